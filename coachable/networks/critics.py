@@ -1,0 +1,84 @@
+"""Style-conditioned action-value networks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torchrl.modules import ValueOperator
+
+from coachable.keys import STYLE
+from coachable.networks.actors import StyleEncoding
+from coachable.networks.residual import ResidualMLP
+
+
+class StyleCritic(nn.Module):
+    """Action value (or its quantiles, or logits over its bins) of `cat(observation, encode(theta), action)`.
+
+    Args:
+        obs_dim: Width of the observation.
+        action_dim: Width of the action.
+        space: Style space whose `encode` is applied to theta; `None` makes a critic without style.
+        widths: Widths of the residual layers.
+        num_outputs: Width of the head: 1 for a scalar value, else the number of quantiles or bins.
+        **trunk: Further arguments of :class:`~coachable.networks.residual.ResidualMLP`.
+    """
+
+    def __init__(
+        self,
+        obs_dim: int,
+        action_dim: int,
+        space: StyleEncoding | None,
+        widths: Sequence[int] = (512, 512, 512),
+        *,
+        num_outputs: int = 1,
+        **trunk: Any,
+    ) -> None:
+        super().__init__()
+        self.space = space
+        style_dim = space.dim if space is not None else 0
+        self.trunk = ResidualMLP(obs_dim + style_dim + action_dim, num_outputs, widths, **trunk)
+
+    def forward(self, observation: Tensor, action: Tensor, style: Tensor | None = None) -> Tensor:
+        """Return `(..., num_outputs)` float32, for raw (not encoded) `style`."""
+        if self.space is None:
+            return self.trunk(torch.cat((observation, action), -1))
+        if style is None:
+            raise ValueError("this critic is conditioned on a style: pass theta as the third argument")
+        return self.trunk(torch.cat((observation, self.space.encode(style), action), -1))
+
+
+def make_critic(
+    obs_dim: int,
+    action_dim: int,
+    space: StyleEncoding | None,
+    widths: Sequence[int] = (512, 512, 512),
+    *,
+    num_outputs: int = 1,
+    observation_key: str = "observation",
+    action_key: str = "action",
+    **trunk: Any,
+) -> ValueOperator:
+    """Build one critic.
+
+    Losses want several: pass them as a list, one call of this function each. A single module would be re-initialised
+    per copy by TorchRL, and lose its Glorot weights.
+
+    Args:
+        obs_dim: Width of the observation.
+        action_dim: Width of the action.
+        space: Style space; theta is read from the key `style` and encoded inside. `None` for no style.
+        widths: Widths of the residual layers.
+        num_outputs: 1 for a scalar value, else the number of quantiles or logits.
+        observation_key: Key of the observation.
+        action_key: Key of the action.
+        **trunk: Further arguments of :class:`~coachable.networks.residual.ResidualMLP`.
+
+    Returns:
+        A `ValueOperator` reading `observation`, `action`, `style` and writing `state_action_value`.
+    """
+    critic = StyleCritic(obs_dim, action_dim, space, widths, num_outputs=num_outputs, **trunk)
+    in_keys = [observation_key, action_key] if space is None else [observation_key, action_key, STYLE]
+    return ValueOperator(critic, in_keys=in_keys, out_keys=["state_action_value"])

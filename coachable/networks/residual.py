@@ -1,0 +1,171 @@
+"""Padded residual network of the paper's policies and critics.
+
+Every layer is `block(x) = ReLU(LayerNorm(W x + b)) + fit(x)`, where `fit` has no parameters: it pads the input with
+zeros, or cuts it, to the width of the layer. Heads are linear. Source: the paper, network appendix (arXiv 2607.00642).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, get_args
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+Side = Literal["end", "beginning"]
+Padding = Literal["alternate", "end", "beginning"]
+Narrowing = Literal["padded_side", "keep_first"]
+
+
+def fit_features(x: Tensor, width: int, side: Side = "end", narrowing: Narrowing = "padded_side") -> Tensor:
+    """Pad or cut the last dimension of `x` to `width` (the identity path of a residual layer).
+
+    Args:
+        x: Features, `(..., n)`.
+        width: Wanted size of the last dimension.
+        side: Where zeros go when `x` is narrower: `"end"` gives `[x, 0]`, `"beginning"` gives `[0, x]`.
+        narrowing: What is dropped when `x` is wider. `"padded_side"` drops from `side`, as padding by a negative
+            amount would; `"keep_first"` always keeps the first `width` features.
+
+    Returns:
+        `(..., width)`; `x` itself where nothing changes, a view where it is cut.
+
+    Example:
+        >>> fit_features(torch.tensor([1.0, 2.0]), 3, side="beginning").tolist()
+        [0.0, 1.0, 2.0]
+        >>> fit_features(torch.tensor([1.0, 2.0, 3.0]), 2, side="beginning").tolist()
+        [2.0, 3.0]
+    """
+    missing = width - x.shape[-1]
+    if missing == 0:
+        return x
+    if missing > 0:
+        return F.pad(x, (0, missing) if side == "end" else (missing, 0))
+    if side == "end" or narrowing == "keep_first":
+        return x[..., :width]
+    return x[..., -width:]
+
+
+class ResidualBlock(nn.Module):
+    """One layer, `ReLU(LayerNorm(W x + b)) + fit(x)`.
+
+    Args:
+        in_features: Width of the input.
+        out_features: Width of the output.
+        side: Padding side of the identity path, see :func:`fit_features`.
+        narrowing: What the identity path drops when it narrows.
+        layer_norm: Without it the layer is `ReLU(W x + b) + fit(x)`.
+        eps: Epsilon of the layer norm.
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        *,
+        side: Side = "end",
+        narrowing: Narrowing = "padded_side",
+        layer_norm: bool = True,
+        eps: float = 1e-5,
+    ) -> None:
+        super().__init__()
+        self.linear = nn.Linear(in_features, out_features)
+        self.norm = nn.LayerNorm(out_features, eps=eps) if layer_norm else None
+        self.side: Side = side
+        self.narrowing: Narrowing = narrowing
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Glorot-uniform weight, zero bias, identity layer norm (the paper's initialisation)."""
+        nn.init.xavier_uniform_(self.linear.weight)
+        nn.init.zeros_(self.linear.bias)
+        if self.norm is not None:
+            self.norm.reset_parameters()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map `(..., in_features)` to `(..., out_features)`."""
+        hidden = self.linear(x)
+        if self.norm is not None:
+            hidden = self.norm(hidden)
+        return F.relu(hidden) + fit_features(x, hidden.shape[-1], self.side, self.narrowing)
+
+    def extra_repr(self) -> str:
+        """Padding of the identity path."""
+        return f"side={self.side!r}, narrowing={self.narrowing!r}"
+
+
+class ResidualMLP(nn.Module):
+    """Stack of residual layers with a linear head.
+
+    Args:
+        in_features: Width of the input.
+        out_features: Width of the head; `None` leaves the head out.
+        widths: Widths of the layers. The paper uses three of 512 (humanoid), 4096, 2048, 1024, 512 (combat).
+        padding: Padding side of the layers: `"alternate"` (end, beginning, end, … as in combat), one side for all, or
+            one side per layer. Irrelevant between layers of equal width.
+        narrowing: What the identity path drops when it narrows, see :func:`fit_features`.
+        layer_norm: Layer norm before the activation of every layer.
+        eps: Epsilon of the layer norms.
+
+    Raises:
+        ValueError: If a width is not positive, or `padding` or `narrowing` is unknown.
+
+    Example:
+        >>> ResidualMLP(10, 2, widths=(64, 64))(torch.zeros(5, 10)).shape
+        torch.Size([5, 2])
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int | None,
+        widths: Sequence[int] = (512, 512, 512),
+        *,
+        padding: Padding | Sequence[Side] = "alternate",
+        narrowing: Narrowing = "padded_side",
+        layer_norm: bool = True,
+        eps: float = 1e-5,
+    ) -> None:
+        super().__init__()
+        if not widths or min(in_features, *widths) < 1:
+            raise ValueError(f"widths must be positive and at least one, got in_features={in_features}, {widths=}")
+        if narrowing not in get_args(Narrowing):
+            raise ValueError(f"narrowing must be one of {get_args(Narrowing)}, got {narrowing!r}")
+        sides = _sides(padding, len(widths))
+        self.in_features = in_features
+        self.out_features = out_features
+        ins = (in_features, *widths[:-1])
+        self.blocks = nn.Sequential(
+            *(
+                ResidualBlock(i, o, side=side, narrowing=narrowing, layer_norm=layer_norm, eps=eps)
+                for i, o, side in zip(ins, widths, sides, strict=True)
+            )
+        )
+        self.head = None if out_features is None else nn.Linear(widths[-1], out_features)
+        if self.head is not None:
+            nn.init.xavier_uniform_(self.head.weight)
+            nn.init.zeros_(self.head.bias)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map `(..., in_features)` to `(..., out_features)` (without a head: to the last layer's features).
+
+        The head runs in float32 also under autocast: values and log-probabilities need more than bfloat16's 8 bits.
+        """
+        hidden = self.blocks(x)
+        if self.head is None:
+            return hidden
+        with torch.autocast(x.device.type, enabled=False):
+            return self.head(hidden.to(self.head.weight.dtype))
+
+
+def _sides(padding: Padding | Sequence[Side], layers: int) -> tuple[Side, ...]:
+    alternate: tuple[Side, Side] = ("end", "beginning")
+    if padding == "alternate":
+        return tuple(alternate[i % 2] for i in range(layers))
+    sides = (padding,) * layers if isinstance(padding, str) else tuple(padding)
+    if len(sides) != layers or any(side not in get_args(Side) for side in sides):
+        raise ValueError(
+            f"padding must be 'alternate', 'end', 'beginning' or one side per layer ({layers}), got {padding!r}"
+        )
+    return sides  # pyright: ignore[reportReturnType]  # checked above

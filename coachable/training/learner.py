@@ -1,0 +1,239 @@
+"""One gradient update of an actor-critic loss: update order, optimisers, target networks, precision."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any, Literal, get_args
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.objectives import LossModule, SoftUpdate
+
+from coachable.training.precision import Precision, resolve_precision
+
+UpdateOrder = Literal["simultaneous", "policy_first", "critic_first"]
+
+
+class NonFiniteLossError(RuntimeError):
+    """A loss became infinite or NaN."""
+
+
+class Learner:
+    """Update a TorchRL actor-critic loss module from batches.
+
+    Works with `SACLoss` and its relatives (QR-SAC, RAC, Cat-RAC): any `LossModule` with `actor_network_params`,
+    `qvalue_network_params`, their targets, and `loss_actor` and `loss_qvalue` among its outputs.
+
+    Update orders (algorithms.md, sections 1 and 2):
+
+    - `"simultaneous"` (the paper's humanoid): both losses from the parameters before the update, then both
+      optimisers step, then the target networks move.
+    - `"policy_first"` (the paper's racing and combat): the policy steps on `actor_loss`, then the critics on a
+      target whose next actions come from the updated policy.
+    - `"critic_first"` (common elsewhere): the critics step, then the policy on the updated critics.
+
+    Args:
+        loss_module: The loss.
+        actor_lr: Learning rate of the policy.
+        critic_lr: Learning rate of everything else that is trained, the temperature excepted.
+        alpha_lr: Learning rate of a learned temperature; unused with `fixed_alpha=True`.
+        adam_eps: Adam's epsilon (1e-7 as in TensorFlow, not torch's 1e-8).
+        tau: Polyak rate of the target networks per update.
+        max_grad_norm: Clip the norm of the policy's and of the critics' gradient, each on its own, to this value.
+        update_order: See above.
+        precision: `"bf16"` multiplies in bfloat16 with float32 master weights, layer-norm statistics, heads, targets
+            and losses; `"auto"` takes it where the device has it in hardware.
+        compile: Compile the loss functions with `torch.compile`.
+        check_every: Read the non-finite flag every so many updates (a device synchronisation on a GPU); 0 leaves that
+            to calls of :meth:`check_finite`.
+
+    Raises:
+        ValueError: If an option is unknown or a number out of range.
+    """
+
+    def __init__(
+        self,
+        loss_module: LossModule,
+        *,
+        actor_lr: float = 1e-4,
+        critic_lr: float = 1e-4,
+        alpha_lr: float = 1e-4,
+        adam_eps: float = 1e-7,
+        tau: float = 0.005,
+        max_grad_norm: float | None = None,
+        update_order: UpdateOrder = "simultaneous",
+        precision: Precision = "auto",
+        compile: bool = False,
+        check_every: int = 100,
+    ) -> None:
+        if update_order not in get_args(UpdateOrder):
+            raise ValueError(f"update_order must be one of {get_args(UpdateOrder)}, got {update_order!r}")
+        if not 0.0 < tau <= 1.0:
+            raise ValueError(f"tau must be in (0, 1], got {tau}")
+        if max_grad_norm is not None and not max_grad_norm > 0:
+            raise ValueError(f"max_grad_norm must be positive or None, got {max_grad_norm}")
+        self.loss_module = loss_module
+        self.update_order: UpdateOrder = update_order
+        self.max_grad_norm = max_grad_norm
+        self.check_every = check_every
+        self.updates = 0
+        groups = _parameter_groups(loss_module)
+        self._actor, self._critic, self._alpha = groups
+        device = self._actor[0].device
+        self.precision = resolve_precision(precision, device)
+        self._device_type = device.type
+
+        def adam(params: Iterable[nn.Parameter], lr: float) -> torch.optim.Adam:
+            return torch.optim.Adam(params, lr=lr, eps=adam_eps, fused=device.type in ("cpu", "cuda"))
+
+        self.optimizers: dict[str, torch.optim.Optimizer] = {
+            "actor": adam(self._actor, actor_lr),
+            "critic": adam(self._critic, critic_lr),
+        }
+        if self._alpha:
+            self.optimizers["alpha"] = adam(self._alpha, alpha_lr)
+        self.target_updater = SoftUpdate(loss_module, tau=tau)
+        self._forward: Callable[..., Any] = loss_module.forward
+        self._actor_loss: Callable[..., Any] = loss_module.actor_loss
+        self._critic_loss: Callable[..., Any] = _critic_loss_of(loss_module)
+        if compile:
+            self._forward = torch.compile(self._forward)
+            self._actor_loss = torch.compile(self._actor_loss)
+            self._critic_loss = torch.compile(self._critic_loss)
+        self._non_finite = torch.zeros((), dtype=torch.bool, device=device)
+
+    def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        """Make one update.
+
+        Args:
+            batch: Transitions, batch shape `[B]` or `[B, n + 1]`. `td_error` is written into it.
+
+        Returns:
+            Detached scalars: `loss_actor`, `loss_qvalue`, `grad_norm_actor`, `grad_norm_critic` (before
+            clipping), `td_error` (mean), and, as far as the loss provides them, `entropy`, `alpha` and
+            `q_policy` (mean over the batch of the smaller value of the policy's own actions). They are tensors so
+            that nothing waits for the device: call `.item()` when they are logged.
+
+        Raises:
+            NonFiniteLossError: If a loss was infinite or NaN since the last check (see `check_every`).
+        """
+        metrics = self._simultaneous(batch) if self.update_order == "simultaneous" else self._sequential(batch)
+        self.target_updater.step()
+        self.updates += 1
+        total = metrics["loss_actor"] + metrics["loss_qvalue"]
+        self._non_finite.logical_or_(torch.isfinite(total).logical_not_())
+        if self.check_every and self.updates % self.check_every == 0:
+            self.check_finite()
+        if "entropy" in metrics and "alpha" in metrics:
+            metrics["q_policy"] = -(metrics["loss_actor"] + metrics["alpha"] * metrics["entropy"])
+        return metrics
+
+    def check_finite(self) -> None:
+        """Raise if any loss since the start was not finite (this reads one flag from the device)."""
+        if bool(self._non_finite):
+            raise NonFiniteLossError(
+                f"a loss was NaN or infinite at or before update {self.updates}. Look for non-finite observations or "
+                "rewards in the replay buffer, a learning rate that is too large, or set max_grad_norm."
+            )
+
+    def state_dict(self) -> dict[str, Any]:
+        """Parameters, targets, optimiser moments and the update counter."""
+        return {
+            "loss_module": self.loss_module.state_dict(),
+            "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.items()},
+            "updates": self.updates,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned."""
+        self.loss_module.load_state_dict(state["loss_module"])
+        for name, optimizer in self.optimizers.items():
+            optimizer.load_state_dict(state["optimizers"][name])
+        self.updates = int(state["updates"])
+        self._non_finite.zero_()
+
+    def _autocast(self) -> torch.autocast:
+        return torch.autocast(self._device_type, dtype=torch.bfloat16, enabled=self.precision == "bf16")
+
+    def _step(self, name: str, parameters: list[nn.Parameter]) -> Tensor:
+        limit = self.max_grad_norm
+        norm = torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
+        if limit is not None:
+            torch.nn.utils.clip_grads_with_norm_(parameters, limit, norm)
+        self.optimizers[name].step()
+        self.optimizers[name].zero_grad(set_to_none=True)
+        return norm
+
+    def _simultaneous(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        with self._autocast():
+            losses = self._forward(batch)
+        total = losses["loss_actor"] + losses["loss_qvalue"]
+        if self._alpha:
+            total = total + losses["loss_alpha"]
+        total.backward()
+        metrics = {key: losses[key].detach() for key in ("loss_actor", "loss_qvalue", "alpha", "entropy")}
+        metrics["grad_norm_actor"] = self._step("actor", self._actor)
+        metrics["grad_norm_critic"] = self._step("critic", self._critic)
+        if self._alpha:
+            self._step("alpha", self._alpha)
+        metrics["td_error"] = batch.get("td_error").mean()
+        return metrics
+
+    def _sequential(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        policy_first = self.update_order == "policy_first"
+        metrics = self._update_actor(batch) if policy_first else {}
+        with self._autocast():
+            loss_qvalue, extra = self._critic_loss(batch)
+        loss_qvalue.backward()
+        metrics["loss_qvalue"] = loss_qvalue.detach()
+        metrics["grad_norm_critic"] = self._step("critic", self._critic)
+        batch.set("td_error", extra["td_error"])
+        metrics["td_error"] = extra["td_error"].mean()
+        if not policy_first:
+            metrics |= self._update_actor(batch)
+        return metrics
+
+    def _update_actor(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        with self._autocast():
+            loss_actor, extra = self._actor_loss(batch)
+        loss_actor.backward()
+        metrics = {"loss_actor": loss_actor.detach(), "grad_norm_actor": self._step("actor", self._actor)}
+        if "log_prob" in extra:
+            log_prob = extra["log_prob"]
+            metrics["entropy"] = -log_prob.mean()
+            metrics["alpha"] = self.loss_module.log_alpha.detach().exp()
+            if self._alpha:
+                self.loss_module.alpha_loss(log_prob).mean().backward()
+                self._step("alpha", self._alpha)
+        return metrics
+
+
+def _parameter_groups(
+    loss_module: LossModule,
+) -> tuple[list[nn.Parameter], list[nn.Parameter], list[nn.Parameter]]:
+    """Split the trainable parameters into the policy's, the critics' and the temperature."""
+    actor: list[nn.Parameter] = []
+    critic: list[nn.Parameter] = []
+    alpha: list[nn.Parameter] = []
+    for name, parameter in loss_module.named_parameters():
+        if not parameter.requires_grad:
+            continue
+        group = actor if name.startswith("actor_network_params") else alpha if name == "log_alpha" else critic
+        group.append(parameter)
+    if not actor or not critic:
+        raise ValueError(
+            f"{type(loss_module).__name__} has no trainable parameters "
+            f"{'under actor_network_params' if not actor else 'of critics'}: the learner needs a policy and critics"
+        )
+    return actor, critic, alpha
+
+
+def _critic_loss_of(loss_module: LossModule) -> Callable[..., Any]:
+    for name in ("qvalue_loss", "qvalue_v2_loss"):
+        method = getattr(loss_module, name, None)
+        if method is not None:
+            return method
+    raise ValueError(
+        f"{type(loss_module).__name__} has neither qvalue_loss(td) nor qvalue_v2_loss(td) returning (loss, metadata)"
+    )

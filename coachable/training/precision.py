@@ -1,0 +1,49 @@
+"""Which numeric precision a device should train in."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import torch
+
+Precision = Literal["auto", "fp32", "bf16"]
+
+
+def supports_bf16(device: torch.device | str = "cpu") -> bool:
+    """Whether `device` multiplies bfloat16 matrices in hardware (elsewhere bfloat16 is slower than float32).
+
+    True for CPUs with AVX512-BF16 or AMX, and for CUDA devices that report bfloat16 support.
+    """
+    kind = torch.device(device).type
+    if kind == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    if kind == "cpu":
+        capabilities = torch.cpu.get_capabilities()
+        return torch.backends.mkldnn.is_available() and any(
+            bool(capabilities.get(name)) for name in ("avx512_bf16", "amx_bf16")
+        )
+    return False
+
+
+def resolve_precision(precision: Precision, device: torch.device | str = "cpu") -> Literal["fp32", "bf16"]:
+    """Turn `"auto"` into the faster of the two precisions that `device` offers.
+
+    Args:
+        precision: `"auto"`, `"fp32"` or `"bf16"`. The last is taken literally, also where it is slow.
+        device: Device of the parameters.
+
+    Returns:
+        `"fp32"` or `"bf16"`.
+
+    Raises:
+        ValueError: If `precision` is something else.
+
+    Example:
+        >>> resolve_precision("fp32")
+        'fp32'
+    """
+    if precision not in get_args(Precision):
+        raise ValueError(f"precision must be one of {get_args(Precision)}, got {precision!r}")
+    if precision == "auto":
+        return "bf16" if supports_bf16(device) else "fp32"
+    return precision

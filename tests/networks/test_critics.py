@@ -1,0 +1,38 @@
+import pytest
+import torch
+from tensordict import TensorDict
+
+from coachable.networks.critics import StyleCritic, make_critic
+
+
+class ScaledStyle:
+    dim = 3
+
+    def encode(self, theta):
+        return theta / 2
+
+
+@pytest.mark.parametrize("num_outputs", [1, 32])
+@pytest.mark.parametrize("shape", [(4,), (4, 5)])
+def test_keys_and_shapes(num_outputs, shape):
+    critic = make_critic(6, 2, ScaledStyle(), (16, 16), num_outputs=num_outputs)
+    sizes = {"observation": 6, "action": 2, "style": 3}
+    td = TensorDict({key: torch.randn(*shape, size) for key, size in sizes.items()}, shape)
+    assert list(critic.in_keys) == ["observation", "action", "style"]
+    assert critic(td)["state_action_value"].shape == (*shape, num_outputs)
+
+
+def test_input_is_observation_encoded_style_action():
+    critic = StyleCritic(6, 2, ScaledStyle(), (16, 16))
+    obs, action, style = torch.randn(4, 6), torch.randn(4, 2), torch.randn(4, 3)
+    expected = critic.trunk(torch.cat((obs, style / 2, action), -1))
+    torch.testing.assert_close(critic(obs, action, style), expected, rtol=0, atol=0)
+    with pytest.raises(ValueError, match="conditioned on a style"):
+        critic(obs, action)
+
+
+def test_without_style():
+    critic = make_critic(6, 2, None, (16,))
+    assert list(critic.in_keys) == ["observation", "action"]
+    td = TensorDict({"observation": torch.randn(3, 6), "action": torch.randn(3, 2)}, [3])
+    assert critic(td)["state_action_value"].shape == (3, 1)

@@ -1,0 +1,106 @@
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from coachable.networks.residual import ResidualBlock, ResidualMLP, fit_features
+
+COMBAT = (4096, 2048, 1024, 512)
+
+
+@pytest.mark.parametrize("side", ["end", "beginning"])
+@pytest.mark.parametrize("width", [2, 5, 9])
+def test_fit_features_equals_padding_by_a_possibly_negative_amount(side, width):
+    x = torch.arange(1.0, 11.0).reshape(2, 5)
+    pad = (0, width - 5) if side == "end" else (width - 5, 0)
+    torch.testing.assert_close(fit_features(x, width, side), F.pad(x, pad), rtol=0, atol=0)
+
+
+def test_keep_first_narrowing_ignores_the_side():
+    x = torch.arange(5.0)
+    assert fit_features(x, 3, "beginning", "keep_first").tolist() == [0.0, 1.0, 2.0]
+    assert fit_features(x, 3, "beginning").tolist() == [2.0, 3.0, 4.0]
+
+
+def test_block_is_relu_of_layer_norm_plus_skip():
+    block = ResidualBlock(3, 4)
+    x = torch.randn(7, 3)
+    z = x @ block.linear.weight.T + block.linear.bias
+    z = (z - z.mean(-1, keepdim=True)) / torch.sqrt(z.var(-1, unbiased=False, keepdim=True) + 1e-5)
+    expected = z.clamp_min(0) + torch.cat((x, torch.zeros(7, 1)), -1)
+    torch.testing.assert_close(block(x), expected)
+
+
+def test_initialisation_is_glorot_uniform_with_zero_bias():
+    block = ResidualBlock(300, 500)
+    bound = (6 / 800) ** 0.5
+    weight = block.linear.weight
+    assert weight.abs().max() <= bound
+    assert weight.abs().max() > 0.99 * bound
+    assert abs(weight.std().item() / (bound / 3**0.5) - 1) < 0.01
+    assert not block.linear.bias.any()
+
+
+@pytest.mark.parametrize(
+    ("in_features", "options", "paths"),
+    [
+        (100, {}, 0),
+        (1500, {}, 0),
+        (2048, {}, 0),
+        (2600, {}, 40),
+        (2600, {"padding": "end"}, 512),
+        (2600, {"narrowing": "keep_first"}, 512),
+    ],
+)
+def test_identity_paths_of_the_padded_network(in_features, options, paths):
+    """How many inputs reach the last layer by skips alone; the counts follow from the widths by hand."""
+    x = torch.arange(1.0, in_features + 1)
+    out = x
+    net_sides = ResidualMLP(4, None, (4, 4, 4, 4), **options).blocks
+    for block, width in zip(net_sides, COMBAT, strict=True):
+        out = fit_features(out, width, block.side, block.narrowing)
+    assert int((out > 0).sum()) == paths
+
+
+def test_zero_layer_norm_leaves_fit():
+    net = ResidualMLP(6, None, (16, 8, 8))
+    for block in net.blocks:
+        nn.init.zeros_(block.norm.weight)
+    x = torch.randn(5, 6)
+    # [x, 0] of 16, then the last 8 of those (padding side "beginning"): all zeros; nothing of x is left.
+    torch.testing.assert_close(net(x), torch.zeros(5, 8), rtol=0, atol=0)
+    equal = ResidualMLP(8, None, (8, 8, 8))
+    for block in equal.blocks:
+        nn.init.zeros_(block.norm.weight)
+    y = torch.randn(5, 8)
+    torch.testing.assert_close(equal(y), y, rtol=0, atol=0)
+
+
+def test_trunk_size_of_the_combat_network():
+    with torch.device("meta"):
+        net = ResidualMLP(1500, None, COMBAT)
+    assert sum(p.numel() for p in net.parameters()) == 17_177_088
+
+
+def test_head_is_float32_under_autocast():
+    net = ResidualMLP(6, 3, (32, 32))
+    x = torch.randn(4, 6)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        out = net(x)
+    assert out.dtype == torch.float32
+    torch.testing.assert_close(out, net(x), rtol=0.05, atol=0.05)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"widths": ()}, {"widths": (4, 0)}, {"padding": "left"}, {"padding": ("end",)}, {"narrowing": "middle"}],
+)
+def test_bad_options_raise(options):
+    with pytest.raises(ValueError, match="must be"):
+        ResidualMLP(3, 1, **{"widths": (4, 4), **options})
+
+
+def test_without_layer_norm():
+    block = ResidualBlock(4, 4, layer_norm=False)
+    x = torch.randn(3, 4)
+    torch.testing.assert_close(block(x), F.relu(block.linear(x)) + x)

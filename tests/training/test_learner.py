@@ -1,0 +1,246 @@
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.objectives import SACLoss, SoftUpdate
+
+from coachable.networks import make_critic, make_gaussian_actor
+from coachable.training import Learner, NonFiniteLossError, resolve_precision
+
+OBS, ACT = 7, 3
+
+
+class ScaledStyle:
+    dim = 2
+
+    def encode(self, theta):
+        return theta / 2
+
+
+def make_loss(seed=0, width=32, fixed_alpha=True, **kwargs):
+    torch.manual_seed(seed)
+    space, widths = ScaledStyle(), (width, width)
+    critics = [make_critic(OBS, ACT, space, widths) for _ in range(2)]
+    loss = SACLoss(
+        make_gaussian_actor(OBS, ACT, space, widths),
+        critics,
+        loss_function="l2",
+        fixed_alpha=fixed_alpha,
+        alpha_init=0.01,
+        action_spec=None,
+        **kwargs,
+    )
+    loss.make_value_estimator(gamma=0.99)
+    return loss
+
+
+def make_batch(*shape, seed=1):
+    gen = torch.Generator().manual_seed(seed)
+
+    def normal(n):
+        return torch.randn(*shape, n, generator=gen)
+
+    style = normal(2)
+    terminated = torch.rand(*shape, 1, generator=gen) < 0.1
+    return TensorDict(
+        {
+            "observation": normal(OBS),
+            "style": style,
+            "action": torch.tanh(normal(ACT)),
+            "next": {
+                "observation": normal(OBS),
+                "style": style,
+                "reward": normal(1),
+                "done": terminated,
+                "terminated": terminated,
+                "truncated": torch.zeros_like(terminated),
+            },
+        },
+        shape,
+    )
+
+
+def params_of(loss):
+    return {k: v.detach().clone() for k, v in loss.named_parameters()}
+
+
+@pytest.mark.parametrize("shape", [(16,), (8, 3)])
+@pytest.mark.parametrize("order", ["simultaneous", "policy_first", "critic_first"])
+def test_update_returns_detached_scalars_and_moves_everything(order, shape):
+    learner = Learner(make_loss(), update_order=order, precision="fp32", actor_lr=1e-3, critic_lr=1e-3)
+    before = params_of(learner.loss_module)
+    targets = learner.loss_module.target_qvalue_network_params.clone()
+    batch = make_batch(*shape)
+    metrics = learner.update(batch)
+    for key in ("loss_actor", "loss_qvalue", "grad_norm_actor", "grad_norm_critic", "entropy", "alpha", "q_policy"):
+        assert metrics[key].shape == ()
+        assert not metrics[key].requires_grad
+        assert torch.isfinite(metrics[key])
+    after = params_of(learner.loss_module)
+    assert all((after[k] != before[k]).any() for k in before)
+    assert not (learner.loss_module.target_qvalue_network_params == targets).all()
+    assert batch["td_error"].shape == shape
+    assert learner.updates == 1
+
+
+def test_target_networks_follow_by_polyak_averaging():
+    learner = Learner(make_loss(), precision="fp32", critic_lr=1e-2, tau=0.25)
+    old = learner.loss_module.target_qvalue_network_params.clone().flatten_keys()
+    learner.update(make_batch(16))
+    new = learner.loss_module.target_qvalue_network_params.flatten_keys()
+    live = learner.loss_module.qvalue_network_params.flatten_keys()
+    for key in old.keys():  # noqa: SIM118  # iterating a tensordict goes along its batch
+        torch.testing.assert_close(new[key], 0.75 * old[key] + 0.25 * live[key].detach())
+
+
+def reference_update(loss, batch, lr, eps, order):
+    """The update written out with plain TorchRL calls."""
+    actor = torch.optim.Adam(loss.actor_network_params.values(True, True), lr=lr, eps=eps)
+    critic = torch.optim.Adam(loss.qvalue_network_params.values(True, True), lr=lr, eps=eps)
+    targets = SoftUpdate(loss, tau=0.005)
+
+    def step_critic():
+        loss_qvalue, _ = loss.qvalue_v2_loss(batch)
+        critic.zero_grad()
+        loss_qvalue.backward()
+        critic.step()
+
+    def step_actor():
+        loss_actor, _ = loss.actor_loss(batch)
+        actor.zero_grad()
+        loss_actor.backward()
+        actor.step()
+
+    if order == "simultaneous":
+        losses = loss(batch)
+        (losses["loss_actor"] + losses["loss_qvalue"]).backward()
+        actor.step()
+        critic.step()
+    elif order == "policy_first":
+        step_actor()
+        step_critic()
+    else:
+        step_critic()
+        step_actor()
+    targets.step()
+
+
+@pytest.mark.parametrize("order", ["simultaneous", "policy_first", "critic_first"])
+def test_update_equals_the_written_out_update(order):
+    ours, theirs = make_loss(), make_loss()
+    learner = Learner(ours, update_order=order, precision="fp32", actor_lr=1e-3, critic_lr=1e-3)
+    torch.manual_seed(5)
+    learner.update(make_batch(32))
+    torch.manual_seed(5)
+    reference_update(theirs, make_batch(32), 1e-3, 1e-7, order)
+    for (name, a), (_, b) in zip(ours.named_parameters(), theirs.named_parameters(), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5, msg=lambda m, name=name: f"{name}: {m}")
+
+
+def test_orders_see_different_parameters():
+    """policy_first draws the target's actions from the updated policy; simultaneous from the one before."""
+
+    class Spy(SACLoss):
+        def qvalue_v2_loss(self, td):
+            self.seen = [p.detach().clone() for p in self.actor_network_params.values(True, True)]
+            return super().qvalue_v2_loss(td)
+
+    for order, updated in (("simultaneous", False), ("policy_first", True), ("critic_first", False)):
+        loss = make_loss()
+        loss.__class__ = Spy
+        before = [p.detach().clone() for p in loss.actor_network_params.values(True, True)]
+        Learner(loss, update_order=order, precision="fp32").update(make_batch(16))
+        assert any((a != b).any() for a, b in zip(before, loss.seen, strict=True)) is updated
+
+
+def test_gradients_are_clipped_separately_and_norms_are_those_before_clipping():
+    batch = make_batch(16)
+    learner = Learner(make_loss(), precision="fp32")
+    torch.manual_seed(3)
+    free = learner.update(batch.clone())
+    clipped = Learner(make_loss(), precision="fp32", max_grad_norm=1e-3)
+    seen = {}
+    for name, optimizer in clipped.optimizers.items():
+        optimizer.register_step_pre_hook(
+            lambda opt, args, kwargs, name=name: seen.__setitem__(
+                name, torch.cat([p.grad.flatten() for g in opt.param_groups for p in g["params"]]).norm()
+            )
+        )
+    torch.manual_seed(3)
+    metrics = clipped.update(batch.clone())
+    torch.testing.assert_close(metrics["grad_norm_actor"], free["grad_norm_actor"])
+    torch.testing.assert_close(metrics["grad_norm_critic"], free["grad_norm_critic"])
+    torch.testing.assert_close(seen["actor"], torch.tensor(1e-3), rtol=1e-3, atol=0)
+    torch.testing.assert_close(seen["critic"], torch.tensor(1e-3), rtol=1e-3, atol=0)
+
+
+def test_non_finite_loss_is_reported_at_the_next_check():
+    learner = Learner(make_loss(), precision="fp32", check_every=2)
+    bad = make_batch(16)
+    bad["next", "reward"][3] = float("nan")
+    learner.update(bad)
+    with pytest.raises(NonFiniteLossError, match="update 2"):
+        learner.update(make_batch(16))
+    with pytest.raises(NonFiniteLossError):
+        learner.check_finite()
+
+
+@pytest.mark.parametrize("order", ["simultaneous", "policy_first"])
+def test_resumed_equals_uninterrupted(order):
+    def run(learner, seeds):
+        for seed in seeds:
+            torch.manual_seed(seed)
+            learner.update(make_batch(16, seed=seed))
+
+    one = Learner(make_loss(), update_order=order)
+    run(one, range(6))
+    two = Learner(make_loss(), update_order=order)
+    run(two, range(3))
+    state = torch.utils.data.default_convert(two.state_dict())
+    three = Learner(make_loss(seed=9), update_order=order)
+    three.load_state_dict(state)
+    assert three.updates == 3
+    run(three, range(3, 6))
+    for (name, a), (_, b) in zip(
+        one.loss_module.state_dict().items(), three.loss_module.state_dict().items(), strict=True
+    ):
+        torch.testing.assert_close(a, b, rtol=0, atol=0, msg=lambda m, name=name: f"{name}: {m}")
+
+
+def test_learned_temperature_moves():
+    loss = make_loss(fixed_alpha=False, target_entropy=-3.0)
+    before = loss.log_alpha.item()
+    for order in ("simultaneous", "policy_first"):
+        Learner(loss, update_order=order, precision="fp32", alpha_lr=1e-2).update(make_batch(16))
+        assert loss.log_alpha.item() != before
+        before = loss.log_alpha.item()
+
+
+def test_bf16_gradients_point_where_fp32_gradients_point():
+    grads = {}
+    for precision in ("fp32", "bf16"):
+        loss = make_loss(width=128)
+        learner = Learner(loss, precision=precision)
+        for name, optimizer in learner.optimizers.items():
+            optimizer.register_step_pre_hook(
+                lambda opt, args, kwargs, key=(precision, name): grads.__setitem__(
+                    key, torch.cat([p.grad.flatten().float() for g in opt.param_groups for p in g["params"]])
+                )
+            )
+        torch.manual_seed(2)
+        learner.update(make_batch(64))
+    for name in ("actor", "critic"):
+        cosine = torch.cosine_similarity(grads["fp32", name], grads["bf16", name], dim=0)
+        assert cosine > 0.99
+
+
+def test_bad_options_raise():
+    loss = make_loss()
+    with pytest.raises(ValueError, match="update_order"):
+        Learner(loss, update_order="actor_first")
+    with pytest.raises(ValueError, match="precision"):
+        Learner(loss, precision="fp16")
+    with pytest.raises(ValueError, match="tau"):
+        Learner(loss, tau=0.0)
+    with pytest.raises(ValueError, match="max_grad_norm"):
+        Learner(loss, max_grad_norm=-1.0)
+    assert resolve_precision("bf16") == "bf16"
