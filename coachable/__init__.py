@@ -1,0 +1,39 @@
+"""Style-conditioned reinforcement learning on TorchRL: train one agent, coach it while it acts.
+
+Importing the package is cheap: names are resolved on first use, so that `import coachable` loads neither torch nor a
+simulator, a logger or a plotting library.
+"""
+
+from importlib import import_module
+
+from coachable.gl import choose_gl_backend
+
+choose_gl_backend()  # MuJoCo, which TorchRL imports, reads the choice once, when it is imported
+
+__version__ = "0.1.0.dev0"
+
+# Where each public name lives. Resolved lazily by `__getattr__` (PEP 562).
+_MODULE_OF = {
+    "Choice": "coachable.styles",
+    "Setpoint": "coachable.styles",
+    "StyleReward": "coachable.styles",
+    "StyleSpace": "coachable.styles",
+    "Weight": "coachable.styles",
+    "CoachableEnv": "coachable.transforms",
+    "StyleRewardTransform": "coachable.transforms",
+    "StyleSampler": "coachable.transforms",
+    "TaskImpersonation": "coachable.transforms",
+    "coachable_env": "coachable.transforms",
+}
+
+__all__ = ["__version__", *sorted(_MODULE_OF)]
+
+
+def __getattr__(name: str) -> object:
+    if name in _MODULE_OF:
+        return getattr(import_module(_MODULE_OF[name]), name)
+    raise AttributeError(f"module 'coachable' has no attribute {name!r}; it offers {', '.join(__all__)}")
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,56 @@
+"""Styles: what can be coached, how it is sampled and encoded, and what it is rewarded with. Pure torch, no environments."""
+
+from coachable.styles.parameters import Choice, Parameter, Setpoint, Weight
+from coachable.styles.reward import StyleReward
+from coachable.styles.samplers import (
+    ContinuousOneHot,
+    Mixture,
+    OneHot,
+    PointMass,
+    Product,
+    Sampler,
+    Uniform,
+    UniformChoice,
+)
+from coachable.styles.space import StyleRangeWarning, StyleSpace, StyleView
+from coachable.styles.terms import (
+    ChoiceTolerance,
+    SetpointTolerance,
+    StyleTerm,
+    Term,
+    WeightedFeature,
+    WeightedSum,
+    feature,
+    scalar_feature,
+    weighted_sum,
+)
+from coachable.styles.tolerance import tolerance
+
+__all__ = [
+    "Choice",
+    "ChoiceTolerance",
+    "ContinuousOneHot",
+    "Mixture",
+    "OneHot",
+    "Parameter",
+    "PointMass",
+    "Product",
+    "Sampler",
+    "Setpoint",
+    "SetpointTolerance",
+    "StyleRangeWarning",
+    "StyleReward",
+    "StyleSpace",
+    "StyleTerm",
+    "StyleView",
+    "Term",
+    "Uniform",
+    "UniformChoice",
+    "Weight",
+    "WeightedFeature",
+    "WeightedSum",
+    "feature",
+    "scalar_feature",
+    "tolerance",
+    "weighted_sum",
+]

@@ -1,0 +1,132 @@
+"""`StyleReward`, the only code that turns features and a style into the style part of the reward."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from torch import Tensor, nn
+
+from coachable.styles.space import StyleSpace
+from coachable.styles.terms import (
+    ChoiceTolerance,
+    Features,
+    SetpointTolerance,
+    StyleTerm,
+    Term,
+    WeightedFeature,
+    WeightedSum,
+    feature,
+    scalar_feature,
+    weighted_sum,
+)
+from coachable.styles.tolerance import tolerance
+
+__all__ = [
+    "ChoiceTolerance",
+    "SetpointTolerance",
+    "StyleReward",
+    "StyleTerm",
+    "Term",
+    "WeightedFeature",
+    "WeightedSum",
+    "feature",
+    "scalar_feature",
+    "tolerance",
+    "weighted_sum",
+]
+
+
+class StyleReward(nn.Module):
+    """Sum of scaled style terms, `sum_k scale_k * term_k(features, theta)` (paper: `sum_i w_i g_i(s, a, s'; xi_i)`).
+
+    It runs as environment transform while collecting and inside the relabelling while learning, with the same bits.
+
+    Args:
+        space: What theta means. Every parameter must be read by a term.
+        terms: Terms by name; each carries `.parameters`, the names it reads (wrap plain functions in `Term`).
+        scales: Fixed factor per term; 1 where not given.
+
+    Raises:
+        ValueError: If a term declares no or unknown parameters, a parameter is read by no term, or a scale belongs to no term.
+
+    Examples:
+        >>> from coachable.styles import Weight
+        >>> reward = StyleReward(StyleSpace([Weight("fuel", -3, 105)]), {"fuel": WeightedFeature("fuel", 0)}, {"fuel": -1.0})
+        >>> reward(torch.tensor([[0.5]]), torch.tensor([[10.0]]))
+        tensor([[-5.]])
+    """
+
+    def __init__(
+        self, space: StyleSpace, terms: Mapping[str, StyleTerm], scales: Mapping[str, float] | None = None
+    ) -> None:
+        super().__init__()
+        self.space = space
+        self.scales = {name: 1.0 for name in terms} | {name: float(s) for name, s in (scales or {}).items()}
+        _check_terms(space, terms, self.scales)
+        # Modules among the terms are registered, so that `.to(device)` reaches their buffers.
+        self.modules_of_terms = nn.ModuleDict({n: t for n, t in terms.items() if isinstance(t, nn.Module)})
+        self._terms: tuple[tuple[str, Any, float], ...] = tuple((n, t, self.scales[n]) for n, t in terms.items())
+
+    @property
+    def term_names(self) -> tuple[str, ...]:
+        """Names of the terms, in the order in which they are added."""
+        return tuple(name for name, _, _ in self._terms)
+
+    def forward(self, features: Features, theta: Tensor) -> Tensor:
+        """Style part of the reward.
+
+        Args:
+            features: `(..., F)`, or a tensordict of batch shape `(...)`.
+            theta: `(..., dim)`, raw. Its batch shape is that of the result; features may broadcast against it.
+
+        Returns:
+            `(..., 1)` in theta's dtype.
+        """
+        style = self.space.lazy_view(theta)
+        total: Tensor | None = None
+        for name, term, scale in self._terms:
+            value = self._checked(name, term(features, style), theta)
+            if scale != 1.0:
+                value = scale * value
+            total = value if total is None else total + value
+        assert total is not None  # a space has parameters, and each has a term
+        return total.unsqueeze(-1)
+
+    def terms_of(self, features: Features, theta: Tensor) -> dict[str, Tensor]:
+        """Each term before its scale, `(...,)`, for logging and reports."""
+        style = self.space.lazy_view(theta)
+        return {name: self._checked(name, term(features, style), theta) for name, term, _ in self._terms}
+
+    @staticmethod
+    def _checked(name: str, value: Tensor, theta: Tensor) -> Tensor:
+        if value.shape != theta.shape[:-1]:
+            raise ValueError(
+                f"style term {name!r} returned shape {tuple(value.shape)} for a style of shape {tuple(theta.shape)}: "
+                f"expected {tuple(theta.shape[:-1])}, one number per style. Features must broadcast against the style."
+            )
+        return value
+
+
+def _check_terms(space: StyleSpace, terms: Mapping[str, Any], scales: Mapping[str, float]) -> None:
+    problems = []
+    read: set[str] = set()
+    for name, term in terms.items():
+        parameters = getattr(term, "parameters", None)
+        # nn.Module.parameters is a method: a module that forgot to declare shadows nothing.
+        if not callable(term) or not isinstance(parameters, tuple) or not parameters:
+            problems.append(f"term {name!r} declares no parameters: wrap it as Term(function, parameters=(...,))")
+            continue
+        unknown = [p for p in parameters if p not in space]
+        if unknown:
+            problems.append(f"term {name!r} reads {unknown}, which the space lacks")
+        read.update(parameters)
+    unread = [p for p in space.names if p not in read]
+    if unread:
+        problems.append(f"no term reads the parameters {unread}: add a term that does, or remove them from the space")
+    stray = [name for name in scales if name not in terms]
+    if stray:
+        problems.append(f"scales are given for {stray}, expected some of {list(terms)}")
+    if problems:
+        label = f" {space.name!r}" if space.name else ""
+        raise ValueError(
+            f"StyleReward does not fit the space{label} of {list(space.names)}: " + "; ".join(problems) + "."
+        )

@@ -1,0 +1,241 @@
+"""Terms of the style reward: small callables that say which style parameters they read.
+
+A term maps `(features, style)` to a reward `(...,)`. `features` is what the environment emitted (one tensor `(..., F)` or a
+nested tensordict), `style` a mapping from parameter name to its block of theta.
+
+Only elementwise operations appear here, in a fixed order. A reduction such as `Tensor.sum` may add in another order for
+another batch shape or memory layout, and the reward while collecting would differ from the relabelled one in the last bits.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from coachable.styles.tolerance import tolerance
+
+Features = Tensor | TensorDictBase
+Style = Mapping[str, Tensor]
+FeatureKey = int | slice | str | tuple[Any, ...]
+
+
+@runtime_checkable
+class StyleTerm(Protocol):
+    """Anything callable as `(features, style) -> (...,)` that names the parameters it reads."""
+
+    parameters: tuple[str, ...]
+
+    def __call__(self, features: Features, style: Style) -> Tensor:
+        """Reward of the term, `(...,)`, before its scale."""
+        ...
+
+
+@dataclass(frozen=True)
+class Term:
+    """Wraps a plain function as a term.
+
+    Args:
+        function: `(features, style) -> (...,)`.
+        parameters: Names of the style parameters that the function reads.
+
+    Examples:
+        >>> term = Term(lambda features, style: style["fuel"] * features[..., 0], parameters=("fuel",))
+        >>> term(torch.tensor([[2.0]]), {"fuel": torch.tensor([3.0])})
+        tensor([6.])
+    """
+
+    function: Callable[[Any, Style], Tensor]
+    parameters: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        parameters = (self.parameters,) if isinstance(self.parameters, str) else tuple(self.parameters)
+        object.__setattr__(self, "parameters", parameters)
+
+    def __call__(self, features: Features, style: Style) -> Tensor:
+        """Calls the function."""
+        return self.function(features, style)
+
+
+def feature(features: Features, key: FeatureKey) -> Tensor:
+    """Picks one feature.
+
+    Args:
+        features: Tensor `(..., F)` or tensordict.
+        key: For a tensor an index, `(...,)`, or a slice, `(..., k)`. For a tensordict a key, nested if a tuple, whose last
+            part may be an index or slice into the entry: `"speed"`, `("gait", "length")`, `("arms", 0)`.
+
+    Returns:
+        The entry, as it is stored: a tensordict entry `(..., 1)` read by name alone keeps its last dimension.
+    """
+    if isinstance(key, int | slice):
+        return features[..., key]
+    if isinstance(key, tuple) and isinstance(key[-1], int | slice):
+        return features.get(key[:-1] if len(key) > 2 else key[0])[..., key[-1]]
+    return features.get(key)
+
+
+def scalar_feature(features: Features, key: FeatureKey, like: Tensor) -> Tensor:
+    """Like `feature`, but `(...,)`: drops the trailing 1 of a tensordict entry with one dimension more than `like`."""
+    value = feature(features, key)
+    return value.squeeze(-1) if value.ndim == like.ndim + 1 and value.shape[-1] == 1 else value
+
+
+def weighted_sum(weights: Tensor, values: Tensor) -> Tensor:
+    """Sum of products over the last dimension, with the same bits for every batch shape, memory layout and device.
+
+    Args:
+        weights: `(..., k)`.
+        values: `(..., k)`, broadcastable.
+
+    Returns:
+        `(...,)`.
+    """
+    products = weights * values
+    width = products.shape[-1]
+    while width > 1:
+        # Halve by elementwise additions: their result cannot depend on strides, unlike that of a reduction kernel.
+        half = width // 2
+        folded = products[..., :half] + products[..., half : 2 * half]
+        if width % 2:
+            folded = torch.cat([folded, products[..., 2 * half :]], dim=-1)
+        products, width = folded, half + width % 2
+    return products[..., 0]
+
+
+@dataclass(frozen=True)
+class WeightedFeature:
+    """`w * g`: one weight times one feature.
+
+    Args:
+        parameter: Name of the `Weight`.
+        key: Feature to scale, see `feature`.
+    """
+
+    parameter: str
+    key: FeatureKey
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """The weight."""
+        return (self.parameter,)
+
+    def __call__(self, features: Features, style: Style) -> Tensor:
+        """`(...,)`."""
+        weight = style[self.parameter]
+        return weight * scalar_feature(features, self.key, weight)
+
+
+class WeightedSum:
+    """`sum_i w_i g_i` over many weights at once, `features[..., i]` belonging to `parameters[i]` (paper, combat).
+
+    One term instead of one `WeightedFeature` per parameter, which matters at 18 of them in every environment step.
+
+    Args:
+        parameters: Names of the weights, in the order of the features.
+        key: Features `(..., len(parameters))`, see `feature`; by default all of them.
+    """
+
+    def __init__(self, parameters: Sequence[str], key: FeatureKey | None = None) -> None:
+        self.parameters = tuple(parameters)
+        self.key = key
+
+    def __call__(self, features: Features, style: Style) -> Tensor:
+        """`(...,)`."""
+        block = getattr(style, "block", None)
+        weights = torch.stack([style[n] for n in self.parameters], -1) if block is None else block(self.parameters)
+        values = features if self.key is None else feature(features, self.key)
+        if values.shape[-1] != len(self.parameters):
+            raise ValueError(
+                f"WeightedSum reads {values.shape[-1]} features for {len(self.parameters)} weights {self.parameters}: "
+                "expected as many, in the same order. Pass `key` to select them."
+            )
+        return weighted_sum(weights, values)
+
+
+@dataclass(frozen=True)
+class SetpointTolerance:
+    """`tolerance` of a feature around a set-point: 1 within `half_width` of the requested value.
+
+    Args:
+        parameter: Name of the `Setpoint`.
+        key: Measured feature, in the unit of the set-point; see `feature`.
+        margin: Distance at which the reward is `value_at_margin`, same unit.
+        sigmoid: Shape of the decline, see `tolerance`.
+        value_at_margin: See `tolerance`.
+        half_width: Half width of the interval that counts as exact, same unit.
+        gate: Optional feature that multiplies the term, such as a "step completed" flag.
+    """
+
+    parameter: str
+    key: FeatureKey
+    margin: float
+    sigmoid: str = "long_tail"
+    value_at_margin: float = 0.1
+    half_width: float = 0.0
+    gate: FeatureKey | None = None
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """The set-point."""
+        return (self.parameter,)
+
+    def __call__(self, features: Features, style: Style) -> Tensor:
+        """`(...,)`."""
+        target = style[self.parameter]
+        measured = scalar_feature(features, self.key, target)
+        lower, upper = target - self.half_width, target + self.half_width
+        value = tolerance(measured, lower, upper, self.margin, self.sigmoid, self.value_at_margin)
+        return value if self.gate is None else value * scalar_feature(features, self.gate, target).to(value.dtype)
+
+
+class ChoiceTolerance(nn.Module):
+    """Mean `tolerance` of several features inside bounds that depend on the chosen option (paper, arm poses).
+
+    Args:
+        parameter: Name of the `Choice`.
+        key: Features `(..., k)`, see `feature`.
+        lower: `(n_options, k)` lower bounds, in the unit of the features.
+        upper: `(n_options, k)` upper bounds.
+        margin: Distance at which the value is `value_at_margin`, same unit.
+        sigmoid: Shape of the decline, see `tolerance`.
+        value_at_margin: See `tolerance`.
+
+    Raises:
+        ValueError: If the bounds are no two matrices of one shape, or a lower bound exceeds its upper bound.
+    """
+
+    lower: Tensor
+    upper: Tensor
+
+    def __init__(
+        self,
+        parameter: str,
+        key: FeatureKey,
+        lower: Tensor,
+        upper: Tensor,
+        margin: float,
+        sigmoid: str = "long_tail",
+        value_at_margin: float = 0.1,
+    ) -> None:
+        super().__init__()
+        lower, upper = torch.as_tensor(lower, dtype=torch.float32), torch.as_tensor(upper, dtype=torch.float32)
+        if lower.ndim != 2 or lower.shape != upper.shape or bool((lower > upper).any()):
+            raise ValueError(
+                f"ChoiceTolerance for {parameter!r} has bounds of shapes {tuple(lower.shape)} and {tuple(upper.shape)}: "
+                "expected two (n_options, k) matrices with lower <= upper."
+            )
+        self.parameters = (parameter,)
+        self.key, self.margin, self.sigmoid, self.value_at_margin = key, margin, sigmoid, value_at_margin
+        self.register_buffer("lower", lower, persistent=False)
+        self.register_buffer("upper", upper, persistent=False)
+        self.register_buffer("_mean", torch.full((lower.shape[1],), 1.0 / lower.shape[1]), persistent=False)
+
+    def forward(self, features: Features, style: Style) -> Tensor:
+        """`(...,)`."""
+        option = style[self.parameters[0]].argmax(-1)
+        lower, upper = self.lower[option], self.upper[option]  # (..., k)
+        value = tolerance(feature(features, self.key), lower, upper, self.margin, self.sigmoid, self.value_at_margin)
+        return weighted_sum(self._mean, value)

@@ -1,0 +1,20 @@
+"""TorchRL transforms: styles and style rewards in environments, relabelling in replay, gamepad actions."""
+
+from importlib import import_module
+
+# Resolved on first use, so that one transform does not load the others.
+_MODULE_OF = {
+    "CoachableEnv": "coachable.transforms.style_sampler",
+    "StyleRewardTransform": "coachable.transforms.style_reward",
+    "StyleSampler": "coachable.transforms.style_sampler",
+    "TaskImpersonation": "coachable.transforms.task_impersonation",
+    "coachable_env": "coachable.transforms.style_sampler",
+}
+
+__all__ = sorted(_MODULE_OF)
+
+
+def __getattr__(name: str) -> object:
+    if name in _MODULE_OF:
+        return getattr(import_module(_MODULE_OF[name]), name)
+    raise AttributeError(f"module 'coachable.transforms' has no attribute {name!r}; it offers {', '.join(__all__)}")

@@ -1,0 +1,201 @@
+"""`StyleSampler` draws a style at every reset and carries it along; `CoachableEnv` seeds it with the environment."""
+
+import secrets
+import zlib
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, TensorSpec
+from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
+
+from coachable import keys
+from coachable.styles.reward import StyleReward
+from coachable.styles.samplers import Sampler
+from coachable.styles.space import StyleSpace
+from coachable.transforms.style_reward import StyleRewardTransform
+
+_MASK = (1 << 64) - 1
+
+
+def derive_seed(seed: int, salt: str) -> int:
+    """Mixes a seed with a name, so that streams seeded with one number are independent (splitmix64 finaliser)."""
+    z = (int(seed) * 0x9E3779B97F4A7C15 + zlib.crc32(salt.encode())) & _MASK
+    z = ((z ^ (z >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
+    z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) & _MASK
+    return (z ^ (z >> 31)) >> 1  # torch wants it below 2^63
+
+
+class StyleSampler(Transform):
+    """Environment transform that draws theta at reset and copies it from step to step.
+
+    The style lives in the tensordict, nowhere else: writing another `style` before a step changes it from that step on,
+    and a partial reset changes it exactly where an episode ended. At reset, in this order: a style given by the caller
+    (`env.reset(TensorDict({"style": theta}, [N]))`), a held style (`hold`), a draw.
+
+    Args:
+        space: What theta means; gives the spec its bounds.
+        sampler: Distribution to draw from; the space's own if None.
+        key: Where the style is written.
+        seed: Seed of this transform's generator; taken from the operating system if None, so that workers differ. With
+            `CoachableEnv`, `env.set_seed` reaches it.
+        device: Where styles are drawn; they are then moved to the environment's device.
+
+    Raises:
+        ValueError: If the sampler's dimension is not the space's.
+    """
+
+    def __init__(
+        self,
+        space: StyleSpace,
+        sampler: Sampler | None = None,
+        key: NestedKey = keys.STYLE,
+        seed: int | None = None,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        super().__init__(in_keys=[], out_keys=[key])
+        self.space = space
+        self.sampler = space.sampler if sampler is None else sampler
+        if self.sampler.dim != space.dim:
+            raise ValueError(
+                f"sampler has dimension {self.sampler.dim}, the style space {list(space.names)} {space.dim}."
+            )
+        self.key = key
+        self.generator = torch.Generator(device)
+        self._held: Tensor | None = None
+        self._seeded = False
+        self.set_seed(seed)
+
+    def set_seed(self, seed: int | None = None) -> None:
+        """Restarts the random stream; from the operating system's entropy if None."""
+        self._seeded = seed is not None
+        # Salted: an environment seeded with the same number would otherwise draw start states that match the styles.
+        self.generator.manual_seed(secrets.randbits(63) if seed is None else derive_seed(seed, f"style:{self.key}"))
+
+    def hold(self, theta: Tensor) -> None:
+        """Uses this style at every reset, automatic ones included, until `release`.
+
+        Args:
+            theta: `(dim,)` for all environments, or `(*batch, dim)`, one each. Running episodes keep their style.
+        """
+        self.space.validate(theta)
+        self._held = theta.detach().to(torch.float32, copy=True)
+
+    def release(self) -> None:
+        """Draws styles again from the next reset on."""
+        self._held = None
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        # Styles for all rows: TorchRL keeps only those that are being reset.
+        given = tensordict.get(self.key, None)
+        shape, device = tensordict_reset.batch_size, tensordict_reset.device
+        if given is not None:
+            style = given.to(torch.float32, copy=True)
+        elif self._held is not None:
+            style = self._held.to(device).expand(*shape, self.space.dim).clone()
+        else:
+            style = self.sampler.sample(shape, self.generator, device)
+        return tensordict_reset.set(self.key, style)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        # A copy: writing into the next style in place must not rewrite the style of the transition before it.
+        return next_tensordict.set(self.key, tensordict.get(self.key).clone())
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Adds the style, bounded by the space's ranges."""
+        shape = (*observation_spec.shape, self.space.dim)
+        device = observation_spec.device
+        low, high = self.space.low.to(device).expand(shape), self.space.high.to(device).expand(shape)
+        observation_spec[self.key] = Bounded(low, high, shape=shape, dtype=torch.float32, device=device)
+        return observation_spec
+
+    def transform_state_spec(self, state_spec: TensorSpec) -> TensorSpec:
+        """Adds the style here too: otherwise a style given at reset would be ignored."""
+        return self.transform_observation_spec(state_spec)
+
+    def get_extra_state(self) -> Tensor:
+        """State of the generator, for `state_dict`."""
+        return self.generator.get_state()
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Restores the generator from `state_dict`."""
+        self.generator.set_state(state.to("cpu", torch.uint8))
+        self._seeded = True
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = super().__getstate__()
+        generator = state.pop("generator")
+        state["generator"] = (str(generator.device), generator.get_state())
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        device, generator_state = state.pop("generator")
+        super().__setstate__(state)
+        self.generator = torch.Generator(device)
+        if self._seeded:
+            self.generator.set_state(generator_state)
+        else:  # copies sent to workers must not draw the same styles
+            self.set_seed(None)
+
+
+class CoachableEnv(TransformedEnv):
+    """`TransformedEnv` whose `set_seed` reaches every transform that has a `set_seed` (TorchRL's does not)."""
+
+    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
+        """Seeds the environment and its transforms; returns the seed for the next environment."""
+        following = super().set_seed(seed, static_seed=static_seed)
+        for module in self.transform.modules():
+            if module is not self.transform and hasattr(module, "set_seed"):
+                module.set_seed(seed)  # type: ignore[operator]
+        return following
+
+    def hold_style(self, theta: Tensor) -> None:
+        """Uses this style at every reset until `release_style`; see `StyleSampler.hold`."""
+        for sampler in self._samplers():
+            sampler.hold(theta)
+
+    def release_style(self) -> None:
+        """Draws styles again from the next reset on."""
+        for sampler in self._samplers():
+            sampler.release()
+
+    def _samplers(self) -> list[StyleSampler]:
+        samplers = [m for m in self.transform.modules() if isinstance(m, StyleSampler)]
+        if not samplers:
+            raise RuntimeError("this environment has no StyleSampler: build it with coachable_env(...) to hold styles.")
+        return samplers
+
+
+def coachable_env(
+    base_env: EnvBase,
+    space: StyleSpace,
+    style_reward: StyleReward,
+    *transforms: Transform,
+    sampler: Sampler | None = None,
+    seed: int | None = None,
+    device: torch.device | str = "cpu",
+    **kwargs: Any,
+) -> CoachableEnv:
+    """Adds styles to a domain: `StyleSampler`, then `StyleRewardTransform`, then any further transforms.
+
+    Args:
+        base_env: Emits `task_reward` and `style_features`, and never sees theta.
+        space: What can be coached.
+        style_reward: What it is rewarded with.
+        *transforms: Further transforms, such as `StepCounter` or `RewardSum`.
+        sampler: Distribution of styles; the space's own if None.
+        seed: Seeds the environment and its transforms, if given.
+        device: Where styles are drawn.
+        **kwargs: For `TransformedEnv`.
+
+    Returns:
+        The environment, ready for a collector.
+    """
+    chain = Compose(
+        StyleSampler(space, sampler, seed=seed, device=device), StyleRewardTransform(style_reward), *transforms
+    )
+    env = CoachableEnv(base_env, chain, **kwargs)
+    if seed is not None:
+        env.set_seed(seed)
+    return env
