@@ -1,0 +1,1 @@
+"""Domains. Each folder is one; no domain imports another."""

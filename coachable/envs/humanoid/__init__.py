@@ -1,0 +1,6 @@
+"""The DeepMind Control humanoid, walking with a requested arm pose and step length."""
+
+from coachable.envs.humanoid.env import HumanoidEnv
+from coachable.envs.humanoid.styles import humanoid_style_reward, humanoid_style_space
+
+__all__ = ["HumanoidEnv", "humanoid_style_reward", "humanoid_style_space"]

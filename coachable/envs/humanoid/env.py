@@ -1,0 +1,243 @@
+"""`HumanoidEnv`: N walking humanoids as one TorchRL environment."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from coachable.envs.humanoid.gait import GaitTracker
+from coachable.envs.humanoid.model import NUM_ACTIONS, NUM_POSITIONS
+from coachable.envs.humanoid.observation import (
+    OBSERVATION_SCALE,
+    OBSERVATION_SIZE,
+    orientation_to_course,
+    rotate_to_course,
+    suite_observation,
+)
+from coachable.envs.humanoid.rewards import move_reward
+from coachable.envs.humanoid.simulation import HumanoidSimulation, Kinematics
+from coachable.envs.humanoid.styles import STYLE_FEATURES_SIZE, pack_style_features
+from coachable.keys import STYLE_FEATURES, TASK_REWARD
+
+EPISODE_STEPS = 1000
+FALL_HEIGHT = 1.1  # [m], an episode ends when the head is lower
+HEADING_SPREAD = 0.3  # [rad], initial heading relative to the course
+STEP_MAX = 1.0  # [s], a step that takes longer times out
+_POSTURES = 512  # collision-free arm postures prepared at construction
+
+
+class HumanoidEnv(EnvBase):
+    """DeepMind Control humanoid on an infinite plane, observed for walking with a style.
+
+    The env knows no style: it emits `task_reward` and the raw `style_features` from which `StyleReward` computes the
+    style's part. Episodes start upright with random arms and end when the head falls below 1.1 m (terminated) or
+    after `episode_steps` (truncated).
+
+    Args:
+        num_envs: N, stepped together.
+        num_threads: physics threads; default: one per core that this process may use, at most `num_envs`.
+        seed: seed of the initial states.
+        episode_steps: control steps (25 ms) after which an episode is truncated.
+        step_max: time without a foot strike after which a step times out [s].
+
+    Keys written: `observation` (N, 82) float32, `task_reward` (N, 1), `style_features` (N, 13),
+    `done`, `terminated`, `truncated` (N, 1).
+
+    Example:
+        >>> env = HumanoidEnv(num_envs=2, seed=0)
+        >>> env.rollout(3)["next", "observation"].shape
+        torch.Size([2, 3, 82])
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 32,
+        *,
+        num_threads: int | None = None,
+        seed: int | None = None,
+        episode_steps: int = EPISODE_STEPS,
+        step_max: float = STEP_MAX,
+    ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        if step_max <= 0:
+            raise ValueError(f"step_max must be positive seconds, got {step_max}")
+        super().__init__(device="cpu", batch_size=[num_envs])
+        if num_threads is None:
+            num_threads = min(len(os.sched_getaffinity(0)), num_envs)
+        self.num_envs = num_envs
+        self.episode_steps = episode_steps
+        # One thread is the calling one: no pool to wake.
+        self.simulation = HumanoidSimulation(num_envs, 0 if num_threads == 1 else num_threads)
+        self.gait = GaitTracker.create(num_envs, step_max)
+        self.course = np.zeros(num_envs)
+        self.steps = np.zeros(num_envs, dtype=np.int64)
+        self.divergences = 0
+        self._observation = np.zeros((num_envs, OBSERVATION_SIZE), dtype=np.float32)
+        self._postures = self._find_postures()
+        self._random = np.random.default_rng(seed)
+        self._make_specs()
+
+    def steer(self, course: float | np.ndarray) -> None:
+        """Set the direction that counts as forward, counter-clockwise from +x [rad], for all envs or each (N,)."""
+        self.course[:] = course
+
+    # -- TorchRL ---------------------------------------------------------------------------------------------------
+
+    def _make_specs(self) -> None:
+        n = self.num_envs
+        self.action_spec = Bounded(-1.0, 1.0, shape=(n, NUM_ACTIONS), dtype=torch.float32)
+        self.observation_spec = Composite(
+            {
+                "observation": Unbounded(shape=(n, OBSERVATION_SIZE), dtype=torch.float32),
+                TASK_REWARD: Unbounded(shape=(n, 1), dtype=torch.float32),
+                STYLE_FEATURES: Unbounded(shape=(n, STYLE_FEATURES_SIZE), dtype=torch.float32),
+            },
+            shape=(n,),
+        )
+        self.reward_spec = Unbounded(shape=(n, 1), dtype=torch.float32)
+        self.done_spec = Composite(
+            {name: Binary(n=1, shape=(n, 1), dtype=torch.bool) for name in ("done", "terminated", "truncated")},
+            shape=(n,),
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._random = np.random.default_rng(seed)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
+        partial = None if tensordict is None else tensordict.get("_reset", None)
+        mask = np.ones(self.num_envs, dtype=bool) if partial is None else partial.reshape(self.num_envs).numpy()
+        rows = np.flatnonzero(mask)
+        if len(rows):
+            self._start_episodes(rows)
+        zero = torch.zeros(self.num_envs, 1)
+        done = torch.zeros(self.num_envs, 1, dtype=torch.bool)
+        return TensorDict(
+            {
+                "observation": torch.from_numpy(self._observation.copy()),
+                TASK_REWARD: zero,
+                STYLE_FEATURES: torch.zeros(self.num_envs, STYLE_FEATURES_SIZE),
+                "done": done,
+                "terminated": done.clone(),
+                "truncated": done.clone(),
+            },
+            batch_size=self.batch_size,
+        )
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        controls = np.clip(tensordict.get("action").detach().numpy().astype(np.float64), -1.0, 1.0)
+        if np.isnan(controls).any():
+            raise ValueError("action contains NaN: the policy has diverged")
+        diverged = self.simulation.step(controls)
+        self.divergences += int(diverged.sum())
+        self.steps += 1
+        kinematics = self.simulation.kinematics()
+        feet = rotate_to_course(kinematics.feet, self.course)
+        report = self.gait.update(feet, kinematics.foot_clearance, self._knees())
+        forward_speed = rotate_to_course(kinematics.com_velocity, self.course)[:, 0]
+        task_reward = move_reward(forward_speed, kinematics.head_height, controls)
+        arms = self.simulation.positions[:, self.simulation.model.arm_positions]
+        terminated = torch.from_numpy((kinematics.head_height < FALL_HEIGHT) | diverged)[:, None]
+        truncated = torch.from_numpy(self.steps >= self.episode_steps)[:, None] & ~terminated
+        reward = torch.from_numpy(task_reward.astype(np.float32))[:, None]
+        self._observation = self._observe(kinematics, np.arange(self.num_envs))
+        return TensorDict(
+            {
+                "observation": torch.from_numpy(self._observation.copy()),
+                TASK_REWARD: reward,
+                "reward": reward.clone(),
+                STYLE_FEATURES: torch.from_numpy(pack_style_features(arms, report)),
+                "done": terminated | truncated,
+                "terminated": terminated,
+                "truncated": truncated,
+            },
+            batch_size=self.batch_size,
+        )
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Stop the physics threads."""
+        if not self.is_closed:
+            self.simulation.close()
+        super().close(raise_if_closed=raise_if_closed)
+
+    # -- state -----------------------------------------------------------------------------------------------------
+
+    def simulator_state(self) -> dict[str, object]:
+        """Everything that the next step depends on, as tensors and plain values, for exact resumption."""
+        arrays = {"state": self.simulation.state, "course": self.course, "steps": self.steps, "observation": self._observation}
+        arrays |= {f"gait.{name}": value for name, value in self.gait.arrays().items()}
+        tensors: dict[str, object] = {name: torch.from_numpy(value.copy()) for name, value in arrays.items()}
+        return tensors | {"random": self._random.bit_generator.state}
+
+    def load_simulator_state(self, state: dict[str, object]) -> None:
+        """Restore what `simulator_state` returned.
+
+        Raises:
+            ValueError: if it comes from another number of envs.
+        """
+        physics = state["state"]
+        assert isinstance(physics, torch.Tensor)
+        if len(physics) != self.num_envs:
+            raise ValueError(f"state of {len(physics)} envs given, this env has {self.num_envs}")
+        self.simulation.state[:] = physics.numpy()
+        self.course[:] = np.asarray(state["course"])
+        self.steps[:] = np.asarray(state["steps"])
+        self._observation[:] = np.asarray(state["observation"])
+        for name in self.gait.arrays():
+            setattr(self.gait, name, np.array(state[f"gait.{name}"]))
+        self._random.bit_generator.state = state["random"]  # type: ignore[assignment]
+
+    def _start_episodes(self, rows: np.ndarray) -> None:
+        """Upright, feet on the ground, random arms, heading near the course."""
+        positions = np.tile(self.simulation.model.dynamics.qpos0, (len(rows), 1))
+        positions[:, 7:] = 0.0
+        postures = self._random.integers(0, len(self._postures), len(rows))
+        positions[:, self.simulation.model.arm_positions] = self._postures[postures]
+        positions[:, 2] = self._standing_height
+        heading = self.course[rows] + self._random.uniform(-HEADING_SPREAD, HEADING_SPREAD, len(rows))
+        positions[:, 3], positions[:, 6] = np.cos(heading / 2), np.sin(heading / 2)
+        self.simulation.state[rows, 0] = 0.0
+        self.simulation.state[rows, 1 : 1 + NUM_POSITIONS] = positions
+        self.simulation.state[rows, 1 + NUM_POSITIONS :] = 0.0
+        self.steps[rows] = 0
+        kinematics = self.simulation.kinematics(rows)
+        feet = rotate_to_course(kinematics.feet, self.course[rows])
+        self.gait.reset(rows, self._random.integers(0, 2, len(rows)), feet, self._knees()[rows])
+        self._observation[rows] = self._observe(kinematics, rows)
+
+    def _find_postures(self) -> np.ndarray:
+        """Arm postures (M, 6) without self-collision, drawn uniformly within the joint limits."""
+        # Always the same set, so that an env's seed decides only which of them an episode starts with.
+        random = np.random.default_rng(0)
+        model = self.simulation.model
+        state = self.simulation.state[:1].copy()
+        state[0, 1 + 7 : 1 + NUM_POSITIONS] = 0.0
+        self._standing_height = float(state[0, 3] - self.simulation.kinematics_of(state).foot_clearance.min())
+        lower, upper = model.arm_ranges.T
+        found = []
+        while len(found) < _POSTURES:
+            posture = random.uniform(lower, upper)
+            # Contacts with the floor do not count: the search happens above it.
+            state[0, 3] = self._standing_height + 1.0
+            state[0, 1 + model.arm_positions] = posture
+            if self.simulation.count_contacts(state[0]) == 0:
+                found.append(posture)
+        return np.array(found)
+
+    def _knees(self) -> np.ndarray:
+        return self.simulation.positions[:, self.simulation.model.knee_positions]
+
+    def _observe(self, kinematics: Kinematics, rows: np.ndarray) -> np.ndarray:
+        """Scaled observation (len(rows), 82) float32 of the states that `kinematics` belongs to."""
+        course = self.course[rows]
+        suite = suite_observation(
+            self.simulation.positions[rows], self.simulation.velocities[rows], kinematics, course
+        )
+        pelvis = orientation_to_course(kinematics.pelvis_quaternion, course)
+        values = np.concatenate([suite, pelvis, self.gait.observe()[rows]], axis=1) * OBSERVATION_SCALE
+        return values.astype(np.float32)

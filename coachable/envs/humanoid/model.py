@@ -1,0 +1,144 @@
+"""MuJoCo models of the DeepMind Control humanoid, and where its quantities lie in the state.
+
+Two compiled models share the suite's body. The *dynamics* model integrates; it has no sensors, because the suite's force
+sensors alone cost a pass of inverse dynamics per physics step. The *kinematics* model has only the sensors that our
+features need and every force switched off, so that one cheap step of it reads the geometry of any state.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from dm_control.suite import humanoid as suite_humanoid
+
+PHYSICS_STEP = 0.005  # [s], as in the suite
+PHYSICS_STEPS_PER_CONTROL = 5
+CONTROL_STEP = PHYSICS_STEP * PHYSICS_STEPS_PER_CONTROL  # [s]
+
+NUM_ACTIONS = 21
+NUM_POSITIONS = 28  # free joint 7 + 21 hinges
+NUM_VELOCITIES = 27
+
+ARM_JOINTS = (
+    "right_shoulder1",
+    "right_shoulder2",
+    "right_elbow",
+    "left_shoulder1",
+    "left_shoulder2",
+    "left_elbow",
+)
+KNEE_JOINTS = ("right_knee", "left_knee")
+FEET = ("right_foot", "left_foot")
+# The suite lists the end effectors in this order.
+EXTREMITIES = ("left_hand", "left_foot", "right_hand", "right_foot")
+
+# End points of the two capsules of each foot in the foot's frame [m], and their radius: from the suite's MJCF.
+_FOOT_CAPSULES = {
+    "right_foot": ((-0.07, -0.02), (0.14, -0.04), (-0.07, 0.0), (0.14, 0.02)),
+    "left_foot": ((-0.07, 0.02), (0.14, 0.04), (-0.07, 0.0), (0.14, -0.02)),
+}
+FOOT_RADIUS = 0.027  # [m]
+
+_FULL_PHYSICS = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
+
+
+@dataclass(frozen=True)
+class HumanoidModel:
+    """Compiled models and the addresses that the simulation reads.
+
+    Attributes:
+        dynamics: model that integrates, without sensors.
+        kinematics: model whose sensors are the geometry of a state, without forces.
+        sensors: name to slice of the kinematics model's sensor vector.
+        arm_positions: addresses of the six arm joints in qpos, in the order of `ARM_JOINTS`.
+        knee_positions: addresses of the right and left knee in qpos.
+        arm_ranges: (6, 2) joint limits of the arms [rad].
+        foot_points: (2, 4, 2) capsule end points of each foot in its own frame [m].
+    """
+
+    dynamics: mujoco.MjModel
+    kinematics: mujoco.MjModel
+    sensors: dict[str, slice]
+    arm_positions: np.ndarray
+    knee_positions: np.ndarray
+    arm_ranges: np.ndarray
+    foot_points: np.ndarray
+
+
+def load_spec() -> mujoco.MjSpec:
+    """The suite's humanoid as an editable specification."""
+    xml, assets = suite_humanoid.get_model_and_assets()
+    # dm_control prefixes its includes with "./", which MjSpec does not resolve.
+    text = (xml.decode() if isinstance(xml, bytes) else xml).replace('"./common/', '"common/')
+    include = {name.removeprefix("./"): data for name, data in assets.items()}
+    return mujoco.MjSpec.from_string(text, include=include)
+
+
+def build_model() -> HumanoidModel:
+    """Compile the dynamics and kinematics models."""
+    dynamics_spec = load_spec()
+    for sensor in list(dynamics_spec.sensors):
+        dynamics_spec.delete(sensor)
+    dynamics = dynamics_spec.compile()
+    # Without auto-reset a diverging state stays visible instead of turning silently into the initial one.
+    dynamics.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+
+    kinematics_spec = load_spec()
+    for sensor in list(kinematics_spec.sensors):
+        kinematics_spec.delete(sensor)
+    _add_sensors(kinematics_spec)
+    kinematics = kinematics_spec.compile()
+    bits = mujoco.mjtDisableBit
+    kinematics.opt.disableflags |= int(
+        bits.mjDSBL_AUTORESET
+        | bits.mjDSBL_CONSTRAINT
+        | bits.mjDSBL_CONTACT
+        | bits.mjDSBL_ACTUATION
+        | bits.mjDSBL_GRAVITY
+    )
+    sensors = {
+        kinematics.sensor(i).name: slice(
+            int(kinematics.sensor_adr[i]), int(kinematics.sensor_adr[i] + kinematics.sensor_dim[i])
+        )
+        for i in range(kinematics.nsensor)
+    }
+    return HumanoidModel(
+        dynamics=dynamics,
+        kinematics=kinematics,
+        sensors=sensors,
+        arm_positions=_positions(dynamics, ARM_JOINTS),
+        knee_positions=_positions(dynamics, KNEE_JOINTS),
+        arm_ranges=np.stack([dynamics.joint(name).range for name in ARM_JOINTS]),
+        foot_points=np.array([_FOOT_CAPSULES[foot] for foot in FEET]),
+    )
+
+
+def state_size(model: mujoco.MjModel) -> int:
+    """Length of the full physics state: time, qpos, qvel."""
+    return mujoco.mj_stateSize(model, _FULL_PHYSICS)
+
+
+def _positions(model: mujoco.MjModel, joints: tuple[str, ...]) -> np.ndarray:
+    return np.array([int(model.joint(name).qposadr[0]) for name in joints])
+
+
+def _add_sensors(spec: mujoco.MjSpec) -> None:
+    kinds = mujoco.mjtSensor
+    requests = [("com_velocity", kinds.mjSENS_SUBTREELINVEL, "torso")]
+    requests += [("pelvis_quaternion", kinds.mjSENS_FRAMEQUAT, "pelvis")]
+    for body in ("torso", "head", *EXTREMITIES):
+        requests.append((f"{body}_position", kinds.mjSENS_FRAMEPOS, body))
+    for axis, kind in (
+        ("x", kinds.mjSENS_FRAMEXAXIS),
+        ("y", kinds.mjSENS_FRAMEYAXIS),
+        ("z", kinds.mjSENS_FRAMEZAXIS),
+    ):
+        requests.append((f"torso_{axis}_axis", kind, "torso"))
+        if axis != "z":
+            requests += [(f"{foot}_{axis}_axis", kind, foot) for foot in FEET]
+    for name, kind, body in requests:
+        # Subtree sensors attach to a body, frame sensors to the body's own frame ("xbody", not its inertial frame).
+        target = mujoco.mjtObj.mjOBJ_BODY if kind == kinds.mjSENS_SUBTREELINVEL else mujoco.mjtObj.mjOBJ_XBODY
+        spec.add_sensor(name=name, type=kind, objtype=target, objname=body)

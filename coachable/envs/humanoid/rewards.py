@@ -1,0 +1,32 @@
+"""Task reward of the humanoid: move forward along the course, without waste, with the head up."""
+
+from __future__ import annotations
+
+import numpy as np
+from dm_control.utils.rewards import tolerance
+
+WALK_SPEED = 1.0  # [m/s], the suite's walking speed
+STAND_HEIGHT = 1.4  # [m], head height above which the suite counts the humanoid as standing
+_STAND_MARGIN = STAND_HEIGHT / 4
+
+
+def move_reward(forward_speed: np.ndarray, head_height: np.ndarray, controls: np.ndarray) -> np.ndarray:
+    """Task reward `r_move` (Appendix C, DMC Humanoid), within [0, 1].
+
+    The factors are those of the suite's walk task; what differs is that only speed along the course counts and that
+    standing still earns nothing.
+
+    Args:
+        forward_speed: (N,) speed of the centre of mass along the course [m/s].
+        head_height: (N,) [m].
+        controls: (N, 21) motor commands in [-1, 1].
+
+    Returns:
+        (N,)
+    """
+    moving = tolerance(
+        forward_speed, bounds=(WALK_SPEED, np.inf), margin=WALK_SPEED, value_at_margin=0, sigmoid="linear"
+    )
+    standing = tolerance(head_height, bounds=(STAND_HEIGHT, np.inf), margin=_STAND_MARGIN)
+    effortless = tolerance(controls, margin=1, value_at_margin=0, sigmoid="quadratic").mean(axis=1)
+    return moving * standing * (4 + effortless) / 5
