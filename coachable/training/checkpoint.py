@@ -1,0 +1,265 @@
+"""Checkpoints: written atomically, read without pickle, and refused with a reason where they do not fit.
+
+A checkpoint is a folder with `state.pt` (tensors, numbers, strings, containers: `torch.load(weights_only=True)`), a
+readable `metadata.json` and, in the newest one, the replay buffer under `replay/`.
+"""
+
+import contextlib
+import json
+import os
+import shutil
+import time
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from coachable.training.replay_files import write_replay
+
+__all__ = ["CheckpointError", "CheckpointStore", "check_fits", "check_writable", "find_checkpoint", "read_state"]
+
+SCHEMA_VERSION = 1
+_LATEST = "LATEST"
+_STATE = "state.pt"
+
+
+class CheckpointError(RuntimeError):
+    """A checkpoint is missing, damaged or does not fit the run that wants it."""
+
+
+class CheckpointStore:
+    """The checkpoints of one run.
+
+    Args:
+        directory: folder of the checkpoints, created when first written to.
+        keep: how many to keep; older ones are removed after a new one is complete.
+        replay: whether the newest checkpoint holds the replay buffer (needed to resume exactly).
+
+    Raises:
+        ValueError: if `keep` is below 1.
+    """
+
+    def __init__(self, directory: Path | str, keep: int = 3, replay: bool = True) -> None:
+        if keep < 1:
+            raise ValueError(f"checkpoint.keep must be at least 1, got {keep}")
+        self.directory = Path(directory)
+        self.keep = keep
+        self.replay = replay
+
+    def save(self, state: Mapping[str, Any], metadata: Mapping[str, Any], replay: Any | None = None) -> Path:
+        """Writes one checkpoint: complete, or not at all.
+
+        Everything goes to a hidden folder that is synced to disk and renamed, so that a process killed at any moment
+        leaves the previous checkpoint as it was.
+
+        Args:
+            state: what `state.pt` holds.
+            metadata: JSON-ready; must contain `frames`.
+            replay: replay buffer to save with it, if this store keeps replays.
+
+        Returns:
+            The folder.
+
+        Raises:
+            OSError: if writing fails (disk full, no permission); the partial is removed first.
+        """
+        self.directory.mkdir(parents=True, exist_ok=True)
+        name = self._free_name(int(metadata["frames"]))
+        partial = self.directory / f".{name}.partial"
+        shutil.rmtree(partial, ignore_errors=True)
+        try:
+            partial.mkdir()
+            _save_tensors({"schema": SCHEMA_VERSION, **state}, partial / _STATE)
+            _write_text(partial / "metadata.json", json.dumps({"schema": SCHEMA_VERSION, **metadata}, indent=1))
+            if replay is not None and self.replay:
+                write_replay(replay, partial / "replay")
+            _sync_folder(partial)
+            os.rename(partial, self.directory / name)
+            pointer = self.directory / f".{_LATEST}.partial"
+            _write_text(pointer, name + "\n")
+            os.replace(pointer, self.directory / _LATEST)
+            _sync_folder(self.directory)
+        except BaseException:
+            shutil.rmtree(partial, ignore_errors=True)
+            raise
+        self._prune(name)
+        return self.directory / name
+
+    def try_save(self, state: Mapping[str, Any], metadata: Mapping[str, Any], replay: Any | None = None) -> Path | None:
+        """Like `save`, but a failed write only warns: a long training should outlive a disk that is full."""
+        try:
+            return self.save(state, metadata, replay)
+        except OSError as error:
+            warnings.warn(
+                f"checkpoint at {metadata['frames']} frames was not written to {self.directory}: {error}. "
+                "Training goes on; the previous checkpoint is intact.",
+                stacklevel=2,
+            )
+            return None
+
+    def _free_name(self, frames: int) -> str:
+        base = f"frames_{frames:012d}"
+        name, copy = base, 1
+        while (self.directory / name).exists():
+            copy += 1
+            name = f"{base}-{copy}"
+        return name
+
+    def _prune(self, newest: str) -> None:
+        for stale in self.directory.glob(".*.partial"):
+            shutil.rmtree(stale, ignore_errors=True)
+        others = [folder for folder in _complete(self.directory) if folder.name != newest]
+        for folder in others[: max(0, len(others) - (self.keep - 1))]:
+            shutil.rmtree(folder, ignore_errors=True)
+        if (self.directory / newest / "replay").exists():
+            for folder in others:
+                shutil.rmtree(folder / "replay", ignore_errors=True)
+
+
+def find_checkpoint(path: Path | str) -> Path:
+    """Finds a checkpoint folder.
+
+    Args:
+        path: a checkpoint, the `checkpoints` folder of a run, or the run's folder (then: its newest).
+
+    Raises:
+        CheckpointError: if there is none.
+    """
+    path = Path(path).expanduser()
+    if (path / _STATE).is_file():
+        return path
+    folder = path / "checkpoints" if (path / "checkpoints").is_dir() else path
+    pointer = folder / _LATEST
+    if pointer.is_file():
+        named = folder / pointer.read_text(encoding="utf-8").strip()
+        if (named / _STATE).is_file():
+            return named
+    complete = _complete(folder) if folder.is_dir() else []
+    if not complete:
+        raise CheckpointError(
+            f"no checkpoint at {path}: expected a run's folder, its checkpoints/ or one folder of them"
+        )
+    return complete[-1]
+
+
+def read_state(path: Path | str, device: torch.device | str = "cpu") -> dict[str, Any]:
+    """Reads `state.pt` of a checkpoint, or a weights file, without executing anything from it.
+
+    Args:
+        path: a checkpoint folder, or a file.
+        device: where tensors go.
+
+    Raises:
+        CheckpointError: if it is damaged, of another schema, or would need pickle.
+    """
+    path = Path(path)
+    file = path / _STATE if path.is_dir() else path
+    try:
+        state = torch.load(file, map_location=device, weights_only=True)
+    except FileNotFoundError:
+        raise CheckpointError(f"no such file: {file}") from None
+    except Exception as error:
+        raise CheckpointError(f"cannot read {file}: {error}") from error
+    if not isinstance(state, dict) or state.get("schema") != SCHEMA_VERSION:
+        found = state.get("schema") if isinstance(state, dict) else type(state).__name__
+        raise CheckpointError(f"{file} has schema {found}, this version of coachable reads schema {SCHEMA_VERSION}")
+    return state
+
+
+def check_fits(saved: Mapping[str, Tensor], present: Mapping[str, Tensor], what: str, source: Path | str) -> None:
+    """Compares two sets of parameters by name and shape.
+
+    Args:
+        saved: from the checkpoint.
+        present: of this run.
+        what: what they are, for the message ("actor").
+        source: where `saved` came from.
+
+    Raises:
+        CheckpointError: naming what is missing, unexpected or shaped differently.
+    """
+    problems = [f"{name} is missing in the checkpoint" for name in present if name not in saved]
+    problems += [f"{name} is unknown here" for name in saved if name not in present]
+    problems += [
+        f"{name} is {tuple(saved[name].shape)} in the checkpoint, {tuple(value.shape)} here"
+        for name, value in present.items()
+        if name in saved and saved[name].shape != value.shape
+    ]
+    if problems:
+        shown = "; ".join(problems[:6]) + (f"; and {len(problems) - 6} more" if len(problems) > 6 else "")
+        raise CheckpointError(
+            f"the {what} of {source} does not fit this run: {shown}. "
+            "Choose the same network settings (network.*), loss and domain, or start without resume and init_from."
+        )
+
+
+def check_writable(directory: Path | str, required_bytes: int = 0) -> None:
+    """Makes sure before a training starts that its folder can be written to and is large enough.
+
+    Args:
+        directory: created if missing.
+        required_bytes: what the run is going to need.
+
+    Raises:
+        CheckpointError: saying what is wrong and what to change.
+    """
+    directory = Path(directory)
+    probe = directory / ".write_test"
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with probe.open("wb") as file:
+            file.write(b"\0" * 2**20)
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise CheckpointError(
+            f"cannot write to {directory}: {error}. Choose another folder with run_dir=PATH"
+        ) from error
+    finally:
+        with contextlib.suppress(OSError):
+            probe.unlink(missing_ok=True)
+    free = shutil.disk_usage(directory).free
+    if free < required_bytes:
+        raise CheckpointError(
+            f"{directory} has {free / 1e9:.2f} GB free, checkpoints need about {required_bytes / 1e9:.2f} GB. Choose "
+            "another folder with run_dir=PATH, or leave the replay buffer out with checkpoint.replay=false"
+        )
+
+
+def _complete(directory: Path) -> list[Path]:
+    """Complete checkpoints, oldest first (by time of writing: a resumed run may have gone back in frames)."""
+    found = [p for p in directory.glob("frames_*") if (p / _STATE).is_file()]
+    return sorted(found, key=lambda p: ((p / _STATE).stat().st_mtime_ns, p.name))
+
+
+def _save_tensors(state: Mapping[str, Any], file: Path) -> None:
+    try:
+        with file.open("wb") as stream:
+            torch.save(dict(state), stream)
+            stream.flush()
+            os.fsync(stream.fileno())
+    except RuntimeError as error:  # torch's zip writer reports a failed write this way
+        raise OSError(str(error)) from error
+
+
+def _write_text(file: Path, text: str) -> None:
+    with file.open("w", encoding="utf-8") as stream:
+        stream.write(text)
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def now() -> str:
+    """UTC time as ISO 8601."""
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())

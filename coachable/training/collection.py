@@ -1,0 +1,217 @@
+"""Collecting: TorchRL's collector with a state that a training can be resumed from, and a short evaluation."""
+
+import warnings
+from collections.abc import Callable, Iterable
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.collectors import BaseCollector, Collector
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from coachable.training.rng import preserved_rng
+
+__all__ = [
+    "ResumableEnv",
+    "collector_state",
+    "evaluate_policy",
+    "load_collector_state",
+    "make_collector",
+    "simulation_env",
+]
+
+
+@runtime_checkable
+class ResumableEnv(Protocol):
+    """An env whose running episodes can be saved and continued."""
+
+    def simulator_state(self) -> dict[str, Any]:
+        """Everything that the next step depends on, as tensors and plain values."""
+        ...
+
+    def load_simulator_state(self, state: dict[str, Any]) -> None:
+        """Restores what `simulator_state` returned."""
+        ...
+
+
+def make_collector(
+    make_env: Callable[[int], EnvBase],
+    policy: Any,
+    *,
+    frames_per_batch: int,
+    init_random_frames: int = 0,
+    backend: str = "direct",
+    num_collectors: int = 1,
+    sync: bool = True,
+    seed: int = 0,
+    policy_device: torch.device | str | None = None,
+) -> BaseCollector:
+    """Makes the collector of a training.
+
+    Args:
+        make_env: called with a seed, returns a batched env `[N]` that is already seeded (the collector's constructor
+            resets it, so seeding afterwards would miss the first episode).
+        policy: the actor; with `backend="direct"` it is used as it is, so updates reach it without a copy.
+        frames_per_batch: env-steps per iteration, a multiple of N.
+        init_random_frames: env-steps with uniformly random actions at the start.
+        backend: "direct" (this process), "process" (one host) or "ray" (many hosts).
+        num_collectors: workers of the latter two.
+        sync: whether an iteration waits for all workers.
+        seed: worker i gets `seed + i`.
+        policy_device: where the policy runs, if not where the env is.
+
+    Raises:
+        ValueError: for an unknown backend.
+    """
+    common: dict[str, Any] = {
+        "frames_per_batch": frames_per_batch,
+        "total_frames": -1,  # the loop decides when to stop
+        "init_random_frames": init_random_frames or None,
+        "exploration_type": ExplorationType.RANDOM,
+        "auto_register_policy_transforms": False,  # ours need none
+    }
+    if policy_device is not None and torch.device(policy_device).type != "cpu":
+        common |= {"policy_device": policy_device, "env_device": "cpu", "storing_device": "cpu"}
+    if backend == "direct":
+        return Collector(make_env(seed), policy, use_buffers=False, trust_policy=True, **common)
+    if backend in ("process", "ray"):
+        factories = [_SeededFactory(make_env, seed + i) for i in range(num_collectors)]
+        return Collector(factories, policy, backend=backend, num_collectors=num_collectors, sync=sync, **common)
+    raise ValueError(f"collector backend must be direct, process or ray, got {backend!r}")
+
+
+class _SeededFactory:
+    """A picklable call of `make_env(seed)`."""
+
+    def __init__(self, make_env: Callable[[int], EnvBase], seed: int) -> None:
+        self.make_env = make_env
+        self.seed = seed
+
+    def __call__(self) -> EnvBase:
+        return self.make_env(self.seed)
+
+
+def simulation_env(env: EnvBase) -> EnvBase:
+    """Peels the transforms off an env."""
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    return env
+
+
+def collector_state(collector: BaseCollector) -> dict[str, Any]:
+    """Reads what the next iteration of a single-process collector depends on, besides policy and global generators.
+
+    Returns:
+        Tensors and plain containers: frame count, transforms' state (style generators), the simulation's own state and
+        the tensordict that the next step starts from. Empty for workers in other processes: their episodes restart.
+    """
+    if not isinstance(collector, Collector):
+        return {}
+    env, base = collector.env, simulation_env(collector.env)
+    simulation = base.simulator_state() if isinstance(base, ResumableEnv) else {}
+    return {
+        "frames": int(collector._frames),
+        "iterations": int(collector._iter),
+        "transforms": dict(env.state_dict()) if isinstance(env, TransformedEnv) else {},
+        "simulation": simulation,
+        # Without the simulation's state, the observation to go on from would not be the simulator's.
+        "carrier": _plain(collector._carrier) if simulation else {},
+    }
+
+
+def load_collector_state(collector: BaseCollector, state: dict[str, Any]) -> bool:
+    """Restores what `collector_state` read.
+
+    Args:
+        collector: a fresh one, made like the old one.
+        state: from `collector_state`.
+
+    Returns:
+        Whether the running episodes go on. If not (the env keeps no state, or workers in other processes), they
+        restart; a warning says so.
+    """
+    if not state or not isinstance(collector, Collector):
+        warnings.warn("the collector's state was not saved or cannot be restored: episodes restart", stacklevel=2)
+        return False
+    env, base = collector.env, simulation_env(collector.env)
+    collector._frames = state["frames"]
+    collector._iter = state["iterations"]
+    if isinstance(env, TransformedEnv):
+        env.load_state_dict(state["transforms"])
+    if not state["carrier"] or not isinstance(base, ResumableEnv):
+        warnings.warn(f"{type(base).__name__} does not save its simulator's state: episodes restart", stacklevel=2)
+        return False
+    saved = tuple(state["carrier"]["done"].shape)
+    present = tuple(collector._carrier["done"].shape)
+    if saved != present:
+        warnings.warn(
+            f"the checkpoint holds {saved[0]} environments, this run has {present[0]} (num_envs): episodes restart",
+            stacklevel=2,
+        )
+        return False
+    base.load_simulator_state(state["simulation"])
+    carrier = TensorDict(state["carrier"], batch_size=collector._carrier.batch_size)
+    if ("collector", "traj_ids") in carrier.keys(True):
+        collector._traj_pool.get_traj_and_increment(int(carrier["collector", "traj_ids"].max()) + 1)
+    collector._carrier = carrier.clone()
+    return True
+
+
+def evaluate_policy(
+    env: EnvBase,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    *,
+    max_steps: int,
+    keys: Iterable[str] = (),
+    device: torch.device | str = "cpu",
+) -> dict[str, float]:
+    """Runs one episode per environment with the deterministic policy.
+
+    Args:
+        env: batched env `[N]`; it is reset first, with styles drawn by its sampler.
+        policy: writes `action`.
+        max_steps: episodes longer than this are cut.
+        keys: entries of `next`, (N, 1) each, to average per step beside the returns.
+        device: where the policy is.
+
+    Returns:
+        `return`, `task_return`, `length`, `survived` (share that did not terminate), one `NAME_per_step` for each key,
+        all averaged over episodes.
+    """
+    wanted = dict.fromkeys(["reward", "task_reward", *keys])
+    with preserved_rng(), torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        td = env.reset()
+        running = torch.ones(env.batch_size, dtype=torch.bool, device=td["done"].device)
+        fell = torch.zeros_like(running)
+        length = torch.zeros_like(running, dtype=torch.float32)
+        sums = {key: torch.zeros_like(length) for key in wanted}
+        for _ in range(max_steps):
+            acted = policy(td.to(device)).to(env.device)
+            stepped, td = env.step_and_maybe_reset(acted)
+            after = stepped["next"]
+            length += running
+            for key, total in sums.items():
+                value = after.get(key, None)
+                if value is not None:
+                    total += torch.where(running, value.reshape(running.shape), 0.0)
+            fell |= running & after["terminated"].reshape(running.shape)
+            running &= ~after["done"].reshape(running.shape)
+            if not running.any():
+                break
+    result = {
+        "return": sums["reward"].mean().item(),
+        "task_return": sums["task_reward"].mean().item(),
+        "length": length.mean().item(),
+        "survived": 1.0 - fell.float().mean().item(),
+    }
+    for key in keys:
+        result[f"{key}_per_step"] = (sums[key] / length).mean().item()
+    return result
+
+
+def _plain(td: TensorDictBase) -> dict[str, Any]:
+    return {
+        str(key): _plain(value) if isinstance(value, TensorDictBase) else value.detach().clone().cpu()
+        for key, value in td.items()
+    }

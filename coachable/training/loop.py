@@ -1,0 +1,346 @@
+"""The one training loop: collect, store, update, evaluate, log, checkpoint."""
+
+import signal
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.collectors import BaseCollector, Collector
+from torchrl.data import ReplayBuffer
+
+from coachable.keys import STYLE, STYLE_FEATURES, TASK_REWARD
+from coachable.training.checkpoint import CheckpointStore, find_checkpoint, now, read_state
+from coachable.training.collection import collector_state, load_collector_state
+from coachable.training.episodes import EpisodeStatistics, Means
+from coachable.training.learner import Learner
+from coachable.training.logging import MetricsLog, Progress
+from coachable.training.replay_files import read_replay
+from coachable.training.rng import rng_state, set_rng_state
+from coachable.training.throttle import Throttle
+from coachable.training.weights import require_same_agent
+
+__all__ = ["REPLAY_KEYS", "Train", "TrainSettings"]
+
+REPLAY_KEYS: tuple[str | tuple[str, ...], ...] = (
+    "observation",
+    "action",
+    STYLE,
+    ("next", "observation"),
+    ("next", "reward"),
+    ("next", "done"),
+    ("next", "terminated"),
+    ("next", TASK_REWARD),
+    ("next", STYLE_FEATURES),
+)
+"""What replay stores: what losses and relabelling read. `("next", "style")` equals `style` and is not stored."""
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """When the loop does what.
+
+    Attributes:
+        total_frames: [env-steps] of the whole training, resumed parts included.
+        batch_size: transitions per update.
+        warmup_frames: [env-steps] before the first update.
+        utd_ratio: updates per env-step, fractions allowed; None makes as many as fit into the time that the throttle
+            leaves.
+        throttle: [env-steps/s] upper bound on collection, or None.
+        eval_interval: [env-steps] between evaluations, 0 for none but the last.
+        log_interval: [s] between rows of metrics.
+        checkpoint_interval: [s] between checkpoints.
+    """
+
+    total_frames: int
+    batch_size: int = 256
+    warmup_frames: int = 0
+    utd_ratio: float | None = 1.0
+    throttle: float | None = None
+    eval_interval: int = 0
+    log_interval: float = 20.0
+    checkpoint_interval: float = 300.0
+
+    def __post_init__(self) -> None:
+        """Refuses what cannot work."""
+        for name in ("total_frames", "batch_size"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.utd_ratio is None and self.throttle is None:
+            raise ValueError("utd_ratio=null (as many updates as fit) needs a throttle: set train.throttle=RATE")
+        if self.utd_ratio is not None and self.utd_ratio < 0:
+            raise ValueError(f"utd_ratio must not be negative, got {self.utd_ratio}")
+
+
+class Train:
+    """Trains until `total_frames`, a stop signal or an error.
+
+    Args:
+        collector: a TorchRL collector.
+        replay: buffer whose `sample(batch_size)` gives batches for the learner.
+        learner: makes the updates.
+        settings: see `TrainSettings`.
+        log: where metrics go.
+        progress: what a person sees meanwhile.
+        checkpoints: where checkpoints go, or None for none.
+        describe: returns what identifies the agent (style space, network, config, weights); every checkpoint contains
+            it.
+        evaluate: called without arguments now and then, returns metrics; it must leave the global generators as they
+            were.
+        style_terms: maps style features `(B, F)` and theta `(B, d)` to named, unscaled terms `(B,)` for the log.
+        replay_keys: see `REPLAY_KEYS`.
+    """
+
+    def __init__(
+        self,
+        *,
+        collector: BaseCollector,
+        replay: ReplayBuffer,
+        learner: Learner,
+        settings: TrainSettings,
+        log: MetricsLog,
+        progress: Progress,
+        checkpoints: CheckpointStore | None = None,
+        describe: Callable[[], Mapping[str, Any]] = dict,
+        evaluate: Callable[[], Mapping[str, float]] | None = None,
+        style_terms: Callable[[Any, torch.Tensor], Mapping[str, torch.Tensor]] | None = None,
+        replay_keys: tuple[str | tuple[str, ...], ...] = REPLAY_KEYS,
+    ) -> None:
+        self.collector = collector
+        self.replay = replay
+        self.learner = learner
+        self.settings = settings
+        self.log = log
+        self.progress = progress
+        self.checkpoints = checkpoints
+        self.describe = describe
+        self.evaluate = evaluate
+        self.replay_keys = replay_keys
+        self.frames = 0
+        self.owed = 0.0  # updates that utd_ratio asks for and that are not made yet
+        self.seconds = dict.fromkeys(("collect", "store", "update", "evaluate", "log", "checkpoint", "wait"), 0.0)
+        self._device = next(learner.loss_module.parameters()).device
+        self._throttle = Throttle(settings.throttle)
+        self._episodes = EpisodeStatistics(style_terms)
+        self._losses = Means()
+        self._latest: dict[str, float] = {}
+        self._evaluations = 0
+        self._logged = self._saved = time.monotonic()
+
+    def run(self) -> dict[str, float]:
+        """Runs the loop.
+
+        Returns:
+            The latest value of every metric.
+
+        Raises:
+            ValueError: if an observation or a reward is not finite.
+        """
+        batches = iter(self.collector)
+        with _stop_signals() as stop:
+            while self.frames < self.settings.total_frames and not stop.is_set():
+                data = self._collect(batches)
+                self._store(data)
+                self._update(data.numel(), stop)
+                self._evaluate_if_due()
+                self._log_if_due()
+                self._checkpoint_if_due()
+            self._finish(interrupted=stop.is_set())
+        return self._latest
+
+    def _collect(self, batches: Iterator[TensorDictBase]) -> TensorDictBase:
+        with self._timed("wait"):
+            self._throttle.wait()
+        with self._timed("collect"):
+            data = next(batches)
+        self.frames += data.numel()
+        self._throttle.add(data.numel())
+        return data
+
+    def _store(self, data: TensorDictBase) -> None:
+        with self._timed("store"):
+            data = data.contiguous().reshape(
+                -1
+            )  # flattening the lazy stack without contiguous() takes 25 times as long
+            _require_finite(data)
+            self._episodes.add(data)
+            self.replay.extend(data.select(*self.replay_keys))
+
+    def _update(self, new_frames: int, stop: threading.Event) -> None:
+        if self.frames <= self.settings.warmup_frames or len(self.replay) < self.settings.batch_size:
+            return
+        with self._timed("update"):
+            if self.settings.utd_ratio is None:  # the learner fills the time that the throttle leaves
+                while self._throttle.remaining() > 0 and not stop.is_set():
+                    self._update_once()
+            else:
+                self.owed += new_frames * self.settings.utd_ratio
+                while self.owed >= 1.0:
+                    self._update_once()
+                    self.owed -= 1.0
+            if not isinstance(
+                self.collector, Collector
+            ):  # a single-process collector acts with the learner's own weights
+                self.collector.update_policy_weights_()
+
+    def _update_once(self) -> None:
+        batch = self.replay.sample(self.settings.batch_size).to(self._device)
+        if ("next", STYLE) not in batch.keys(True):
+            batch.set(("next", STYLE), batch.get(STYLE))  # theta is fixed within a training episode
+        self._losses.add(self.learner.update(batch))
+
+    def _evaluate_if_due(self) -> None:
+        interval = self.settings.eval_interval
+        if interval and self.frames // interval > self._evaluations:
+            self._evaluations = self.frames // interval
+            self._evaluate()
+
+    def _evaluate(self) -> None:
+        if self.evaluate is None:
+            return
+        with self._timed("evaluate"):
+            metrics = {f"eval/{name}": value for name, value in self.evaluate().items()}
+        self._latest |= metrics
+        self._write({**self._position(), **metrics})
+
+    def _log_if_due(self) -> None:
+        if time.monotonic() - self._logged >= self.settings.log_interval:
+            self._log()
+        self.progress.update(self.frames, self.learner.updates, self._latest)
+
+    def _log(self) -> None:
+        with self._timed("log"):
+            self._logged = time.monotonic()
+            row = {**self._episodes.flush(), **{f"loss/{k}": v for k, v in self._losses.flush().items()}}
+            row |= {f"seconds/{name}": round(spent, 3) for name, spent in self.seconds.items()}
+            self._latest |= row
+            self._write({**self._position(), **row})
+
+    def _write(self, row: Mapping[str, float]) -> None:
+        try:
+            self.log.write(row, step=self.frames)
+        except OSError as error:  # a full disk must not end a training that may outlive it
+            warnings.warn(f"metrics at {self.frames} frames were not written: {error}", stacklevel=2)
+
+    def _position(self) -> dict[str, float]:
+        return {"frames": self.frames, "updates": self.learner.updates}
+
+    def _checkpoint_if_due(self) -> None:
+        if time.monotonic() - self._saved >= self.settings.checkpoint_interval:
+            self._checkpoint()
+
+    def _checkpoint(self) -> Path | None:
+        if self.checkpoints is None:
+            return None
+        with self._timed("checkpoint"):
+            metadata = {**self._position(), "created": now(), "versions": _versions()}
+            path = self.checkpoints.try_save({**self.describe(), **self.state_dict()}, metadata, self.replay)
+            self._saved = time.monotonic()
+        return path
+
+    def _finish(self, *, interrupted: bool) -> None:
+        if not interrupted:
+            self._evaluate()
+        self._log()
+        self._checkpoint()
+        self.progress.update(self.frames, self.learner.updates, self._latest, force=True)
+        self.progress.close()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that the rest of the training depends on, but for the replay buffer."""
+        return {
+            "learner": self.learner.state_dict(),
+            "loop": {"frames": self.frames, "owed": self.owed, "evaluations": self._evaluations},
+            "collector": collector_state(self.collector),
+            "rng": rng_state(),
+        }
+
+    def resume(self, path: Path | str) -> Path:
+        """Continues from a checkpoint of the same agent.
+
+        Args:
+            path: a run's folder or a checkpoint.
+
+        Returns:
+            The checkpoint.
+
+        Raises:
+            CheckpointError: if there is none, or style space or network shapes differ.
+        """
+        path = find_checkpoint(path)
+        state = read_state(path)
+        require_same_agent(state, self.describe(), path)
+        self.load_state_dict(state, path / "replay" if (path / "replay").is_dir() else None)
+        return path
+
+    def load_state_dict(self, state: Mapping[str, Any], replay: Path | None = None) -> None:
+        """Continues from a checkpoint.
+
+        Args:
+            state: contains what `state_dict` returned.
+            replay: folder of the saved replay buffer; None starts with an empty one, and says so.
+        """
+        self.learner.load_state_dict(state["learner"])
+        self.frames = state["loop"]["frames"]
+        self.owed = state["loop"]["owed"]
+        self._evaluations = state["loop"]["evaluations"]
+        if replay is not None:
+            read_replay(self.replay, replay)
+        else:
+            warnings.warn("the checkpoint has no replay buffer: the resumed training fills a new one", stacklevel=2)
+        load_collector_state(self.collector, state["collector"])
+        set_rng_state(state["rng"])  # last: what is restored above draws random numbers
+
+    @contextmanager
+    def _timed(self, part: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.seconds[part] += time.perf_counter() - start
+
+
+@contextmanager
+def _stop_signals() -> Iterator[threading.Event]:
+    """Turns the first Ctrl-C or SIGTERM into an event; the second one acts as usual."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def on_signal(number: int, _frame: FrameType | None) -> None:
+        stop.set()
+        signal.signal(number, before[number] or signal.SIG_DFL)
+
+    for number in before:
+        signal.signal(number, on_signal)
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler or signal.SIG_DFL)
+
+
+def _require_finite(data: TensorDictBase) -> None:
+    for key in ("observation", ("next", "observation"), ("next", "reward")):
+        value = data.get(key)
+        # The sum is finite only if every entry is; that an overflow may look alike, the second look sorts out.
+        if not torch.isfinite(value.sum()) and not torch.isfinite(value).all():
+            rows = (~torch.isfinite(value)).flatten(1).any(1).nonzero().flatten().tolist()
+            raise ValueError(
+                f"{key!r} is not finite in {len(rows)} of {len(value)} collected transitions (first: row {rows[0]}); none "
+                "of them was stored. The environment has to end an episode whose physics explode, and rewards have to "
+                "be finite for every style: look at its step function and at the style terms."
+            )
+
+
+def _versions() -> dict[str, str]:
+    from importlib.metadata import version
+
+    return {name: version(name) for name in ("coachable", "torch", "torchrl", "tensordict")}

@@ -1,0 +1,206 @@
+"""Agents in files: what identifies one, loading its policy, exporting and reusing its weights."""
+
+import importlib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from coachable.styles import StyleSpace
+from coachable.training.checkpoint import SCHEMA_VERSION, CheckpointError, check_fits, find_checkpoint, read_state
+
+__all__ = ["LoadedPolicy", "agent_state", "export_weights", "initialise_from", "load_policy", "require_same_agent"]
+
+_PRETRAINED = Path(__file__).resolve().parent.parent / "pretrained"
+_CRITICS = "qvalue_network_params."
+_AGENT = ("domain", "space", "config", "network", "actor", "critics")
+
+
+class LoadedPolicy(NamedTuple):
+    """What `load_policy` returns.
+
+    Attributes:
+        actor: the policy, in eval mode; reads `observation` and `style`, writes `action`.
+        space: the styles it was trained on.
+        config: the resolved configuration of its training, as plain containers.
+        metadata: `domain`, `source` (file), `frames` and `updates` where known.
+    """
+
+    actor: TensorDictModuleBase
+    space: StyleSpace
+    config: dict[str, Any]
+    metadata: dict[str, Any]
+
+
+def agent_state(
+    *,
+    domain: str,
+    space: StyleSpace,
+    actor: TensorDictModuleBase,
+    loss_module: LossModule,
+    network: Mapping[str, Any],
+    config: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Gathers what identifies an agent, for a checkpoint or a weights file.
+
+    Args:
+        domain: "humanoid", "racing", "combat" or the user's own.
+        space: its styles.
+        actor: its policy.
+        loss_module: holds the critics' weights.
+        network: how to build the actor again: `{"actor": {"_target_": "coachable....", arguments}}`; `space` is added.
+        config: resolved configuration, plain containers.
+
+    Returns:
+        A dictionary of plain containers and tensors, readable with `weights_only=True`.
+    """
+    return {
+        "domain": domain,
+        "space": space.to_dict(),
+        "config": dict(config),
+        "network": dict(network),
+        "actor": _tensors(actor.state_dict()),
+        "critics": _with_prefix(loss_module.state_dict(), _CRITICS),
+    }
+
+
+def load_policy(path_or_domain: Path | str, device: torch.device | str = "cpu") -> LoadedPolicy:
+    """Loads a trained policy.
+
+    Args:
+        path_or_domain: a run's folder, a checkpoint, a weights file, or the name of a domain that ships with weights.
+        device: where the actor goes.
+
+    Raises:
+        CheckpointError: if there is no such thing, or it does not describe its policy.
+    """
+    file = _locate(path_or_domain)
+    state = read_state(file, device)
+    missing = [name for name in _AGENT if name not in state]
+    if missing:
+        raise CheckpointError(f"{file} does not describe a policy: it lacks {', '.join(missing)}")
+    space = StyleSpace.from_dict(state["space"])
+    actor = _build(state["network"]["actor"], space, file).to(device)
+    check_fits(state["actor"], _tensors(actor.state_dict()), "actor", file)
+    actor.load_state_dict(state["actor"])
+    actor.eval().requires_grad_(False)
+    counters = state.get("loop", {}) | {"updates": state.get("learner", {}).get("updates")}
+    counters |= state.get("counters", {})
+    metadata = {"domain": state["domain"], "source": str(file), **{k: counters.get(k) for k in ("frames", "updates")}}
+    return LoadedPolicy(actor, space, state["config"], metadata)
+
+
+def export_weights(checkpoint: Path | str, out: Path | str) -> Path:
+    """Writes the small final weights file: actor, critics and what identifies them, without optimisers and replay.
+
+    Args:
+        checkpoint: a run's folder or a checkpoint.
+        out: the file, for example `coachable/pretrained/humanoid/weights.pt`.
+
+    Returns:
+        The file.
+    """
+    source = _locate(checkpoint)
+    state = read_state(source)
+    agent = {name: state[name] for name in _AGENT}
+    # Tensors are copied, because a slice or a shared parameter would drag its whole storage into the file.
+    agent["actor"] = {name: value.clone() for name, value in agent["actor"].items()}
+    agent["critics"] = {name: value.clone() for name, value in agent["critics"].items()}
+    counters = {"frames": state["loop"]["frames"], "updates": state["learner"]["updates"]}
+    out = Path(out)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    partial = out.with_name(out.name + ".partial")
+    torch.save({"schema": SCHEMA_VERSION, **agent, "counters": counters}, partial)
+    os.replace(partial, out)
+    return out
+
+
+def initialise_from(
+    path_or_domain: Path | str, actor: TensorDictModuleBase, loss_module: LossModule, space: StyleSpace
+) -> None:
+    """Starts a new training from the actor and critics of another one; optimisers and replay start empty.
+
+    Args:
+        path_or_domain: as for `load_policy`.
+        actor: overwritten.
+        loss_module: built from `actor`; its critics and their targets are overwritten.
+        space: of the new training.
+
+    Raises:
+        CheckpointError: if style space or network shapes differ.
+    """
+    file = _locate(path_or_domain)
+    state = read_state(file)
+    _check_space(state["space"], space, file)
+    present = loss_module.state_dict()
+    check_fits(state["actor"], _tensors(actor.state_dict()), "actor", file)
+    check_fits(state["critics"], _with_prefix(present, _CRITICS), "critics", file)
+    actor.load_state_dict(state["actor"])
+    for name, value in state["critics"].items():
+        for prefix in (_CRITICS, "target_" + _CRITICS):
+            present[prefix + name].copy_(value)
+
+
+def require_same_agent(saved: Mapping[str, Any], present: Mapping[str, Any], source: Path | str) -> None:
+    """Compares a checkpoint with the run that wants to continue it.
+
+    Args:
+        saved: state of the checkpoint.
+        present: `agent_state` of this run.
+        source: the checkpoint, for the message.
+
+    Raises:
+        CheckpointError: saying how domain, style space or network shapes differ.
+    """
+    if saved["domain"] != present["domain"]:
+        raise CheckpointError(f"{source} belongs to domain {saved['domain']!r}, this run to {present['domain']!r}")
+    _check_space(saved["space"], StyleSpace.from_dict(present["space"]), source)
+    for part in ("actor", "critics"):
+        check_fits(saved[part], present[part], part, source)
+
+
+def _check_space(saved: Mapping[str, Any], space: StyleSpace, source: Path | str) -> None:
+    differences = StyleSpace.from_dict(saved).difference(space)
+    if differences:
+        raise CheckpointError(
+            f"{source} was trained on another style space: {'; '.join(differences)}. "
+            "Train afresh, or declare the space as it was"
+        )
+
+
+def _locate(path_or_domain: Path | str) -> Path:
+    path = Path(path_or_domain).expanduser()
+    if path.is_file():
+        return path
+    shipped = _PRETRAINED / str(path_or_domain) / "weights.pt"
+    if not path.exists() and shipped.is_file():
+        return shipped
+    try:
+        return find_checkpoint(path)
+    except CheckpointError as error:
+        domains = sorted(p.parent.name for p in _PRETRAINED.glob("*/weights.pt"))
+        raise CheckpointError(f"{error}; domains with weights: {', '.join(domains) or 'none'}") from None
+
+
+def _build(network: Mapping[str, Any], space: StyleSpace, source: Path) -> TensorDictModuleBase:
+    arguments = dict(network)
+    target = str(arguments.pop("_target_"))
+    if not target.startswith("coachable."):  # a file must not choose what is imported and called
+        raise CheckpointError(f"{source} names {target!r} as its network: only coachable.* is loaded")
+    module, _, name = target.rpartition(".")
+    return getattr(importlib.import_module(module), name)(space=space, **arguments)
+
+
+def _tensors(state: Mapping[str, Any]) -> dict[str, Tensor]:
+    return {name: value.detach() for name, value in state.items() if isinstance(value, Tensor)}
+
+
+def _with_prefix(state: Mapping[str, Any], prefix: str) -> dict[str, Tensor]:
+    return {
+        k.removeprefix(prefix): v.detach() for k, v in state.items() if k.startswith(prefix) and isinstance(v, Tensor)
+    }

@@ -1,0 +1,201 @@
+"""From a command line to a checked, plain configuration; shared by the recipes."""
+
+import difflib
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+
+from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
+from coachable.training.hardware import choose_preset, detect
+
+CONFIGS = Path(__file__).resolve().parent / "configs"
+GROUPS = {folder.name: sorted(f.stem for f in folder.glob("*.yaml")) for folder in CONFIGS.iterdir() if folder.is_dir()}
+
+
+def run_recipe(config_name: str, train: Callable[[dict[str, Any]], Any]) -> None:
+    """Runs a recipe from the command line.
+
+    Args:
+        config_name: file in recipes/configs, without its suffix.
+        train: gets the plain, resolved configuration.
+    """
+    sys.argv[1:] = checked_arguments(config_name, sys.argv[1:])
+
+    @hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name=config_name)
+    def main(cfg: DictConfig) -> None:
+        try:
+            train(plain_config(cfg, list(HydraConfig.get().overrides.task)))
+        except CheckpointError as error:  # the user's to solve: the sentence says how, a traceback would hide it
+            raise SystemExit(f"error: {error}") from None
+
+    main()
+
+
+def compose_config(config_name: str, arguments: list[str]) -> dict[str, Any]:
+    """Composes a recipe's configuration in-process, with the checks of the command line.
+
+    Args:
+        config_name: file in recipes/configs, without its suffix.
+        arguments: overrides, such as `["preset=smoke", "seed=1"]`.
+
+    Returns:
+        Plain containers.
+    """
+    arguments = checked_arguments(config_name, arguments)
+    with _configs():
+        return plain_config(hydra.compose(config_name, arguments), arguments)
+
+
+def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
+    """Checks overrides against what the configuration knows, and replaces `preset=auto` by a preset.
+
+    Hydra alone says that a key is not in a struct, not which keys there are, and takes any type.
+
+    Args:
+        config_name: file in recipes/configs, without its suffix.
+        arguments: command line without the program; options such as `--help` pass through.
+
+    Returns:
+        Arguments for Hydra.
+
+    Raises:
+        SystemExit: naming what is misspelt or of a wrong type, and the valid choices.
+    """
+    try:
+        overrides = OverridesParser.create().parse_overrides([a for a in arguments if not a.startswith("-")])
+    except HydraException as error:
+        raise SystemExit(f"error: {error}\nexpected KEY=VALUE, for example loss=sac or train.batch_size=256") from None
+    chosen = {
+        o.key_or_group: str(o.value()) for o in overrides if o.key_or_group in GROUPS and not o.is_sweep_override()
+    }
+    for group, choice in chosen.items():
+        if choice not in GROUPS[group]:
+            raise SystemExit(f"error: {group}={choice} does not exist.{_choices(choice, GROUPS[group])}")
+    if chosen.get("preset", "auto") == "auto":
+        chosen["preset"] = choose_preset(detect())
+        arguments = [a for a in arguments if not a.startswith("preset=")] + [f"preset={chosen['preset']}"]
+    elif any(o.key_or_group == "resume" and o.value() for o in overrides):
+        raise SystemExit("error: a resumed run keeps its preset: leave preset= out, or start anew with init_from=PATH")
+    with _configs():
+        known = hydra.compose(config_name, [f"{group}={choice}" for group, choice in chosen.items()])
+    for override in overrides:
+        if override.key_or_group not in GROUPS and not override.key_or_group.startswith("hydra"):
+            _check(override, known)
+    return arguments
+
+
+def plain_config(cfg: DictConfig, overrides: list[str]) -> dict[str, Any]:
+    """Resolves a composed configuration; a resumed run's starts from the one in its checkpoint.
+
+    Args:
+        cfg: composed by Hydra.
+        overrides: what the command line said.
+
+    Returns:
+        Plain containers, `run_dir` filled in.
+    """
+    if cfg.resume:
+        checkpoint = find_checkpoint(cfg.resume)
+        saved = read_state(checkpoint)["config"]
+        said = {key: OmegaConf.select(cfg, key) for key in _said(overrides)}
+        cfg = OmegaConf.create(saved)
+        for key, value in {
+            "init_from": None,
+            "run_dir": _run_of(checkpoint),
+            **said,
+            "resume": str(checkpoint),
+        }.items():
+            OmegaConf.update(cfg, key, value, merge=False)
+    config = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
+    assert isinstance(config, dict)
+    config.pop("hydra", None)
+    config["run_dir"] = str(Path(config["run_dir"] or _new_run_dir(config["domain"])).expanduser().absolute())
+    return {str(key): value for key, value in config.items()}
+
+
+def save_config(config: dict[str, Any], run_dir: Path) -> None:
+    """Writes the resolved configuration beside the run's metrics."""
+    (run_dir / "config.json").write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")
+
+
+def _check(override: Override, known: DictConfig) -> None:
+    key = override.key_or_group
+    if override.is_add() or override.is_delete():  # +key=value and ~key say that the user knows better
+        return
+    node: Any = known
+    parts = key.split(".")
+    for depth, part in enumerate(parts):
+        names = [str(n) for n in node if n != "hydra"] if isinstance(node, DictConfig) else []
+        if part not in names:
+            where = ".".join(parts[:depth]) or "the configuration"
+            raise SystemExit(f"error: {key} does not exist: {where} has no {part!r}.{_choices(part, names)}")
+        node = node[part]
+    if override.is_sweep_override():
+        return
+    value = override.value()
+    if not _same_kind(node, value):
+        expected = {bool: "true or false", int: "a whole number", float: "a number", str: "a name or path"}
+        kind = expected.get(type(node), "a list" if OmegaConf.is_list(node) else "a group of settings")
+        raise SystemExit(f"error: {key}={value} has a wrong type: expected {kind} (it is {node} by default)")
+
+
+def _same_kind(default: Any, value: Any) -> bool:
+    if default is None or value is None:
+        return True
+    if isinstance(default, bool) or isinstance(value, bool):
+        return isinstance(default, bool) and isinstance(value, bool)
+    if isinstance(default, int):
+        return isinstance(value, int) or (isinstance(value, float) and value.is_integer())
+    if isinstance(default, float):
+        return isinstance(value, int | float)
+    if isinstance(default, str):
+        return isinstance(value, str | int | float)
+    if OmegaConf.is_list(default):
+        return isinstance(value, list)
+    return isinstance(value, dict)
+
+
+def _choices(given: str, valid: list[str]) -> str:
+    close = difflib.get_close_matches(given, valid, n=1)
+    guess = f" Did you mean {close[0]}?" if close else ""
+    return f"{guess} Valid: {', '.join(valid)}" if valid else f"{guess} It is a single value"
+
+
+def _said(overrides: list[str]) -> list[str]:
+    keys = [o.key_or_group for o in OverridesParser.create().parse_overrides(overrides) if not o.is_delete()]
+    return [key for key in keys if key != "preset" and not key.startswith("hydra")]
+
+
+def _run_of(checkpoint: Path) -> str | None:
+    return str(checkpoint.parent.parent) if checkpoint.parent.name == "checkpoints" else None
+
+
+def _new_run_dir(domain: str) -> Path:
+    base = Path("runs") / domain / time.strftime("%Y-%m-%d_%H-%M-%S")
+    folder, copy = base, 1
+    while folder.exists():
+        copy += 1
+        folder = base.with_name(f"{base.name}_{copy}")
+    return folder
+
+
+@contextmanager
+def _configs() -> Iterator[None]:
+    """Makes `hydra.compose` work, inside and outside of a running recipe."""
+    if GlobalHydra.instance().is_initialized():
+        yield
+        return
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONFIGS)):
+        yield
