@@ -26,7 +26,19 @@ _MODULE_OF = {
     "coachable_env": "coachable.transforms",
 }
 
-__all__ = ["__version__", *sorted(_MODULE_OF)]
+__all__ = [
+    "Choice",
+    "CoachableEnv",
+    "Setpoint",
+    "StyleReward",
+    "StyleRewardTransform",
+    "StyleSampler",
+    "StyleSpace",
+    "TaskImpersonation",
+    "Weight",
+    "__version__",
+    "coachable_env",
+]
 
 
 def __getattr__(name: str) -> object:

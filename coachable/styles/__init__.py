@@ -1,4 +1,4 @@
-"""Styles: what can be coached, how it is sampled and encoded, and what it is rewarded with. Pure torch, no environments."""
+"""Styles: what can be coached, how it is sampled and encoded, and what it is rewarded with. No environments here."""
 
 from coachable.styles.parameters import Choice, Parameter, Setpoint, Weight
 from coachable.styles.reward import StyleReward
@@ -12,7 +12,7 @@ from coachable.styles.samplers import (
     Uniform,
     UniformChoice,
 )
-from coachable.styles.space import StyleRangeWarning, StyleSpace, StyleView
+from coachable.styles.space import StyleSpace
 from coachable.styles.terms import (
     ChoiceTolerance,
     SetpointTolerance,
@@ -25,6 +25,8 @@ from coachable.styles.terms import (
     weighted_sum,
 )
 from coachable.styles.tolerance import tolerance
+from coachable.styles.validation import StyleRangeWarning
+from coachable.styles.view import StyleView
 
 __all__ = [
     "Choice",

@@ -108,8 +108,8 @@ class Setpoint(_Numeric):
         unit: Unit for sliders and reports.
         help: One line that tells a coach what the parameter does.
         default: Value when the coach names none; the middle of the range if None.
-        encoding: What the networks see. "max": `theta / max(|low|, |high|)`, the paper's f; "range": the range mapped to
-            `[-1, 1]`, for set-points far from 0 (our choice).
+        encoding: What the networks see. "max": `theta / max(|low|, |high|)`, the paper's f; "range": the range mapped
+            to `[-1, 1]`, for set-points far from 0 (our choice).
         evaluation: Range that reports sweep, inside `[low, high]`; the whole range if None.
 
     Raises:
@@ -152,7 +152,7 @@ class Choice:
         default: Option when the coach names none; the first if None.
 
     Raises:
-        ValueError: If the name is no identifier, options repeat or are fewer than two, or the default is not one of them.
+        ValueError: If the name is no identifier, options repeat or are fewer than two, or the default is none of them.
 
     Examples:
         >>> Choice("pose", ("front", "t_pose", "up")).width

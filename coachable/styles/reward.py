@@ -42,15 +42,19 @@ class StyleReward(nn.Module):
 
     Args:
         space: What theta means. Every parameter must be read by a term.
-        terms: Terms by name; each carries `.parameters`, the names it reads (wrap plain functions in `Term`).
+        terms: Terms by name; each carries `.parameters`, the names it reads (wrap plain functions and modules in
+            `Term`).
         scales: Fixed factor per term; 1 where not given.
 
     Raises:
-        ValueError: If a term declares no or unknown parameters, a parameter is read by no term, or a scale belongs to no term.
+        ValueError: If a term declares no parameters or unknown ones, a parameter is read by no term, or a scale
+            belongs to no term.
 
     Examples:
+        >>> import torch
         >>> from coachable.styles import Weight
-        >>> reward = StyleReward(StyleSpace([Weight("fuel", -3, 105)]), {"fuel": WeightedFeature("fuel", 0)}, {"fuel": -1.0})
+        >>> space = StyleSpace([Weight("fuel", -3, 105)])
+        >>> reward = StyleReward(space, {"fuel": WeightedFeature("fuel", 0)}, {"fuel": -1.0})
         >>> reward(torch.tensor([[0.5]]), torch.tensor([[10.0]]))
         tensor([[-5.]])
     """
@@ -60,16 +64,17 @@ class StyleReward(nn.Module):
     ) -> None:
         super().__init__()
         self.space = space
-        self.scales = {name: 1.0 for name in terms} | {name: float(s) for name, s in (scales or {}).items()}
-        _check_terms(space, terms, self.scales)
-        # Modules among the terms are registered, so that `.to(device)` reaches their buffers.
-        self.modules_of_terms = nn.ModuleDict({n: t for n, t in terms.items() if isinstance(t, nn.Module)})
-        self._terms: tuple[tuple[str, Any, float], ...] = tuple((n, t, self.scales[n]) for n, t in terms.items())
+        _check_terms(space, terms, scales or {})
+        self.scales = {name: float((scales or {}).get(name, 1.0)) for name in terms}
+        self._terms: tuple[tuple[str, StyleTerm, float], ...] = tuple((n, t, self.scales[n]) for n, t in terms.items())
+        # Registered, so that `.to(device)` reaches the weights of a module used as a term.
+        functions = {name: getattr(term, "function", None) for name, term in terms.items()}
+        self.modules_of_terms = nn.ModuleDict({n: f for n, f in functions.items() if isinstance(f, nn.Module)})
 
     @property
     def term_names(self) -> tuple[str, ...]:
         """Names of the terms, in the order in which they are added."""
-        return tuple(name for name, _, _ in self._terms)
+        return tuple(self.scales)
 
     def forward(self, features: Features, theta: Tensor) -> Tensor:
         """Style part of the reward.
@@ -79,7 +84,10 @@ class StyleReward(nn.Module):
             theta: `(..., dim)`, raw. Its batch shape is that of the result; features may broadcast against it.
 
         Returns:
-            `(..., 1)` in theta's dtype.
+            `(..., 1)`, in theta's dtype (float32).
+
+        Raises:
+            ValueError: If a term returns another shape than one number per style.
         """
         style = self.space.lazy_view(theta)
         total: Tensor | None = None
@@ -89,7 +97,7 @@ class StyleReward(nn.Module):
                 value = scale * value
             total = value if total is None else total + value
         assert total is not None  # a space has parameters, and each has a term
-        return total.unsqueeze(-1)
+        return total.to(theta.dtype).unsqueeze(-1)
 
     def terms_of(self, features: Features, theta: Tensor) -> dict[str, Tensor]:
         """Each term before its scale, `(...,)`, for logging and reports."""
@@ -111,7 +119,7 @@ def _check_terms(space: StyleSpace, terms: Mapping[str, Any], scales: Mapping[st
     read: set[str] = set()
     for name, term in terms.items():
         parameters = getattr(term, "parameters", None)
-        # nn.Module.parameters is a method: a module that forgot to declare shadows nothing.
+        # A bare nn.Module arrives here with its method `parameters`, hence the check for a tuple.
         if not callable(term) or not isinstance(parameters, tuple) or not parameters:
             problems.append(f"term {name!r} declares no parameters: wrap it as Term(function, parameters=(...,))")
             continue
@@ -121,12 +129,10 @@ def _check_terms(space: StyleSpace, terms: Mapping[str, Any], scales: Mapping[st
         read.update(parameters)
     unread = [p for p in space.names if p not in read]
     if unread:
-        problems.append(f"no term reads the parameters {unread}: add a term that does, or remove them from the space")
+        problems.append(f"no term reads the parameters {unread}: add one that does, or remove them from the space")
     stray = [name for name in scales if name not in terms]
     if stray:
-        problems.append(f"scales are given for {stray}, expected some of {list(terms)}")
+        problems.append(f"scales are given for {stray}, expected some of the terms {list(terms)}")
     if problems:
         label = f" {space.name!r}" if space.name else ""
-        raise ValueError(
-            f"StyleReward does not fit the space{label} of {list(space.names)}: " + "; ".join(problems) + "."
-        )
+        raise ValueError(f"StyleReward does not fit the space{label} {list(space.names)}: " + "; ".join(problems) + ".")

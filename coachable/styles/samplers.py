@@ -1,109 +1,28 @@
 """Composable distributions over theta (paper, training distributions of the three domains; algorithms.md section 4).
 
-Every sampler draws float32 of any batch shape from an optional `torch.Generator`. Draws happen on the generator's device
-(on `device` without one) and the result is moved to `device`. Each call consumes the same random numbers whatever
-it returns, so two runs with one seed stay aligned.
+Every sampler draws float32 of any batch shape from an optional `torch.Generator`. Draws happen on the generator's
+device (on `device` without one) and the result is moved to `device`. How many random numbers a call consumes depends on
+its batch shape only, never on what was drawn, so runs with one seed stay aligned.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from functools import lru_cache
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from torch import Generator, Tensor
 
-_REGISTRY: dict[str, type["Sampler"]] = {}
+from coachable.styles.sampler_base import Sampler, constant, numbers
 
-
-@lru_cache(maxsize=256)
-def _constant(values: tuple[float, ...], device: torch.device) -> Tensor:
-    """A float32 constant on a device; shared, so never written to."""
-    with torch.inference_mode(False):
-        return torch.tensor(values, dtype=torch.float32, device=device)
-
-
-def _numbers(values: float | Sequence[float]) -> tuple[float, ...]:
-    if isinstance(values, Tensor):
-        values = values.tolist()
-    return tuple(float(v) for v in values) if isinstance(values, Sequence) else (float(values),)
-
-
-class Sampler:
-    """Distribution over a block of `dim` style numbers.
-
-    A new sampler is a frozen dataclass that subclasses this and defines `dim`, `_draw` and, for the range check of
-    `StyleSpace`, `support`. Its fields must be numbers, strings, samplers or tuples of these: serialisation follows from them.
-    """
-
-    dim: int
-
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        _REGISTRY[cls.__name__] = cls
-
-    def sample(
-        self,
-        shape: Sequence[int] = (),
-        generator: Generator | None = None,
-        device: torch.device | str | None = None,
-    ) -> Tensor:
-        """Draws styles.
-
-        Args:
-            shape: Batch shape.
-            generator: Source of randomness; torch's global generator if None.
-            device: Device of the result; the generator's device if None, or the CPU without one.
-
-        Returns:
-            `(*shape, dim)` float32.
-        """
-        target = torch.device(device) if device is not None else generator.device if generator is not None else _CPU
-        source = generator.device if generator is not None else target
-        drawn = self._draw(tuple(shape), generator, source)
-        return drawn if source == target else drawn.to(target)
-
-    def _draw(self, shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
-        raise NotImplementedError(f"{type(self).__name__} must define _draw")
-
-    def support(self) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-        """Lowest and highest value of each entry, or None if not known."""
-        return None
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-ready description; `Sampler.from_dict` reads it back."""
-        return {"type": type(self).__name__, **{f.name: _plain(getattr(self, f.name)) for f in fields(self)}}  # type: ignore[arg-type]
-
-    @staticmethod
-    def from_dict(description: dict[str, Any]) -> "Sampler":
-        """Rebuilds a sampler from `to_dict`.
-
-        Raises:
-            ValueError: If the type is unknown, for instance because the module that defines it was not imported.
-        """
-        arguments = dict(description)
-        kind = arguments.pop("type", None)
-        if kind not in _REGISTRY:
-            raise ValueError(
-                f"unknown sampler type {kind!r}: expected one of {sorted(_REGISTRY)}. "
-                "A sampler of your own is known once its module has been imported."
-            )
-        return _REGISTRY[kind](**{name: _revived(value) for name, value in arguments.items()})
-
-
-_CPU = torch.device("cpu")
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Sampler):
-        return value.to_dict()
-    return [_plain(v) for v in value] if isinstance(value, tuple) else value
-
-
-def _revived(value: Any) -> Any:
-    if isinstance(value, dict):
-        return Sampler.from_dict(value)
-    return tuple(_revived(v) for v in value) if isinstance(value, list) else value
+__all__ = [
+    "ContinuousOneHot",
+    "Mixture",
+    "OneHot",
+    "PointMass",
+    "Product",
+    "Sampler",
+    "Uniform",
+    "UniformChoice",
+]
 
 
 def _check_bounds(who: str, low: tuple[float, ...], high: tuple[float, ...]) -> None:
@@ -137,15 +56,15 @@ class PointMass(Sampler):
     values: tuple[float, ...]
 
     def __init__(self, values: float | Sequence[float]) -> None:
-        object.__setattr__(self, "values", _numbers(values))
+        object.__setattr__(self, "values", numbers(values))
 
     @property
-    def dim(self) -> int:  # type: ignore[override]
+    def dim(self) -> int:
         """Number of entries."""
         return len(self.values)
 
     def _draw(self, shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
-        return _constant(self.values, device).expand(*shape, self.dim).clone()
+        return constant(self.values, device).expand(*shape, self.dim).clone()
 
     def support(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """The point itself, twice."""
@@ -168,19 +87,19 @@ class Uniform(Sampler):
     high: tuple[float, ...]
 
     def __init__(self, low: float | Sequence[float], high: float | Sequence[float]) -> None:
-        object.__setattr__(self, "low", _numbers(low))
-        object.__setattr__(self, "high", _numbers(high))
+        object.__setattr__(self, "low", numbers(low))
+        object.__setattr__(self, "high", numbers(high))
         _check_bounds("Uniform", self.low, self.high)
 
     @property
-    def dim(self) -> int:  # type: ignore[override]
+    def dim(self) -> int:
         """Number of entries."""
         return len(self.low)
 
     def _draw(self, shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
         # lerp, unlike low + u * (high - low), never rounds to a value outside [low, high].
         u = _rand((*shape, self.dim), generator, device)
-        return torch.lerp(_constant(self.low, device), _constant(self.high, device), u)
+        return torch.lerp(constant(self.low, device), constant(self.high, device), u)
 
     def support(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """The bounds."""
@@ -209,7 +128,7 @@ class Mixture(Sampler):
 
     def __init__(self, components: Sequence[Sampler], weights: Sequence[float]) -> None:
         object.__setattr__(self, "components", tuple(components))
-        object.__setattr__(self, "weights", _numbers(weights))
+        object.__setattr__(self, "weights", numbers(weights))
         dims = [c.dim for c in self.components]
         if not dims or len(set(dims)) != 1:
             raise ValueError(
@@ -222,17 +141,18 @@ class Mixture(Sampler):
             )
 
     @property
-    def dim(self) -> int:  # type: ignore[override]
+    def dim(self) -> int:
         """Number of entries."""
         return self.components[0].dim
 
     def _draw(self, shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
         u = _rand((*shape, 1), generator, device)
         drawn = self.components[0]._draw(shape, generator, device)
-        passed = 0.0
-        for component, weight in zip(self.components[1:], self.weights, strict=False):
+        passed = self.weights[0]
+        for component, weight in zip(self.components[1:], self.weights[1:], strict=True):
+            if weight > 0:
+                drawn = torch.where(u >= passed, component._draw(shape, generator, device), drawn)
             passed += weight
-            drawn = torch.where(u >= passed, component._draw(shape, generator, device), drawn)
         return drawn
 
     def support(self) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
@@ -266,7 +186,7 @@ class Product(Sampler):
             raise ValueError("Product has no components: expected at least one sampler.")
 
     @property
-    def dim(self) -> int:  # type: ignore[override]
+    def dim(self) -> int:
         """Number of entries."""
         return sum(c.dim for c in self.components)
 
@@ -297,7 +217,7 @@ class UniformChoice(Sampler):
             raise ValueError(f"UniformChoice has n = {self.n}: expected at least one option.")
 
     @property
-    def dim(self) -> int:  # type: ignore[override]
+    def dim(self) -> int:
         """Number of entries."""
         return self.n
 
@@ -325,12 +245,12 @@ class ContinuousOneHot(Sampler):
     high: tuple[float, ...]
 
     def __init__(self, low: float | Sequence[float], high: float | Sequence[float]) -> None:
-        object.__setattr__(self, "low", _numbers(low))
-        object.__setattr__(self, "high", _numbers(high))
+        object.__setattr__(self, "low", numbers(low))
+        object.__setattr__(self, "high", numbers(high))
         _check_bounds("ContinuousOneHot", self.low, self.high)
 
     @property
-    def dim(self) -> int:  # type: ignore[override]
+    def dim(self) -> int:
         """Number of entries."""
         return len(self.low)
 
@@ -338,7 +258,7 @@ class ContinuousOneHot(Sampler):
         hot = _one_hot(self.dim, shape, generator, device)
         # One number per style is enough: only the chosen entry uses it.
         u = _rand((*shape, 1), generator, device)
-        values = torch.lerp(_constant(self.low, device), _constant(self.high, device), u)
+        values = torch.lerp(constant(self.low, device), constant(self.high, device), u)
         return torch.where(hot, values, 0.0)
 
     def support(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -357,15 +277,15 @@ class OneHot(Sampler):
     values: tuple[float, ...]
 
     def __init__(self, values: float | Sequence[float]) -> None:
-        object.__setattr__(self, "values", _numbers(values))
+        object.__setattr__(self, "values", numbers(values))
 
     @property
-    def dim(self) -> int:  # type: ignore[override]
+    def dim(self) -> int:
         """Number of entries."""
         return len(self.values)
 
     def _draw(self, shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
-        return torch.where(_one_hot(self.dim, shape, generator, device), _constant(self.values, device), 0.0)
+        return torch.where(_one_hot(self.dim, shape, generator, device), constant(self.values, device), 0.0)
 
     def support(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Zero to the value."""

@@ -11,9 +11,13 @@ from typing import Any
 
 import torch
 from torch import Generator, Tensor
+from torch.nn.functional import one_hot
 
+from coachable.styles.difference import differences
 from coachable.styles.parameters import Choice, Parameter, Setpoint, Weight
 from coachable.styles.samplers import Product, Sampler, Uniform, UniformChoice
+from coachable.styles.validation import StyleRangeWarning, violations
+from coachable.styles.view import StyleView
 
 __all__ = ["Choice", "Parameter", "Setpoint", "StyleRangeWarning", "StyleSpace", "StyleView", "Weight"]
 
@@ -21,38 +25,21 @@ SCHEMA_VERSION = 1
 _KINDS: dict[str, type] = {"weight": Weight, "setpoint": Setpoint, "choice": Choice}
 
 
-class StyleRangeWarning(UserWarning):
-    """A requested style lies outside the range that the agent was trained on."""
-
-
-class StyleView(Mapping[str, Tensor]):
-    """Named, lazily sliced columns of theta: what reward terms receive as `style`.
-
-    `view["step_length"]` is `(...,)` for a `Weight` or `Setpoint` and `(..., n_options)` for a `Choice`. Slicing only what
-    is read keeps a term library cheap in spaces of many parameters.
-    """
-
-    __slots__ = ("_columns", "theta")
-
-    def __init__(self, theta: Tensor, columns: Mapping[str, int | slice]) -> None:
-        self.theta = theta
-        self._columns = columns
-
-    def __getitem__(self, name: str) -> Tensor:
-        return self.theta[..., self._columns[name]]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._columns)
-
-    def __len__(self) -> int:
-        return len(self._columns)
-
-
 class StyleSpace:
     """An ordered set of style parameters, their training distribution and their encoding.
 
-    Theta is a float32 tensor `(..., dim)`, in the units of the parameters. Tensors on the space (`low`, `high`) are shared:
-    do not write to them.
+    Theta is a float32 tensor `(..., dim)`, in the units of the parameters. The space maps names to parameters like a
+    dict: `space["pose"]`, `"pose" in space`, `for name in space`.
+
+    Attributes:
+        parameters: The declarations, in the order of theta's entries.
+        names: Their names.
+        dim: Number of entries of theta.
+        low: Lower bounds, `(dim,)` float32; shared, do not write to it.
+        high: Upper bounds, likewise.
+        slices: Entries of theta by parameter name.
+        columns: The same for indexing: an integer for a `Weight` or `Setpoint`, a slice for a `Choice`.
+        sampler: Training distribution.
 
     Args:
         parameters: `Weight`, `Setpoint` and `Choice` declarations, in the order of theta's entries.
@@ -96,9 +83,10 @@ class StyleSpace:
                 torch.tensor(scale, dtype=torch.float32, device="cpu"),
             )
         }
-        self._columns: dict[str, int | slice] = {
+        self.columns: dict[str, int | slice] = {
             p.name: self.slices[p.name] if isinstance(p, Choice) else self.slices[p.name].start for p in self.parameters
         }
+        self._columns_of: dict[tuple[str, ...], slice | list[int] | None] = {}
         self.sampler: Sampler = _uniform_over(self.parameters) if sampler is None else sampler
         self._check_sampler()
 
@@ -107,6 +95,9 @@ class StyleSpace:
         if name not in self.slices:
             raise KeyError(f"no style parameter {name!r}: expected one of {list(self.names)}")
         return self.parameters[self.names.index(name)]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
 
     def __contains__(self, name: object) -> bool:
         return name in self.slices
@@ -136,7 +127,7 @@ class StyleSpace:
         return self.sampler.sample(shape, generator, device)
 
     def encode(self, theta: Tensor) -> Tensor:
-        """Scales theta for the networks: `f(theta) = theta / max(|low|, |high|)` (paper), or affine for "range" set-points.
+        """Scales theta for the networks: `theta / max(|low|, |high|)` (paper's f), affine for "range" set-points.
 
         Args:
             theta: `(..., dim)`, raw.
@@ -160,7 +151,7 @@ class StyleSpace:
 
         Args:
             strict: Raise instead of clamping with a warning when a number lies outside its range.
-            **values: A number per `Weight` or `Setpoint`, an option's name per `Choice`; missing ones take their default.
+            **values: A number per `Weight` or `Setpoint`, an option's name per `Choice`; others take their default.
 
         Returns:
             Theta, `(dim,)` float32.
@@ -201,63 +192,43 @@ class StyleSpace:
         Raises:
             ValueError: If the shape is wrong, a value is NaN, or `strict` and something would be changed.
         """
-        problems = self._problems(theta)
-        if not problems:
+        clauses = violations(self, theta)
+        if not clauses:
             return theta.to(torch.float32, copy=True)
+        message = f"style {'; '.join(clauses)}."
         if strict:
-            raise ValueError(_sentence(problems) + " Pass strict=False to clamp instead.")
-        warnings.warn(_sentence(problems) + " Clamped to the trained range.", StyleRangeWarning, stacklevel=2)
+            raise ValueError(f"{message} Pass strict=False to clamp instead.")
+        warnings.warn(f"{message} Clamped to the trained range.", StyleRangeWarning, stacklevel=2)
         theta = theta.to(torch.float32)
         clamped = theta.clamp(self.low.to(theta.device), self.high.to(theta.device))
         for p in self.parameters:
             if isinstance(p, Choice):
-                block = theta[..., self.slices[p.name]]
-                clamped[..., self.slices[p.name]] = torch.nn.functional.one_hot(block.argmax(-1), p.width).to(
-                    theta.dtype
-                )
+                block = self.slices[p.name]
+                clamped[..., block] = one_hot(theta[..., block].argmax(-1), p.width).to(torch.float32)
         return clamped
 
     def validate(self, theta: Tensor) -> None:
         """Raises a ValueError that lists what is wrong with theta: shape, NaN, range or one-hot."""
-        problems = self._problems(theta)
-        if problems:
-            raise ValueError(_sentence(problems))
-
-    def _problems(self, theta: Tensor) -> list[str]:
-        """Range and one-hot violations, one clause per parameter. Wrong shapes and NaN raise at once."""
-        if theta.ndim < 1 or theta.shape[-1] != self.dim or not theta.is_floating_point():
-            raise ValueError(
-                f"style has shape {tuple(theta.shape)} and type {theta.dtype}: "
-                f"expected (..., {self.dim}) floating point, for {list(self.names)}."
-            )
-        theta = theta.to(torch.float32)
-        if bool(theta.isnan().any()):
-            columns = theta.isnan().reshape(-1, self.dim).any(0)
-            bad = [n for n, s in self.slices.items() if bool(columns[s].any())]
-            raise ValueError(f"style is NaN in {bad}: expected numbers.")
-        outside = (
-            ((theta < self.low.to(theta.device)) | (theta > self.high.to(theta.device))).reshape(-1, self.dim).any(0)
-        )
-        problems = []
-        for p in self.parameters:
-            block = theta[..., self.slices[p.name]]
-            if isinstance(p, Choice):
-                if not bool((((block == 0) | (block == 1)).all(-1) & (block.sum(-1) == 1)).all()):
-                    problems.append(f"{p.name} is no one-hot of its {p.width} options {list(p.options)}")
-            elif bool(outside[self.slices[p.name]].any()):
-                values = sorted({f"{v:g}" for v in (block.min().item(), block.max().item())}, key=float)
-                problems.append(
-                    f"{p.name} = {' to '.join(values)}{_unit(p)} lies outside [{p.low:g}, {p.high:g}]{_unit(p)}"
-                )
-        return problems
+        clauses = violations(self, theta)
+        if clauses:
+            raise ValueError(f"style {'; '.join(clauses)}.")
 
     def view(self, theta: Tensor) -> dict[str, Tensor]:
         """Named blocks of theta: `(...,)` for a `Weight` or `Setpoint`, `(..., n_options)` for a `Choice`."""
-        return {name: theta[..., column] for name, column in self._columns.items()}
+        return {name: theta[..., column] for name, column in self.columns.items()}
 
     def lazy_view(self, theta: Tensor) -> StyleView:
         """Like `view`, but each block is sliced only when read."""
-        return StyleView(theta, self._columns)
+        return StyleView(self, theta)
+
+    def columns_of(self, names: tuple[str, ...]) -> slice | list[int] | None:
+        """Columns of several parameters, in that order: a slice where they are adjacent, None if all of theta."""
+        if names not in self._columns_of:
+            indices = [i for name in names for i in range(self.slices[name].start, self.slices[name].stop)]
+            adjacent = indices == list(range(indices[0], indices[0] + len(indices)))
+            found = slice(indices[0], indices[-1] + 1) if adjacent else indices
+            self._columns_of[names] = None if adjacent and len(indices) == self.dim else found
+        return self._columns_of[names]
 
     def describe(self, theta: Tensor) -> dict[str, float | str]:
         """Numbers and option names of one style `(dim,)`; `make(**describe(theta))` gives it back."""
@@ -276,7 +247,7 @@ class StyleSpace:
         return {
             "version": SCHEMA_VERSION,
             "name": self.name,
-            "parameters": [{"kind": p.kind, **asdict(p)} for p in self.parameters],
+            "parameters": [{"kind": p.kind, **{k: _plain(v) for k, v in asdict(p).items()}} for p in self.parameters],
             "sampler": self.sampler.to_dict(),
         }
 
@@ -302,7 +273,7 @@ class StyleSpace:
 
     def to_json(self) -> str:
         """The description of `to_dict` as a JSON string."""
-        return json.dumps(self.to_dict())
+        return json.dumps(self.to_dict(), allow_nan=False)
 
     @classmethod
     def from_json(cls, text: str) -> "StyleSpace":
@@ -310,23 +281,47 @@ class StyleSpace:
         return cls.from_dict(json.loads(text))
 
     def difference(self, other: "StyleSpace") -> list[str]:
-        """Readable sentences on how `other` differs from this space; empty if equal."""
-        return [] if self == other else ["spaces differ"]
+        """Readable sentences on how `other` ("there") differs from this space ("here"); empty if equal."""
+        return differences(self, other)
+
+    def encodes_like(self, other: "StyleSpace") -> bool:
+        """Whether a network trained on `other` reads this space's styles unchanged: same entries, same encoding."""
+        ours, theirs = (
+            [(p.name, p.kind, getattr(p, "options", None), p.encoding, p.low, p.high) for p in space.parameters]
+            for space in (self, other)
+        )
+        return ours == theirs
 
     def _check_sampler(self) -> None:
         if self.sampler.dim != self.dim:
             raise ValueError(
-                f"sampler has dimension {self.sampler.dim}, the parameters {list(self.names)} need {self.dim} numbers."
+                f"the sampler draws {self.sampler.dim} numbers, the parameters {list(self.names)} need {self.dim}: "
+                f"{self.sampler}."
             )
+        # Draws expose a wrong order of components, and ranges where the sampler does not state its support.
+        trial = self.sampler.sample((64,), torch.Generator().manual_seed(0))
+        for theta in [trial, *self._corners()]:
+            try:
+                self.validate(theta)
+            except ValueError as error:
+                raise ValueError(f"the sampler does not fit the parameters: it draws a {error}") from None
+
+    def _corners(self) -> list[Tensor]:
+        """Lowest and highest draw of every number, choices at their default."""
+        support = self.sampler.support()
+        if support is None:
+            return []
+        corners = [torch.tensor(bounds, dtype=torch.float32) for bounds in support]
+        for p in self.parameters:
+            if isinstance(p, Choice):
+                for corner in corners:
+                    corner[self.slices[p.name]] = self._default[self.slices[p.name]]
+        return corners
 
 
 def _uniform_over(parameters: Sequence[Parameter]) -> Sampler:
     return Product([UniformChoice(p.width) if isinstance(p, Choice) else Uniform(p.low, p.high) for p in parameters])
 
 
-def _unit(parameter: Parameter) -> str:
-    return f" {parameter.unit}" if parameter.unit else ""
-
-
-def _sentence(problems: list[str]) -> str:
-    return "style " + "; ".join(problems) + "."
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value

@@ -1,14 +1,16 @@
 """Terms of the style reward: small callables that say which style parameters they read.
 
-A term maps `(features, style)` to a reward `(...,)`. `features` is what the environment emitted (one tensor `(..., F)` or a
-nested tensordict), `style` a mapping from parameter name to its block of theta.
+A term maps `(features, style)` to a reward `(...,)`. `features` is what the environment emitted (one tensor `(..., F)`,
+or a nested tensordict), `style` a mapping from parameter name to its block of theta.
 
 Only elementwise operations appear here, in a fixed order. A reduction such as `Tensor.sum` may add in another order for
-another batch shape or memory layout, and the reward while collecting would differ from the relabelled one in the last bits.
+another batch shape or memory layout, and the relabelled reward would differ in its last bits from the collected one.
 """
 
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -16,6 +18,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from coachable.styles.tolerance import tolerance
+from coachable.styles.view import StyleView
 
 Features = Tensor | TensorDictBase
 Style = Mapping[str, Tensor]
@@ -64,21 +67,33 @@ def feature(features: Features, key: FeatureKey) -> Tensor:
 
     Args:
         features: Tensor `(..., F)` or tensordict.
-        key: For a tensor an index, `(...,)`, or a slice, `(..., k)`. For a tensordict a key, nested if a tuple, whose last
-            part may be an index or slice into the entry: `"speed"`, `("gait", "length")`, `("arms", 0)`.
+        key: For a tensor an index, `(...,)`, or a slice, `(..., k)`. For a tensordict a key, nested if a tuple, whose
+            last part may be an index or slice into the entry: `"speed"`, `("gait", "length")`, `("arms", 0)`.
 
     Returns:
-        The entry, as it is stored: a tensordict entry `(..., 1)` read by name alone keeps its last dimension.
+        The entry as it is stored: an entry `(..., 1)` of a tensordict keeps its last dimension.
+
+    Raises:
+        KeyError: If the features are one tensor but the key a name, or the tensordict lacks the key.
     """
     if isinstance(key, int | slice):
         return features[..., key]
+    name, column = key, None
     if isinstance(key, tuple) and isinstance(key[-1], int | slice):
-        return features.get(key[:-1] if len(key) > 2 else key[0])[..., key[-1]]
-    return features.get(key)
+        name, column = key[:-1], key[-1]
+    entry = None if isinstance(features, Tensor) else features.get(name, None)
+    if entry is None:
+        offered = (
+            f"one tensor of {features.shape[-1]} columns, to be read by index or slice"
+            if isinstance(features, Tensor)
+            else f"the entries {sorted(map(str, features.keys(True, True)))}"
+        )
+        raise KeyError(f"no style feature {name!r}: the environment emits {offered}.")
+    return entry if column is None else entry[..., column]
 
 
 def scalar_feature(features: Features, key: FeatureKey, like: Tensor) -> Tensor:
-    """Like `feature`, but `(...,)`: drops the trailing 1 of a tensordict entry with one dimension more than `like`."""
+    """Like `feature`, but `(...,)`: drops the trailing 1 of an entry that has one dimension more than `like`."""
     value = feature(features, key)
     return value.squeeze(-1) if value.ndim == like.ndim + 1 and value.shape[-1] == 1 else value
 
@@ -93,16 +108,8 @@ def weighted_sum(weights: Tensor, values: Tensor) -> Tensor:
     Returns:
         `(...,)`.
     """
-    products = weights * values
-    width = products.shape[-1]
-    while width > 1:
-        # Halve by elementwise additions: their result cannot depend on strides, unlike that of a reduction kernel.
-        half = width // 2
-        folded = products[..., :half] + products[..., half : 2 * half]
-        if width % 2:
-            folded = torch.cat([folded, products[..., 2 * half :]], dim=-1)
-        products, width = folded, half + width % 2
-    return products[..., 0]
+    # Elementwise additions, first to last: unlike a reduction kernel, they cannot depend on strides or batch shape.
+    return reduce(operator.add, (weights * values).unbind(-1))
 
 
 @dataclass(frozen=True)
@@ -144,8 +151,10 @@ class WeightedSum:
 
     def __call__(self, features: Features, style: Style) -> Tensor:
         """`(...,)`."""
-        block = getattr(style, "block", None)
-        weights = torch.stack([style[n] for n in self.parameters], -1) if block is None else block(self.parameters)
+        if isinstance(style, StyleView):
+            weights = style.block(self.parameters)
+        else:
+            weights = torch.stack([style[name] for name in self.parameters], dim=-1)
         values = features if self.key is None else feature(features, self.key)
         if values.shape[-1] != len(self.parameters):
             raise ValueError(
@@ -186,12 +195,13 @@ class SetpointTolerance:
         """`(...,)`."""
         target = style[self.parameter]
         measured = scalar_feature(features, self.key, target)
-        lower, upper = target - self.half_width, target + self.half_width
+        half = self.half_width
+        lower, upper = (target - half, target + half) if half else (target, target)
         value = tolerance(measured, lower, upper, self.margin, self.sigmoid, self.value_at_margin)
         return value if self.gate is None else value * scalar_feature(features, self.gate, target).to(value.dtype)
 
 
-class ChoiceTolerance(nn.Module):
+class ChoiceTolerance:
     """Mean `tolerance` of several features inside bounds that depend on the chosen option (paper, arm poses).
 
     Args:
@@ -207,9 +217,6 @@ class ChoiceTolerance(nn.Module):
         ValueError: If the bounds are no two matrices of one shape, or a lower bound exceeds its upper bound.
     """
 
-    lower: Tensor
-    upper: Tensor
-
     def __init__(
         self,
         parameter: str,
@@ -220,22 +227,30 @@ class ChoiceTolerance(nn.Module):
         sigmoid: str = "long_tail",
         value_at_margin: float = 0.1,
     ) -> None:
-        super().__init__()
         lower, upper = torch.as_tensor(lower, dtype=torch.float32), torch.as_tensor(upper, dtype=torch.float32)
         if lower.ndim != 2 or lower.shape != upper.shape or bool((lower > upper).any()):
             raise ValueError(
-                f"ChoiceTolerance for {parameter!r} has bounds of shapes {tuple(lower.shape)} and {tuple(upper.shape)}: "
+                f"ChoiceTolerance for {parameter!r} has bounds of shapes {tuple(lower.shape)}, {tuple(upper.shape)}: "
                 "expected two (n_options, k) matrices with lower <= upper."
             )
         self.parameters = (parameter,)
         self.key, self.margin, self.sigmoid, self.value_at_margin = key, margin, sigmoid, value_at_margin
-        self.register_buffer("lower", lower, persistent=False)
-        self.register_buffer("upper", upper, persistent=False)
-        self.register_buffer("_mean", torch.full((lower.shape[1],), 1.0 / lower.shape[1]), persistent=False)
+        # Both bounds in one table, (n_options, 2k): one look-up per step instead of two.
+        self._bounds = {lower.device: torch.cat([lower, upper], dim=-1)}
+        self._mean = {lower.device: torch.full((lower.shape[1],), 1.0 / lower.shape[1], device=lower.device)}
 
-    def forward(self, features: Features, style: Style) -> Tensor:
+    def __call__(self, features: Features, style: Style) -> Tensor:
         """`(...,)`."""
         option = style[self.parameters[0]].argmax(-1)
-        lower, upper = self.lower[option], self.upper[option]  # (..., k)
+        table, mean = _on(self._bounds, option.device), _on(self._mean, option.device)
+        lower, upper = nn.functional.embedding(option, table).chunk(2, dim=-1)  # (..., k) each
         value = tolerance(feature(features, self.key), lower, upper, self.margin, self.sigmoid, self.value_at_margin)
-        return weighted_sum(self._mean, value)
+        return weighted_sum(mean, value)
+
+
+def _on(copies: dict[torch.device, Tensor], device: torch.device) -> Tensor:
+    """The copy of a constant on a device, made on first use."""
+    found = copies.get(device)
+    if found is None:
+        found = copies[device] = next(iter(copies.values())).to(device)
+    return found

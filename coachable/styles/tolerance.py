@@ -19,16 +19,16 @@ def tolerance(
 ) -> Tensor:
     """1 where `lower <= x <= upper`, falling towards 0 with the distance from the interval.
 
-    Equal to `dm_control.utils.rewards.tolerance`, but differentiable, on any device, and with bounds that may be tensors,
-    so that a style can set them.
+    Equal to `dm_control.utils.rewards.tolerance`, but differentiable, on any device, and with bounds that may be
+    tensors, so that a style can set them.
 
     Args:
         x: `(...)` floating point.
         lower: Lower bound, a number or a tensor that broadcasts with `x`; may be infinite.
         upper: Upper bound, likewise. Tensor bounds are not checked for `lower <= upper`.
         margin: Distance at which the value is `value_at_margin`, in the unit of `x`; 0 gives a hard indicator.
-        sigmoid: Shape of the decline: "gaussian", "hyperbolic", "long_tail", "reciprocal", "cosine", "linear", "quadratic"
-            or "tanh_squared".
+        sigmoid: Shape of the decline: "gaussian", "hyperbolic", "long_tail", "reciprocal", "cosine", "linear",
+            "quadratic" or "tanh_squared".
         value_at_margin: In (0, 1); 0 is allowed for "cosine", "linear" and "quadratic". Unused if `margin` is 0.
 
     Returns:
@@ -48,13 +48,9 @@ def tolerance(
     if margin == 0:
         return ((x >= lower) & (x <= upper)).to(x.dtype)
     scale = _scale(sigmoid, value_at_margin)
-    # Distance from the interval, in margins; 0 inside, where every sigmoid is exactly 1 with a zero or finite slope.
-    outside = torch.relu(_maximum(lower - x, x - upper)) / margin
-    return _decline(outside * scale, sigmoid)
-
-
-def _maximum(a: Tensor, b: Tensor) -> Tensor:
-    return torch.maximum(a, b)
+    # Distance from the interval: 0 inside, where every sigmoid is exactly 1. No masks, so that gradients stay finite.
+    distance = (x - upper).abs() if lower is upper else torch.maximum(lower - x, x - upper).relu()
+    return _decline(distance * (scale / margin), sigmoid)
 
 
 def _scale(sigmoid: str, value: float) -> float:
@@ -89,18 +85,18 @@ def _decline(z: Tensor, sigmoid: str) -> Tensor:
     """The sigmoid at scaled distance `z >= 0`."""
     match sigmoid:
         case "gaussian":
-            return torch.exp(-0.5 * z * z)
+            return torch.exp(z.square().mul(-0.5))
         case "hyperbolic":
-            return 1 / torch.cosh(z)
+            return torch.cosh(z).reciprocal()
         case "long_tail":
-            return 1 / (z * z + 1)
+            return z.square().add(1).reciprocal()
         case "reciprocal":
-            return 1 / (z + 1)
+            return z.add(1).reciprocal()
         case "cosine":
             return (1 + torch.cos(math.pi * z.clamp(max=1))) / 2
         case "linear":
             return (1 - z).clamp(min=0)
         case "quadratic":
-            return (1 - z * z).clamp(min=0)
+            return (1 - z.square()).clamp(min=0)
         case _:
-            return 1 - torch.tanh(z) ** 2
+            return 1 - torch.tanh(z).square()

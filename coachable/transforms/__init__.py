@@ -11,7 +11,7 @@ _MODULE_OF = {
     "coachable_env": "coachable.transforms.style_sampler",
 }
 
-__all__ = sorted(_MODULE_OF)
+__all__ = ["CoachableEnv", "StyleRewardTransform", "StyleSampler", "TaskImpersonation", "coachable_env"]
 
 
 def __getattr__(name: str) -> object:

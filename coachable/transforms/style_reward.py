@@ -2,7 +2,7 @@
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.data import Composite, Unbounded
 from torchrl.envs import Transform
 
 from coachable import keys
@@ -12,8 +12,8 @@ from coachable.styles.reward import StyleReward
 class StyleRewardTransform(Transform):
     """Writes `reward = task_reward + style_reward(style_features, theta)`, theta being the style that the policy saw.
 
-    The sum is the one that relabelling computes from stored transitions, bit for bit. The style part is also written, as
-    `style_reward`, beside the task reward.
+    The sum is the one that relabelling computes from stored transitions, bit for bit. The style part is also written,
+    as `style_reward`, and declared where the task reward is declared (as a reward or as an observation).
 
     Args:
         style_reward: The only code that computes style rewards.
@@ -42,9 +42,25 @@ class StyleRewardTransform(Transform):
         self.style_reward_key = style_reward_key
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        value = self.style_reward(next_tensordict.get(self.features_key), tensordict.get(self.style_key))
+        theta = tensordict.get(self.style_key, None)
+        features = next_tensordict.get(self.features_key, None)
+        task_reward = next_tensordict.get(self.task_reward_key, None)
+        if theta is None or features is None or task_reward is None:
+            raise KeyError(self._what_is_missing(tensordict, next_tensordict))
+        value = self.style_reward(features, theta)
         next_tensordict.set(self.style_reward_key, value)
-        return next_tensordict.set(self.reward_key, next_tensordict.get(self.task_reward_key) + value)
+        return next_tensordict.set(self.reward_key, task_reward + value)
+
+    def _what_is_missing(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> str:
+        if self.style_key not in tensordict.keys(True):
+            return (
+                f"step got no {self.style_key!r}, only {sorted(map(str, tensordict.keys()))}: "
+                "put a StyleSampler before StyleRewardTransform, and keep its key in the tensordict."
+            )
+        return (
+            f"the environment emitted {sorted(map(str, next_tensordict.keys()))} after a step: StyleRewardTransform "
+            f"expects {self.task_reward_key!r} and {self.features_key!r}; emit them, or name yours in its arguments."
+        )
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         task_reward = tensordict_reset.get(self.task_reward_key, None)
@@ -52,19 +68,18 @@ class StyleRewardTransform(Transform):
             tensordict_reset.set(self.style_reward_key, torch.zeros_like(task_reward))
         return tensordict_reset
 
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Adds the style reward if the task reward is declared as an observation."""
         return self._beside_task_reward(observation_spec)
 
-    def transform_reward_spec(self, reward_spec: TensorSpec) -> TensorSpec:
+    def transform_reward_spec(self, reward_spec: Composite) -> Composite:
         """Lifts bounds of the task reward, and adds the style reward if the task reward is declared as a reward."""
-        reward_spec = self._beside_task_reward(reward_spec)
         spec = reward_spec[self.reward_key]
         reward_spec[self.reward_key] = Unbounded(shape=spec.shape, dtype=spec.dtype, device=spec.device)
-        return reward_spec
+        return self._beside_task_reward(reward_spec)
 
-    def _beside_task_reward(self, spec: TensorSpec) -> TensorSpec:
-        if isinstance(spec, Composite) and self.task_reward_key in spec.keys(True, True):
+    def _beside_task_reward(self, spec: Composite) -> Composite:
+        if self.task_reward_key in spec.keys(True, True):
             task = spec[self.task_reward_key]
             spec[self.style_reward_key] = Unbounded(shape=task.shape, dtype=torch.float32, device=task.device)
         return spec

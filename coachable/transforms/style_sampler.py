@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, TensorSpec
+from torchrl.data import Bounded, Composite
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 
 from coachable import keys
@@ -73,14 +73,17 @@ class StyleSampler(Transform):
         # Salted: an environment seeded with the same number would otherwise draw start states that match the styles.
         self.generator.manual_seed(secrets.randbits(63) if seed is None else derive_seed(seed, f"style:{self.key}"))
 
-    def hold(self, theta: Tensor) -> None:
-        """Uses this style at every reset, automatic ones included, until `release`.
+    def hold(self, theta: Tensor, strict: bool = False) -> None:
+        """Uses this style at every reset, automatic ones included, until `release`. Running episodes keep theirs.
 
         Args:
-            theta: `(dim,)` for all environments, or `(*batch, dim)`, one each. Running episodes keep their style.
+            theta: `(dim,)` for all environments, or `(*batch, dim)`, one each.
+            strict: Raise instead of clamping to the trained range with a warning.
+
+        Raises:
+            ValueError: If the shape is wrong, a value is NaN, or `strict` and out of range.
         """
-        self.space.validate(theta)
-        self._held = theta.detach().to(torch.float32, copy=True)
+        self._held = self.space.clamp(theta.detach(), strict=strict)
 
     def release(self) -> None:
         """Draws styles again from the next reset on."""
@@ -91,26 +94,43 @@ class StyleSampler(Transform):
         given = tensordict.get(self.key, None)
         shape, device = tensordict_reset.batch_size, tensordict_reset.device
         if given is not None:
-            style = given.to(torch.float32, copy=True)
+            style = self._checked(given)
         elif self._held is not None:
             style = self._held.to(device).expand(*shape, self.space.dim).clone()
         else:
             style = self.sampler.sample(shape, self.generator, device)
         return tensordict_reset.set(self.key, style)
 
+    def _checked(self, given: Tensor) -> Tensor:
+        """A copy of the caller's style, which may lie outside the trained range: such tests are legitimate."""
+        if given.shape[-1] != self.space.dim or bool(given.isnan().any()):
+            raise ValueError(
+                f"reset got the style {given.tolist()}: expected (..., {self.space.dim}) numbers, none of them NaN, "
+                f"for {list(self.space.names)}."
+            )
+        return given.to(torch.float32, copy=True)
+
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         # A copy: writing into the next style in place must not rewrite the style of the transition before it.
         return next_tensordict.set(self.key, tensordict.get(self.key).clone())
 
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+    def _reset_on_native_autoreset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        raise NotImplementedError(
+            "StyleSampler does not follow simulators that reset themselves inside step (TorchRL's native_autoreset): "
+            "episodes would keep the style of the one before. Build the environment with native_autoreset=False."
+        )
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Adds the style, bounded by the space's ranges."""
-        shape = (*observation_spec.shape, self.space.dim)
+        shape = torch.Size((*observation_spec.shape, self.space.dim))
         device = observation_spec.device
         low, high = self.space.low.to(device).expand(shape), self.space.high.to(device).expand(shape)
         observation_spec[self.key] = Bounded(low, high, shape=shape, dtype=torch.float32, device=device)
         return observation_spec
 
-    def transform_state_spec(self, state_spec: TensorSpec) -> TensorSpec:
+    def transform_state_spec(self, state_spec: Composite) -> Composite:
         """Adds the style here too: otherwise a style given at reset would be ignored."""
         return self.transform_observation_spec(state_spec)
 
@@ -143,17 +163,20 @@ class CoachableEnv(TransformedEnv):
     """`TransformedEnv` whose `set_seed` reaches every transform that has a `set_seed` (TorchRL's does not)."""
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
-        """Seeds the environment and its transforms; returns the seed for the next environment."""
+        """Seeds the environment and its transforms; returns the seed for the next environment.
+
+        The first episode starts in `reset`, which a collector calls on construction: seed the environment before.
+        """
         following = super().set_seed(seed, static_seed=static_seed)
         for module in self.transform.modules():
-            if module is not self.transform and hasattr(module, "set_seed"):
+            if hasattr(module, "set_seed"):
                 module.set_seed(seed)  # type: ignore[operator]
         return following
 
-    def hold_style(self, theta: Tensor) -> None:
+    def hold_style(self, theta: Tensor, strict: bool = False) -> None:
         """Uses this style at every reset until `release_style`; see `StyleSampler.hold`."""
         for sampler in self._samplers():
-            sampler.hold(theta)
+            sampler.hold(theta, strict)
 
     def release_style(self) -> None:
         """Draws styles again from the next reset on."""
@@ -174,7 +197,7 @@ def coachable_env(
     *transforms: Transform,
     sampler: Sampler | None = None,
     seed: int | None = None,
-    device: torch.device | str = "cpu",
+    sampler_device: torch.device | str = "cpu",
     **kwargs: Any,
 ) -> CoachableEnv:
     """Adds styles to a domain: `StyleSampler`, then `StyleRewardTransform`, then any further transforms.
@@ -186,16 +209,15 @@ def coachable_env(
         *transforms: Further transforms, such as `StepCounter` or `RewardSum`.
         sampler: Distribution of styles; the space's own if None.
         seed: Seeds the environment and its transforms, if given.
-        device: Where styles are drawn.
+        sampler_device: Where styles are drawn.
         **kwargs: For `TransformedEnv`.
 
     Returns:
         The environment, ready for a collector.
     """
-    chain = Compose(
-        StyleSampler(space, sampler, seed=seed, device=device), StyleRewardTransform(style_reward), *transforms
-    )
-    env = CoachableEnv(base_env, chain, **kwargs)
+    styles = StyleSampler(space, sampler, seed=seed, device=sampler_device)
+    chain = Compose(styles, StyleRewardTransform(style_reward), *transforms)
+    env = CoachableEnv(base_env=base_env, transform=chain, **kwargs)
     if seed is not None:
         env.set_seed(seed)
     return env

@@ -1,0 +1,106 @@
+"""`Sampler`: the base of all distributions over theta, with its registry for serialisation."""
+
+from collections.abc import Sequence
+from dataclasses import fields, is_dataclass
+from functools import lru_cache
+from typing import Any
+
+import torch
+from torch import Generator, Tensor
+
+_CPU = torch.device("cpu")
+_REGISTRY: dict[str, type["Sampler"]] = {}
+
+
+@lru_cache(maxsize=256)
+def constant(values: tuple[float, ...], device: torch.device) -> Tensor:
+    """A float32 constant `(n,)` on a device; shared, so never write to it."""
+    with torch.inference_mode(False):
+        return torch.tensor(values, dtype=torch.float32, device=device)
+
+
+def numbers(values: float | Sequence[float] | Tensor) -> tuple[float, ...]:
+    """A number, a sequence of numbers or a tensor `(n,)` as a tuple of floats."""
+    if isinstance(values, Tensor):
+        values = values.tolist()
+    return tuple(float(v) for v in values) if isinstance(values, Sequence) else (float(values),)
+
+
+class Sampler:
+    """Distribution over a block of `dim` style numbers.
+
+    A new sampler is a frozen dataclass that subclasses this and defines `dim`, `_draw` and, for the range check of
+    `StyleSpace`, `support`. Its fields must be numbers, strings, samplers or tuples of these: serialisation follows
+    from them.
+    """
+
+    @property
+    def dim(self) -> int:
+        """Number of entries of theta that this sampler draws."""
+        raise NotImplementedError(f"{type(self).__name__} must define dim")
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        _REGISTRY[cls.__name__] = cls
+
+    def sample(
+        self,
+        shape: Sequence[int] = (),
+        generator: Generator | None = None,
+        device: torch.device | str | None = None,
+    ) -> Tensor:
+        """Draws styles.
+
+        Args:
+            shape: Batch shape.
+            generator: Source of randomness; torch's global generator if None.
+            device: Device of the result; the generator's device if None, or the CPU without one.
+
+        Returns:
+            `(*shape, dim)` float32.
+        """
+        target = torch.device(device) if device is not None else generator.device if generator is not None else _CPU
+        source = generator.device if generator is not None else target
+        drawn = self._draw(tuple(shape), generator, source)
+        return drawn if source == target else drawn.to(target)
+
+    def _draw(self, shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
+        raise NotImplementedError(f"{type(self).__name__} must define _draw")
+
+    def support(self) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+        """Lowest and highest value of each entry, or None if not known."""
+        return None
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready description; `Sampler.from_dict` reads it back."""
+        if not is_dataclass(self):
+            raise TypeError(f"sampler {type(self).__name__} cannot be described: make it a frozen dataclass.")
+        return {"type": type(self).__name__, **{f.name: _plain(getattr(self, f.name)) for f in fields(self)}}
+
+    @staticmethod
+    def from_dict(description: dict[str, Any]) -> "Sampler":
+        """Rebuilds a sampler from `to_dict`.
+
+        Raises:
+            ValueError: If the type is unknown, for instance because the module that defines it was not imported.
+        """
+        arguments = dict(description)
+        kind = arguments.pop("type", None)
+        if kind not in _REGISTRY:
+            raise ValueError(
+                f"unknown sampler type {kind!r}: expected one of {sorted(_REGISTRY)}. "
+                "A sampler of your own is known once its module has been imported."
+            )
+        return _REGISTRY[kind](**{name: _revived(value) for name, value in arguments.items()})
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Sampler):
+        return value.to_dict()
+    return [_plain(v) for v in value] if isinstance(value, tuple) else value
+
+
+def _revived(value: Any) -> Any:
+    if isinstance(value, dict):
+        return Sampler.from_dict(value)
+    return tuple(_revived(v) for v in value) if isinstance(value, list) else value
