@@ -63,11 +63,13 @@ class GaussianPolicy(nn.Module):
 
     def forward(self, observation: Tensor, style: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return location and scale, both `(..., action_dim)` float32, for raw (not encoded) `style`."""
-        if self.space is not None:
-            if style is None:
-                raise ValueError("this policy is conditioned on a style: pass theta as the second argument")
-            observation = torch.cat((observation, self.space.encode(style)), -1)
-        loc, raw = self.trunk(observation).chunk(2, -1)
+        if self.space is None:
+            out = self.trunk(observation)
+        elif style is None:
+            raise ValueError("this policy is conditioned on a style: pass theta as the second argument")
+        else:
+            out = self.trunk(observation, self.space.encode(style))
+        loc, raw = out.chunk(2, -1)
         low, high = self.log_scale_range
         return loc, torch.exp(low + 0.5 * (high - low) * (torch.tanh(raw) + 1.0))
 

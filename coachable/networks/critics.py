@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 from torchrl.modules import ValueOperator
 
@@ -44,10 +43,10 @@ class StyleCritic(nn.Module):
     def forward(self, observation: Tensor, action: Tensor, style: Tensor | None = None) -> Tensor:
         """Return `(..., num_outputs)` float32, for raw (not encoded) `style`."""
         if self.space is None:
-            return self.trunk(torch.cat((observation, action), -1))
+            return self.trunk(observation, action)
         if style is None:
             raise ValueError("this critic is conditioned on a style: pass theta as the third argument")
-        return self.trunk(torch.cat((observation, self.space.encode(style), action), -1))
+        return self.trunk(observation, self.space.encode(style), action)
 
 
 def make_critic(

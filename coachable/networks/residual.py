@@ -13,6 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from coachable.networks.fused import Layer, Plan, residual_network
+
 Side = Literal["end", "beginning"]
 Padding = Literal["alternate", "end", "beginning"]
 Narrowing = Literal["padded_side", "keep_first"]
@@ -147,16 +149,56 @@ class ResidualMLP(nn.Module):
             nn.init.xavier_uniform_(self.head.weight)
             nn.init.zeros_(self.head.bias)
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Map `(..., in_features)` to `(..., out_features)` (without a head: to the last layer's features).
+        self._plan: Plan | None = None
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Map inputs `(..., d_i)`, concatenated to `in_features`, to `(..., out_features)`.
 
         The head runs in float32 also under autocast: values and log-probabilities need more than bfloat16's 8 bits.
+        Without a head this returns the last layer's features.
         """
+        if self._plan is not None:
+            return residual_network(self._plan, inputs, self.ordered_parameters())
+        x = inputs[0] if len(inputs) == 1 else torch.cat(inputs, -1)
         hidden = self.blocks(x)
         if self.head is None:
             return hidden
         with torch.autocast(x.device.type, enabled=False):
             return self.head(hidden.to(self.head.weight.dtype))
+
+    def plan(self) -> Plan:
+        """Describe this network for :func:`~coachable.networks.fused.residual_network`."""
+        layers = tuple(
+            Layer(
+                in_features=block.linear.in_features,
+                out_features=block.linear.out_features,
+                side=block.side,
+                narrowing=block.narrowing,
+                eps=block.norm.eps if block.norm is not None else 0.0,
+                norm=block.norm is not None,
+            )
+            for block in self.blocks
+            if isinstance(block, ResidualBlock)
+        )
+        return Plan(layers, head=self.head is not None)
+
+    def use_plan(self, plan: Plan | None) -> None:
+        """Evaluate with the hand-written passes from now on, or layer by layer again (`None`).
+
+        The learner does so during its updates only: a plan with bfloat16 weights is stale once the parameters change.
+        """
+        self._plan = plan
+
+    def ordered_parameters(self) -> list[Tensor]:
+        """Parameters in the order of :func:`~coachable.networks.fused.residual_network`."""
+        tensors: list[Tensor] = []
+        for block in self.blocks:
+            tensors += [block.linear.weight, block.linear.bias]  # pyright: ignore
+            if block.norm is not None:
+                tensors += [block.norm.weight, block.norm.bias]  # pyright: ignore
+        if self.head is not None:
+            tensors += [self.head.weight, self.head.bias]
+        return tensors
 
 
 def _sides(padding: Padding | Sequence[Side], layers: int) -> tuple[Side, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal, get_args
 
 import torch
@@ -10,6 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import LossModule, SoftUpdate
 
+from coachable.training.acceleration import Acceleration
 from coachable.training.precision import Precision, resolve_precision
 
 UpdateOrder = Literal["simultaneous", "policy_first", "critic_first"]
@@ -44,7 +46,9 @@ class Learner:
         update_order: See above.
         precision: `"bf16"` multiplies in bfloat16 with float32 master weights, layer-norm statistics, heads, targets
             and losses; `"auto"` takes it where the device has it in hardware.
-        compile: Compile the loss functions with `torch.compile`.
+        fused: Evaluate residual networks through their hand-written passes (`coachable.networks.fused`) where possible:
+            on a CPU, when policy and critics consist of nothing else. The numbers are the same, the update is faster.
+        compile: Compile the loss functions with `torch.compile`; excludes `fused`.
         check_every: Read the non-finite flag every so many updates (a device synchronisation on a GPU); 0 leaves that
             to calls of :meth:`check_finite`.
 
@@ -64,6 +68,7 @@ class Learner:
         max_grad_norm: float | None = None,
         update_order: UpdateOrder = "simultaneous",
         precision: Precision = "auto",
+        fused: bool = True,
         compile: bool = False,
         check_every: int = 100,
     ) -> None:
@@ -97,6 +102,9 @@ class Learner:
         self._forward: Callable[..., Any] = loss_module.forward
         self._actor_loss: Callable[..., Any] = loss_module.actor_loss
         self._critic_loss: Callable[..., Any] = _critic_loss_of(loss_module)
+        self._acceleration: Acceleration | None = None
+        if fused and not compile and Acceleration.supports(loss_module):
+            self._acceleration = Acceleration(loss_module, torch.bfloat16 if self.precision == "bf16" else None)
         if compile:
             self._forward = torch.compile(self._forward)
             self._actor_loss = torch.compile(self._actor_loss)
@@ -118,10 +126,12 @@ class Learner:
         Raises:
             NonFiniteLossError: If a loss was infinite or NaN since the last check (see `check_every`).
         """
-        metrics = self._simultaneous(batch) if self.update_order == "simultaneous" else self._sequential(batch)
+        with self._networks():
+            metrics = self._simultaneous(batch) if self.update_order == "simultaneous" else self._sequential(batch)
         self.target_updater.step()
         self.updates += 1
-        total = metrics["loss_actor"] + metrics["loss_qvalue"]
+        # A NaN parameter can hide behind a rectifier in the losses, but not in the gradients.
+        total = sum(metrics[key] for key in ("loss_actor", "loss_qvalue", "grad_norm_actor", "grad_norm_critic"))
         self._non_finite.logical_or_(torch.isfinite(total).logical_not_())
         if self.check_every and self.updates % self.check_every == 0:
             self.check_finite()
@@ -150,19 +160,27 @@ class Learner:
         self.loss_module.load_state_dict(state["loss_module"])
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
+        if self._acceleration is not None:
+            self._acceleration.bind()
         self.updates = int(state["updates"])
         self._non_finite.zero_()
 
-    def _autocast(self) -> torch.autocast:
-        return torch.autocast(self._device_type, dtype=torch.bfloat16, enabled=self.precision == "bf16")
+    def _networks(self) -> AbstractContextManager[None]:
+        return nullcontext() if self._acceleration is None else self._acceleration.active()
+
+    def _autocast(self) -> AbstractContextManager[None]:
+        if self.precision == "fp32" or self._acceleration is not None:
+            return nullcontext()
+        return torch.autocast(self._device_type, dtype=torch.bfloat16)
 
     def _step(self, name: str, parameters: list[nn.Parameter]) -> Tensor:
-        limit = self.max_grad_norm
         norm = torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
-        if limit is not None:
-            torch.nn.utils.clip_grads_with_norm_(parameters, limit, norm)
+        if self.max_grad_norm is not None:
+            torch.nn.utils.clip_grads_with_norm_(parameters, self.max_grad_norm, norm)
         self.optimizers[name].step()
         self.optimizers[name].zero_grad(set_to_none=True)
+        if self._acceleration is not None and self.update_order != "simultaneous":
+            self._acceleration.refresh(name)
         return norm
 
     def _simultaneous(self, batch: TensorDictBase) -> dict[str, Tensor]:
