@@ -5,10 +5,15 @@ simulator, a logger or a plotting library.
 """
 
 from importlib import import_module
+from typing import TYPE_CHECKING
 
 from coachable.gl import choose_gl_backend
 
 choose_gl_backend()  # MuJoCo, which TorchRL imports, reads the choice once, when it is imported
+
+if TYPE_CHECKING:
+    from coachable.styles import Choice, Setpoint, StyleReward, StyleSpace, Weight
+    from coachable.transforms import CoachableEnv, StyleRewardTransform, StyleSampler, TaskImpersonation, coachable_env
 
 __version__ = "0.1.0.dev0"
 

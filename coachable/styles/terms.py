@@ -11,18 +11,20 @@ import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, runtime_checkable
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from coachable.styles.tolerance import tolerance
 from coachable.styles.view import StyleView
 
-Features = Tensor | TensorDictBase
-Style = Mapping[str, Tensor]
-FeatureKey = int | slice | str | tuple[Any, ...]
+if TYPE_CHECKING:  # tensordicts are welcome, but this package runs on torch alone
+    from tensordict import TensorDictBase
+
+Features: TypeAlias = "Tensor | TensorDictBase"
+Style: TypeAlias = Mapping[str, Tensor]
+FeatureKey: TypeAlias = int | slice | str | tuple[Any, ...]
 
 
 @runtime_checkable

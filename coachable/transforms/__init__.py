@@ -1,6 +1,12 @@
 """TorchRL transforms: styles and style rewards in environments, relabelling in replay, gamepad actions."""
 
 from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from coachable.transforms.style_reward import StyleRewardTransform
+    from coachable.transforms.style_sampler import CoachableEnv, StyleSampler, coachable_env
+    from coachable.transforms.task_impersonation import TaskImpersonation
 
 # Resolved on first use, so that one transform does not load the others.
 _MODULE_OF = {

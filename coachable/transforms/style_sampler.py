@@ -216,7 +216,7 @@ def coachable_env(
         The environment, ready for a collector.
     """
     styles = StyleSampler(space, sampler, seed=seed, device=sampler_device)
-    chain = Compose(styles, StyleRewardTransform(style_reward), *transforms)
+    chain = Compose(styles, StyleRewardTransform(style_reward), *transforms)  # pyright: ignore[reportCallIssue]
     env = CoachableEnv(base_env=base_env, transform=chain, **kwargs)
     if seed is not None:
         env.set_seed(seed)
