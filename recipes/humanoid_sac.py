@@ -22,7 +22,8 @@ from coachable.training.collection import evaluate_policy
 from coachable.training.episodes import EpisodeSums
 from coachable.training.hardware import detect, estimate_update_seconds, share_threads
 from coachable.training.logging import MetricsLog, Progress, wandb_logger
-from coachable.training.loop import Train
+from coachable.training.loop import REPLAY_KEYS, Train
+from coachable.training.replay_files import replay_bytes
 from coachable.training.rng import seed_everything
 from coachable.training.weights import agent_state, initialise_from
 from coachable.transforms import CoachableEnv, coachable_env
@@ -31,7 +32,7 @@ from coachable.transforms import CoachableEnv, coachable_env
 def build(config: dict[str, Any]) -> Train:
     """Composes a training from its configuration: env, actor and critics, loss, learner, replay, collector, loop."""
     run_dir = Path(config["run_dir"])
-    check_writable(run_dir, required_bytes=10**9 if config["checkpoint"]["replay"] else 10**8)
+    check_writable(run_dir)
     save_config(config, run_dir)
     make = partial(instantiate, _convert_="all", _partial_=True)
     threads = share_threads(**config["threads"])
@@ -45,8 +46,10 @@ def build(config: dict[str, Any]) -> Train:
     space = humanoid_style_space()
     style_reward = humanoid_style_reward(space, **config["style_reward"])
 
+    workers = config["collector"]["num_collectors"]
+
     def make_env(seed: int, **settings: Any) -> CoachableEnv:
-        simulation = make(config["env"])(num_threads=threads.simulator, seed=seed, **settings)
+        simulation = make(config["env"])(num_threads=max(1, threads.simulator // workers), seed=seed, **settings)
         return coachable_env(simulation, space, style_reward, EpisodeSums(), seed=seed)
 
     # Actor and critics; a list of critics, because a single one would be re-initialised by the loss
@@ -66,11 +69,12 @@ def build(config: dict[str, Any]) -> Train:
 
     # Replay and collector
     replay = make(config["replay"])()
-    num_envs = config["env"]["num_envs"]
+    if config["checkpoint"]["replay"]:  # two at a time: the old one is removed when the new one is complete
+        check_writable(run_dir, required_bytes=2 * replay_bytes(probe, REPLAY_KEYS, config["replay_capacity"]))
     collector = make(config["collector"])(
         make_env,
         actor,
-        frames_per_batch=num_envs,
+        frames_per_batch=config["env"]["num_envs"] * workers,
         init_random_frames=config["init_random_frames"],
         seed=config["seed"],
         policy_device=device,

@@ -2,6 +2,7 @@
 
 import difflib
 import json
+import logging
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -23,6 +24,9 @@ from coachable.training.hardware import choose_preset, detect
 CONFIGS = Path(__file__).resolve().parent / "configs"
 GROUPS = {folder.name: sorted(f.stem for f in folder.glob("*.yaml")) for folder in CONFIGS.iterdir() if folder.is_dir()}
 
+# What a checkpoint decides: its weights, its replay buffer and its generators belong to these values.
+_FIXED = ("domain", "seed", "network", "loss", "gamma", "style_reward", "replay", "replay_capacity", "init_from")
+
 
 def run_recipe(config_name: str, train: Callable[[dict[str, Any]], Any]) -> None:
     """Runs a recipe from the command line.
@@ -31,6 +35,7 @@ def run_recipe(config_name: str, train: Callable[[dict[str, Any]], Any]) -> None
         config_name: file in recipes/configs, without its suffix.
         train: gets the plain, resolved configuration.
     """
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces every buffer it allocates
     sys.argv[1:] = checked_arguments(config_name, sys.argv[1:])
 
     @hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name=config_name)
@@ -110,6 +115,11 @@ def plain_config(cfg: DictConfig, overrides: list[str]) -> dict[str, Any]:
         checkpoint = find_checkpoint(cfg.resume)
         saved = read_state(checkpoint)["config"]
         said = {key: OmegaConf.select(cfg, key) for key in _said(overrides)}
+        fixed = [key for key in said if key.split(".")[0] in _FIXED]
+        if fixed:
+            raise SystemExit(
+                f"error: {', '.join(fixed)} cannot change in a resumed run: start a new one with init_from={cfg.resume}"
+            )
         cfg = OmegaConf.create(saved)
         for key, value in {
             "init_from": None,

@@ -11,6 +11,7 @@ import shutil
 import time
 import warnings
 from collections.abc import Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +74,7 @@ class CheckpointStore:
         try:
             partial.mkdir()
             _save_tensors({"schema": SCHEMA_VERSION, **state}, partial / _STATE)
-            _write_text(partial / "metadata.json", json.dumps({"schema": SCHEMA_VERSION, **metadata}, indent=1))
+            _write_text(partial / "metadata.json", json.dumps({**metadata, **_provenance()}, indent=1))
             if replay is not None and self.replay:
                 write_replay(replay, partial / "replay")
             _sync_folder(partial)
@@ -260,6 +261,7 @@ def _sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def now() -> str:
-    """UTC time as ISO 8601."""
-    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+def _provenance() -> dict[str, Any]:
+    packages = ("coachable", "torch", "torchrl", "tensordict")
+    created = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+    return {"schema": SCHEMA_VERSION, "created": created, "versions": {name: version(name) for name in packages}}

@@ -18,6 +18,7 @@ __all__ = [
     "evaluate_policy",
     "load_collector_state",
     "make_collector",
+    "require_finite",
     "simulation_env",
 ]
 
@@ -67,7 +68,8 @@ def make_collector(
     common: dict[str, Any] = {
         "frames_per_batch": frames_per_batch,
         "total_frames": -1,  # the loop decides when to stop
-        "init_random_frames": init_random_frames or None,
+        # rounded up to whole iterations, which TorchRL does too, but with a warning
+        "init_random_frames": -(-init_random_frames // frames_per_batch) * frames_per_batch or None,
         "exploration_type": ExplorationType.RANDOM,
         "auto_register_policy_transforms": False,  # ours need none
     }
@@ -113,6 +115,7 @@ def collector_state(collector: BaseCollector) -> dict[str, Any]:
     return {
         "frames": int(collector._frames),
         "iterations": int(collector._iter),
+        "trajectories": dict(collector._traj_pool.state_dict()),
         "transforms": dict(env.state_dict()) if isinstance(env, TransformedEnv) else {},
         "simulation": simulation,
         # Without the simulation's state, the observation to go on from would not be the simulator's.
@@ -152,8 +155,7 @@ def load_collector_state(collector: BaseCollector, state: dict[str, Any]) -> boo
         return False
     base.load_simulator_state(state["simulation"])
     carrier = TensorDict(state["carrier"], batch_size=collector._carrier.batch_size)
-    if ("collector", "traj_ids") in carrier.keys(True):
-        collector._traj_pool.get_traj_and_increment(int(carrier["collector", "traj_ids"].max()) + 1)
+    collector._traj_pool.load_state_dict(state["trajectories"])
     collector._carrier = carrier.clone()
     return True
 
@@ -215,3 +217,24 @@ def _plain(td: TensorDictBase) -> dict[str, Any]:
         str(key): _plain(value) if isinstance(value, TensorDictBase) else value.detach().clone().cpu()
         for key, value in td.items()
     }
+
+
+def require_finite(data: TensorDictBase) -> None:
+    """Refuses transitions that would poison the replay buffer.
+
+    Args:
+        data: flat `[B]`.
+
+    Raises:
+        ValueError: if an observation or a reward is NaN or infinite.
+    """
+    for key in ("observation", ("next", "observation"), ("next", "reward")):
+        value = data.get(key)
+        # The sum is finite only if every entry is; that an overflow may look alike, the second look sorts out.
+        if not torch.isfinite(value.sum()) and not torch.isfinite(value).all():
+            rows = (~torch.isfinite(value)).flatten(1).any(1).nonzero().flatten().tolist()
+            raise ValueError(
+                f"{key!r} is not finite in {len(rows)} of {len(value)} collected transitions (first: row {rows[0]}): "
+                "none was stored. The environment has to end an episode whose physics explode, and rewards have to "
+                "be finite for every style: look at its step function and at the style terms."
+            )

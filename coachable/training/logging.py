@@ -20,9 +20,6 @@ class CsvLog:
 
     Args:
         path: the file; rows are appended when it exists.
-        resume_at: rows whose `key` exceeds this are dropped first: they belong to a course of events that a resumed
-            training leaves behind.
-        key: column that orders the rows.
 
     Example:
         >>> import tempfile
@@ -33,31 +30,35 @@ class CsvLog:
         ['frames,loss,reward', '1,0.5,', '2,,1.0']
     """
 
-    def __init__(self, path: Path, resume_at: int | None = None, key: str = "frames") -> None:
+    def __init__(self, path: Path) -> None:
         self.path = Path(path)
         self.columns: list[str] = []
-        if self.path.exists():
-            with self.path.open(newline="", encoding="utf-8") as file:
-                reader = csv.DictReader(file)
-                self.columns = list(reader.fieldnames or [])
-                rows = list(reader)
-            if resume_at is not None:
-                kept = [row for row in rows if float(row.get(key) or 0) <= resume_at]
-                if len(kept) < len(rows):
-                    self._rewrite(kept)
+        self._read()
+
+    def rewind(self, limit: float, key: str = "frames") -> None:
+        """Drops rows whose `key` exceeds `limit`: they belong to a course that a resumed training leaves behind."""
+        rows = self._read()
+        kept = [row for row in rows if float(row.get(key) or 0) <= limit]
+        if len(kept) < len(rows):
+            self._rewrite(kept)
 
     def write(self, row: Mapping[str, Any]) -> None:
         """Appends one row; unknown names become new columns."""
         new = [name for name in row if name not in self.columns]
         if new:
-            rows: list[dict[str, Any]] = []
-            if self.path.exists() and self.columns:
-                with self.path.open(newline="", encoding="utf-8") as file:
-                    rows = list(csv.DictReader(file))
+            rows = self._read()
             self.columns += new
             self._rewrite(rows)
         with self.path.open("a", newline="", encoding="utf-8") as file:
             csv.DictWriter(file, self.columns, restval="", lineterminator="\n").writerow(row)
+
+    def _read(self) -> list[dict[str, Any]]:
+        if not self.path.exists():
+            return []
+        with self.path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            self.columns = list(reader.fieldnames or [])
+            return list(reader)
 
     def _rewrite(self, rows: list[dict[str, Any]]) -> None:
         partial = self.path.with_name(self.path.name + ".partial")
@@ -97,13 +98,16 @@ class MetricsLog:
 
     Args:
         run_dir: `metrics.csv` is written here.
-        logger: a TorchRL logger with `log_metrics` or `log_scalar`, or None.
-        resume_at: frame count of the checkpoint that is resumed (see `CsvLog`).
+        logger: a TorchRL logger with `log_metrics`, or None.
     """
 
-    def __init__(self, run_dir: Path, logger: Any | None = None, resume_at: int | None = None) -> None:
-        self.csv = CsvLog(Path(run_dir) / "metrics.csv", resume_at)
+    def __init__(self, run_dir: Path, logger: Any | None = None) -> None:
+        self.csv = CsvLog(Path(run_dir) / "metrics.csv")
         self.logger = logger
+
+    def rewind(self, frames: int) -> None:
+        """Forgets rows after `frames` env-steps, before a training is resumed there."""
+        self.csv.rewind(frames)
 
     def write(self, row: Mapping[str, float], step: int) -> None:
         """Logs one row.
@@ -123,23 +127,29 @@ class Progress:
 
     Args:
         total: env-steps of the whole training.
-        initial: env-steps already done.
         stream: where to write, standard error by default.
         every: [s] between JSON lines.
     """
 
-    def __init__(self, total: int, initial: int = 0, stream: TextIO | None = None, every: float = 60.0) -> None:
+    def __init__(self, total: int, stream: TextIO | None = None, every: float = 60.0) -> None:
         self.stream = stream or sys.stderr
         self.total = total
         self.every = every
-        self._start = self._last = time.monotonic()
-        self._initial = initial
-        self._rates = (self._start, initial, None)
-        self._bar = (
-            tqdm(total=total, initial=initial, unit="step", unit_scale=True, file=self.stream, smoothing=0.05)
-            if self.stream.isatty()
-            else None
-        )
+        self._bar: Any | None = None
+        self._last = 0.0
+        self._then = (0.0, 0, 0)
+
+    def start(self, frames: int, updates: int) -> None:
+        """Begins to count.
+
+        Args:
+            frames: env-steps already done.
+            updates: updates already made.
+        """
+        self._last = time.monotonic()
+        self._then = (self._last, frames, updates)
+        if self.stream.isatty():
+            self._bar = tqdm(total=self.total, initial=frames, unit="step", unit_scale=True, file=self.stream)
 
     def update(self, frames: int, updates: int, metrics: Mapping[str, float], *, force: bool = False) -> None:
         """Shows where the training is.
@@ -154,6 +164,7 @@ class Progress:
         if self._bar is not None:
             self._bar.update(frames - self._bar.n)
             if force or now - self._last >= 1.0:
+                self._last = now
                 rates = self._rate(now, frames, updates)
                 self._bar.set_postfix_str(", ".join([f"{rates['updates_per_s']:.0f} updates/s", *_pretty(metrics)]))
             return
@@ -170,17 +181,14 @@ class Progress:
             self._bar.close()
 
     def _rate(self, now: float, frames: int, updates: int) -> dict[str, float]:
-        then, frames_then, updates_then = self._rates
+        then, frames_then, updates_then = self._then
         seconds = max(now - then, 1e-9)
         steps_per_s = (frames - frames_then) / seconds
-        updates_per_s = 0.0 if updates_then is None else (updates - updates_then) / seconds
-        self._rates = (now, frames, updates)
-        eta = (self.total - frames) / steps_per_s if steps_per_s > 0 else float("inf")
-        return {
-            "steps_per_s": round(steps_per_s, 1),
-            "updates_per_s": round(updates_per_s, 1),
-            "eta_min": round(eta / 60, 1) if math.isfinite(eta) else -1.0,
-        }
+        self._then = (now, frames, updates)
+        rates = {"steps_per_s": round(steps_per_s, 1), "updates_per_s": round((updates - updates_then) / seconds, 1)}
+        if steps_per_s > 0:
+            rates["eta_min"] = round(max(0, self.total - frames) / steps_per_s / 60, 1)
+        return rates
 
 
 def _short(value: Any) -> Any:

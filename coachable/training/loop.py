@@ -1,6 +1,5 @@
 """The one training loop: collect, store, update, evaluate, log, checkpoint."""
 
-import signal
 import threading
 import time
 import warnings
@@ -8,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import torch
@@ -17,13 +15,14 @@ from torchrl.collectors import BaseCollector, Collector
 from torchrl.data import ReplayBuffer
 
 from coachable.keys import STYLE, STYLE_FEATURES, TASK_REWARD
-from coachable.training.checkpoint import CheckpointStore, find_checkpoint, now, read_state
-from coachable.training.collection import collector_state, load_collector_state
+from coachable.training.checkpoint import CheckpointStore, find_checkpoint, read_state
+from coachable.training.collection import collector_state, load_collector_state, require_finite
 from coachable.training.episodes import EpisodeStatistics, Means
 from coachable.training.learner import Learner
 from coachable.training.logging import MetricsLog, Progress
 from coachable.training.replay_files import read_replay
 from coachable.training.rng import rng_state, set_rng_state
+from coachable.training.stopping import stop_signals
 from coachable.training.throttle import Throttle
 from coachable.training.weights import require_same_agent
 
@@ -143,16 +142,21 @@ class Train:
         Raises:
             ValueError: if an observation or a reward is not finite.
         """
+        self.progress.start(self.frames, self.learner.updates)
         batches = iter(self.collector)
-        with _stop_signals() as stop:
-            while self.frames < self.settings.total_frames and not stop.is_set():
-                data = self._collect(batches)
-                self._store(data)
-                self._update(data.numel(), stop)
-                self._evaluate_if_due()
-                self._log_if_due()
-                self._checkpoint_if_due()
-            self._finish(interrupted=stop.is_set())
+        try:
+            with stop_signals() as stop:
+                while self.frames < self.settings.total_frames and not stop.is_set():
+                    data = self._collect(batches)
+                    self._store(data)
+                    self._update(data.numel(), stop)
+                    self._evaluate_if_due()
+                    self._log_if_due()
+                    self._checkpoint_if_due()
+                self._finish(interrupted=stop.is_set())
+        finally:
+            self.progress.close()
+            self.collector.shutdown()
         return self._latest
 
     def _collect(self, batches: Iterator[TensorDictBase]) -> TensorDictBase:
@@ -169,7 +173,7 @@ class Train:
             data = data.contiguous().reshape(
                 -1
             )  # flattening the lazy stack without contiguous() takes 25 times as long
-            _require_finite(data)
+            require_finite(data)
             self._episodes.add(data)
             self.replay.extend(data.select(*self.replay_keys))
 
@@ -240,8 +244,7 @@ class Train:
         if self.checkpoints is None:
             return None
         with self._timed("checkpoint"):
-            metadata = {**self._position(), "created": now(), "versions": _versions()}
-            path = self.checkpoints.try_save({**self.describe(), **self.state_dict()}, metadata, self.replay)
+            path = self.checkpoints.try_save({**self.describe(), **self.state_dict()}, self._position(), self.replay)
             self._saved = time.monotonic()
         return path
 
@@ -251,7 +254,6 @@ class Train:
         self._log()
         self._checkpoint()
         self.progress.update(self.frames, self.learner.updates, self._latest, force=True)
-        self.progress.close()
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that the rest of the training depends on, but for the replay buffer."""
@@ -277,6 +279,7 @@ class Train:
         path = find_checkpoint(path)
         state = read_state(path)
         require_same_agent(state, self.describe(), path)
+        self.log.rewind(state["loop"]["frames"])
         self.load_state_dict(state, path / "replay" if (path / "replay").is_dir() else None)
         return path
 
@@ -287,7 +290,11 @@ class Train:
             state: contains what `state_dict` returned.
             replay: folder of the saved replay buffer; None starts with an empty one, and says so.
         """
+        rates = {name: [group["lr"] for group in o.param_groups] for name, o in self.learner.optimizers.items()}
         self.learner.load_state_dict(state["learner"])
+        for name, optimizer in self.learner.optimizers.items():  # a new learning rate on the command line must count
+            for group, rate in zip(optimizer.param_groups, rates[name], strict=True):
+                group["lr"] = rate
         self.frames = state["loop"]["frames"]
         self.owed = state["loop"]["owed"]
         self._evaluations = state["loop"]["evaluations"]
@@ -303,44 +310,3 @@ class Train:
         start = time.perf_counter()
         yield
         self.seconds[part] += time.perf_counter() - start
-
-
-@contextmanager
-def _stop_signals() -> Iterator[threading.Event]:
-    """Turns the first Ctrl-C or SIGTERM into an event; the second one acts as usual."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-
-    def on_signal(number: int, _frame: FrameType | None) -> None:
-        stop.set()
-        signal.signal(number, before[number] or signal.SIG_DFL)
-
-    for number in before:
-        signal.signal(number, on_signal)
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler or signal.SIG_DFL)
-
-
-def _require_finite(data: TensorDictBase) -> None:
-    for key in ("observation", ("next", "observation"), ("next", "reward")):
-        value = data.get(key)
-        # The sum is finite only if every entry is; that an overflow may look alike, the second look sorts out.
-        if not torch.isfinite(value.sum()) and not torch.isfinite(value).all():
-            rows = (~torch.isfinite(value)).flatten(1).any(1).nonzero().flatten().tolist()
-            raise ValueError(
-                f"{key!r} is not finite in {len(rows)} of {len(value)} collected transitions (first: row {rows[0]}); none "
-                "of them was stored. The environment has to end an episode whose physics explode, and rewards have to "
-                "be finite for every style: look at its step function and at the style terms."
-            )
-
-
-def _versions() -> dict[str, str]:
-    from importlib.metadata import version
-
-    return {name: version(name) for name in ("coachable", "torch", "torchrl", "tensordict")}

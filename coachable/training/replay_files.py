@@ -2,13 +2,15 @@
 
 import json
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict
+from tensordict import NestedKey, TensorDict
 from torchrl.data import ReplayBuffer
+from torchrl.envs import EnvBase
 
 __all__ = ["read_replay", "replay_bytes", "write_replay"]
 
@@ -84,16 +86,18 @@ def read_replay(replay: ReplayBuffer, folder: Path) -> int:
     return index["filled"]
 
 
-def replay_bytes(record: TensorDict, capacity: int) -> int:
+def replay_bytes(env: EnvBase, keys: Iterable[NestedKey], capacity: int) -> int:
     """Size of a full buffer.
 
     Args:
-        record: one stored transition, or a batch of them.
+        env: batched env whose transitions are stored.
+        keys: what is stored of them.
         capacity: records.
 
     Returns:
         Bytes.
     """
+    record = env.fake_tensordict().select(*keys, strict=False)
     values = record.values(include_nested=True, leaves_only=True)
     return capacity * sum(v.element_size() * v.numel() for v in values) // max(1, record.numel())
 

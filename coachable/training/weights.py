@@ -18,6 +18,7 @@ __all__ = ["LoadedPolicy", "agent_state", "export_weights", "initialise_from", "
 
 _PRETRAINED = Path(__file__).resolve().parent.parent / "pretrained"
 _CRITICS = "qvalue_network_params."
+_PATHS = ("run_dir", "resume", "init_from")  # of the machine that trained, not of the agent
 _AGENT = ("domain", "space", "config", "network", "actor", "critics")
 
 
@@ -53,7 +54,7 @@ def agent_state(
         space: its styles.
         actor: its policy.
         loss_module: holds the critics' weights.
-        network: how to build the actor again: `{"actor": {"_target_": "coachable....", arguments}}`; `space` is added.
+        network: how to build the actor again: `{"actor": {"_target_": "coachable.networks....", arguments}}`; `space` is added.
         config: resolved configuration, plain containers.
 
     Returns:
@@ -111,6 +112,7 @@ def export_weights(checkpoint: Path | str, out: Path | str) -> Path:
     # Tensors are copied, because a slice or a shared parameter would drag its whole storage into the file.
     agent["actor"] = {name: value.clone() for name, value in agent["actor"].items()}
     agent["critics"] = {name: value.clone() for name, value in agent["critics"].items()}
+    agent["config"] = {**agent["config"], **dict.fromkeys(_PATHS)}
     counters = {"frames": state["loop"]["frames"], "updates": state["learner"]["updates"]}
     out = Path(out)
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -165,12 +167,22 @@ def require_same_agent(saved: Mapping[str, Any], present: Mapping[str, Any], sou
 
 
 def _check_space(saved: Mapping[str, Any], space: StyleSpace, source: Path | str) -> None:
-    differences = StyleSpace.from_dict(saved).difference(space)
+    there, here = _essentials(saved), _essentials(space.to_dict())
+    differences = here.difference(there)
     if differences:
         raise CheckpointError(
-            f"{source} was trained on another style space: {'; '.join(differences)}. "
-            "Train afresh, or declare the space as it was"
+            f"{source} was trained on another style space: {' '.join(differences)} (Here is this run, there the "
+            "checkpoint.) Train afresh, or declare the space as it was."
         )
+
+
+def _essentials(description: Mapping[str, Any]) -> StyleSpace:
+    """The space without what may change freely: help texts and ranges of reports."""
+    parameters = [
+        {key: value for key, value in parameter.items() if key not in ("help", "evaluation")}
+        for parameter in description["parameters"]
+    ]
+    return StyleSpace.from_dict({**description, "parameters": parameters})
 
 
 def _locate(path_or_domain: Path | str) -> Path:
@@ -190,8 +202,8 @@ def _locate(path_or_domain: Path | str) -> Path:
 def _build(network: Mapping[str, Any], space: StyleSpace, source: Path) -> TensorDictModuleBase:
     arguments = dict(network)
     target = str(arguments.pop("_target_"))
-    if not target.startswith("coachable."):  # a file must not choose what is imported and called
-        raise CheckpointError(f"{source} names {target!r} as its network: only coachable.* is loaded")
+    if not target.startswith("coachable.networks."):  # a file must not choose what is imported and called
+        raise CheckpointError(f"{source} names {target!r} as its network: only coachable.networks.* is loaded")
     module, _, name = target.rpartition(".")
     return getattr(importlib.import_module(module), name)(space=space, **arguments)
 

@@ -1,0 +1,37 @@
+"""Fixtures that several test folders share."""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+# Imported inside the fixtures: a test that needs none of this should not pay for it.
+
+
+@pytest.fixture
+def echo_space() -> Any:
+    """One set-point: the action that is wanted."""
+    from tests.echo import echo_space
+
+    return echo_space()
+
+
+@pytest.fixture
+def make_echo_env() -> Callable[..., Any]:
+    """Makes a `StyleEchoEnv` with its style transforms: `make_echo_env(seed, num_envs=4)`."""
+    from tests.echo import make_echo_env
+
+    return make_echo_env
+
+
+@pytest.fixture
+def make_train(tmp_path: Path) -> Callable[..., Any]:
+    """Makes a small training in `tmp_path / "run"` or a given folder: `make_train(total_frames=400, width=16)`."""
+    from tests.echo import make_train
+
+    def make(run_dir: Path = tmp_path / "run", **settings: Any) -> Any:
+        return partial(make_train, run_dir)(**settings)
+
+    return make

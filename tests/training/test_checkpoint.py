@@ -1,0 +1,271 @@
+"""Checkpoints: atomic, pickle-free, pruned, refused with a reason; and the files made from them."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+from coachable.styles import Setpoint, StyleSpace
+from coachable.training.checkpoint import CheckpointError, CheckpointStore, check_writable, find_checkpoint, read_state
+from coachable.training.replay_files import read_replay, write_replay
+from coachable.training.rng import preserved_rng, rng_state, seed_everything, set_rng_state
+from coachable.training.weights import export_weights, initialise_from, load_policy
+
+
+def _buffer(capacity=10):
+    return TensorDictReplayBuffer(storage=LazyTensorStorage(capacity))
+
+
+def _records(start, stop):
+    value = torch.arange(start, stop)
+    return TensorDict(
+        {"a": value.float()[:, None].expand(-1, 3), "next": {"done": value % 2 == 0}}, batch_size=[stop - start]
+    )
+
+
+def test_store_keeps_the_newest_and_their_pointer(tmp_path):
+    store = CheckpointStore(tmp_path, keep=2)
+    replay = _buffer()
+    replay.extend(_records(0, 4))
+    for frames in (100, 200, 300):
+        store.save({"x": torch.tensor(frames)}, {"frames": frames}, replay)
+    names = sorted(p.name for p in tmp_path.iterdir())
+    assert names == ["LATEST", "frames_000000000200", "frames_000000000300"]
+    assert find_checkpoint(tmp_path).name == "frames_000000000300"
+    assert not (tmp_path / "frames_000000000200" / "replay").exists(), "only the newest holds the replay buffer"
+    assert (tmp_path / "frames_000000000300" / "replay").is_dir()
+    assert read_state(find_checkpoint(tmp_path))["x"] == 300
+    assert json.loads((tmp_path / "frames_000000000300" / "metadata.json").read_text())["frames"] == 300
+
+
+def test_a_run_that_went_back_in_frames_resumes_where_it_last_was(tmp_path):
+    store = CheckpointStore(tmp_path, keep=3)
+    for frames in (300, 100, 100):
+        store.save({"x": frames}, {"frames": frames})
+    assert find_checkpoint(tmp_path).name == "frames_000000000100-2"
+    (tmp_path / "LATEST").unlink()
+    assert find_checkpoint(tmp_path).name == "frames_000000000100-2"
+    (tmp_path / "LATEST").write_text("frames_of_old\n")
+    assert find_checkpoint(tmp_path).name == "frames_000000000100-2"
+
+
+@pytest.mark.parametrize("fails_at", ["torch.save", "os.rename", "os.fsync"])
+def test_a_failed_write_leaves_the_previous_checkpoint_and_no_partial(tmp_path, monkeypatch, fails_at):
+    store = CheckpointStore(tmp_path)
+    store.save({"x": 1}, {"frames": 1})
+
+    def fail(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fails_at, fail)
+        with pytest.warns(UserWarning, match="checkpoint at 2 frames was not written"):
+            assert store.try_save({"x": 2}, {"frames": 2}) is None
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["LATEST", "frames_000000000001"]
+    assert read_state(find_checkpoint(tmp_path))["x"] == 1
+
+
+def test_a_full_disk_reported_by_the_zip_writer_is_an_oserror(tmp_path):
+    store = CheckpointStore(tmp_path)
+    full = tmp_path / "full"
+    os.symlink("/dev/full", full)  # every write to it fails with ENOSPC
+    from coachable.training.checkpoint import _save_tensors
+
+    with pytest.raises(OSError):
+        _save_tensors({"x": torch.zeros(100_000)}, full)
+    assert store.save({"x": 1}, {"frames": 1}).is_dir()
+
+
+def test_kill_during_a_write_leaves_the_previous_checkpoint(tmp_path):
+    """The process is killed in the middle of writing the second checkpoint, with half of it on disk."""
+    script = textwrap.dedent(
+        """
+        import sys, time
+        import coachable.training.checkpoint as checkpoint
+        store = checkpoint.CheckpointStore(sys.argv[1])
+        store.save({"x": 1}, {"frames": 1})
+        def stuck(state, file):
+            file.write_bytes(b"half of a checkpoint")
+            print("writing", flush=True)
+            time.sleep(60)
+        checkpoint._save_tensors = stuck
+        store.save({"x": 2}, {"frames": 2})
+        """
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-W", "ignore", "-c", script, str(tmp_path)], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "writing\n"
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    assert list(tmp_path.glob(".*.partial")), "the kill left a partial behind"
+    assert read_state(find_checkpoint(tmp_path))["x"] == 1
+    CheckpointStore(tmp_path).save({"x": 3}, {"frames": 3})
+    assert not list(tmp_path.glob(".*.partial")), "the next write cleans up"
+
+
+def test_pickles_are_refused(tmp_path):
+    class Harmful:
+        def __reduce__(self):
+            return (os.system, ("true",))
+
+    file = tmp_path / "state.pt"
+    torch.save({"schema": 1, "x": Harmful()}, file)
+    with pytest.raises(CheckpointError, match="cannot read"):
+        read_state(tmp_path)
+
+
+def test_other_schemas_and_missing_files_are_named(tmp_path):
+    torch.save({"schema": 99}, tmp_path / "state.pt")
+    with pytest.raises(CheckpointError, match="has schema 99, this version of coachable reads schema 1"):
+        read_state(tmp_path)
+    with pytest.raises(CheckpointError, match="no checkpoint at"):
+        find_checkpoint(tmp_path / "nowhere")
+
+
+def test_replay_files_restore_a_wrapped_ring_buffer(tmp_path):
+    replay = _buffer(10)
+    replay.extend(_records(0, 8))
+    replay.extend(_records(8, 13))  # overwrites the three oldest
+    write_replay(replay, tmp_path / "replay")
+    again = _buffer(10)
+    assert read_replay(again, tmp_path / "replay") == 10
+    assert again.storage.get(slice(0, 10))["a"][:, 0].tolist() == [10, 11, 12, 3, 4, 5, 6, 7, 8, 9]
+    assert again.storage.get(slice(0, 10))["next", "done"].dtype == torch.bool
+    for buffer in (replay, again):
+        buffer.extend(_records(13, 14))
+    assert (replay.storage.get(slice(0, 10)) == again.storage.get(slice(0, 10))).all()
+    torch.manual_seed(0)
+    first = replay.sample(6)
+    torch.manual_seed(0)
+    assert (again.sample(6) == first).all()
+
+
+def test_replay_files_hold_only_what_is_filled(tmp_path):
+    replay = _buffer(1_000_000)
+    replay.extend(_records(0, 5))
+    write_replay(replay, tmp_path / "replay")
+    assert np.load(tmp_path / "replay" / "a.npy", allow_pickle=False).shape == (5, 3)
+    assert sum(f.stat().st_size for f in (tmp_path / "replay").iterdir()) < 10_000
+    with pytest.raises(ValueError, match="holds 1000000 records, this run's 10"):
+        read_replay(_buffer(10), tmp_path / "replay")
+
+
+def test_generators_are_restored_without_pickle(tmp_path):
+    import random
+
+    def draw():
+        return random.random(), np.random.rand(), torch.rand(1).item(), random.gauss(0, 1), np.random.randn()  # noqa: NPY002
+
+    seed_everything(3)
+    draw()
+    torch.save(rng_state(), tmp_path / "rng.pt")
+    expected = draw()
+    set_rng_state(torch.load(tmp_path / "rng.pt", weights_only=True))
+    with preserved_rng():
+        draw()
+    assert draw() == expected
+
+
+def test_unwritable_and_full_folders_are_named_before_the_start(tmp_path):
+    file = tmp_path / "file"
+    file.write_text("in the way")
+    with pytest.raises(CheckpointError, match=r"cannot write to .*Choose another folder with run_dir=PATH"):
+        check_writable(file / "run")
+    with pytest.raises(CheckpointError, match=r"GB free, checkpoints need about 1000000000\.00 GB"):
+        check_writable(tmp_path, required_bytes=10**18)
+    check_writable(tmp_path / "new")
+    assert list((tmp_path / "new").iterdir()) == []
+
+
+def test_another_style_space_is_refused_with_the_difference(make_train, tmp_path):
+    make_train(total_frames=80).run()
+    other = StyleSpace([Setpoint("target", -0.8, 0.5)], name="echo")
+    with pytest.raises(CheckpointError, match=r"another style space: .*target"):
+        make_train(total_frames=80, space=other).resume(tmp_path / "run")
+
+
+def test_another_help_text_is_no_other_style_space(make_train, tmp_path):
+    make_train(total_frames=80).run()
+    reworded = StyleSpace([Setpoint("target", -0.8, 0.8, help="what to do")], name="echo")
+    make_train(total_frames=80, space=reworded).resume(tmp_path / "run")
+
+
+def test_another_network_is_refused_with_the_shapes(make_train, tmp_path):
+    make_train(total_frames=80).run()
+    with pytest.raises(CheckpointError, match=r"the actor of .*weight is \(16, 4\) in the checkpoint, \(24, 4\) here"):
+        make_train(total_frames=80, width=24).resume(tmp_path / "run")
+
+
+def test_policies_load_from_runs_checkpoints_and_weights(make_train, make_echo_env, echo_space, tmp_path):
+    train = make_train(total_frames=120)
+    train.run()
+    td = make_echo_env(1).reset()
+    expected = train.collector.policy(td.clone())["loc"]
+    weights = export_weights(tmp_path / "run", tmp_path / "shipped" / "weights.pt")
+    assert weights.stat().st_size < 50_000
+    actions = []
+    for source in (tmp_path / "run", find_checkpoint(tmp_path / "run"), weights):
+        policy = load_policy(source)
+        assert policy.space == echo_space
+        assert policy.config["seed"] == 0
+        assert policy.metadata["domain"] == "echo" and policy.metadata["frames"] == 120
+        assert policy.metadata["updates"] == train.learner.updates
+        assert not policy.actor.training and not any(p.requires_grad for p in policy.actor.parameters())
+        actions.append(policy.actor(td.clone())["loc"])
+    assert torch.equal(actions[0], actions[1]) and torch.equal(actions[0], actions[2])
+    assert torch.equal(expected, actions[0])
+
+
+def test_unknown_policies_are_named(tmp_path):
+    with pytest.raises(CheckpointError, match=r"no checkpoint at nonsense.*domains with weights"):
+        load_policy("nonsense")
+    torch.save({"schema": 1, "actor": {}}, tmp_path / "weights.pt")
+    with pytest.raises(CheckpointError, match="lacks domain, space, config, network, critics"):
+        load_policy(tmp_path / "weights.pt")
+
+
+def test_a_file_cannot_choose_what_is_called(make_train, tmp_path):
+    make_train(total_frames=80).run()
+    state = torch.load(find_checkpoint(tmp_path / "run") / "state.pt", weights_only=True)
+    state["network"]["actor"]["_target_"] = "os.system"
+    torch.save(state, tmp_path / "harmful.pt")
+    with pytest.raises(
+        CheckpointError, match=r"names 'os\.system' as its network: only coachable\.networks\.\* is loaded"
+    ):
+        load_policy(tmp_path / "harmful.pt")
+
+
+def test_initialise_from_copies_actor_critics_and_targets(make_train, echo_space, tmp_path):
+    first = make_train(total_frames=120)
+    first.run()
+    weights = export_weights(tmp_path / "run", tmp_path / "weights.pt")
+    second = make_train(tmp_path / "second", total_frames=120, seed=5)
+    loss = second.learner.loss_module
+    initialise_from(weights, second.collector.policy, loss, echo_space)
+    trained, fresh = first.learner.loss_module.state_dict(), loss.state_dict()
+    for name, value in trained.items():
+        if name.startswith(("actor_network_params.", "qvalue_network_params.")):
+            assert torch.equal(value, fresh[name]), name
+        if name.startswith("qvalue_network_params."):
+            assert torch.equal(value, fresh["target_" + name]), name
+    assert second.learner.updates == 0
+    second.run()
+    assert second.learner.updates > 0
+
+
+def test_weights_name_no_place_on_the_machine_that_trained(make_train, tmp_path):
+    make_train(total_frames=80).run()
+    weights = export_weights(tmp_path / "run", tmp_path / "weights.pt")
+    assert str(tmp_path).encode() not in weights.read_bytes()
+    assert read_state(weights)["config"]["run_dir"] is None

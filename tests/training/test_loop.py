@@ -1,0 +1,255 @@
+"""The loop: exact resumption, accounting of updates, statistics, refusal of bad numbers."""
+
+import csv
+import io
+import json
+import os
+import signal
+import threading
+import time
+import warnings
+
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+from coachable.training.checkpoint import find_checkpoint, read_state
+from coachable.training.collection import evaluate_policy
+from coachable.training.logging import CsvLog, Progress, wandb_logger
+from coachable.training.loop import TrainSettings
+from coachable.training.throttle import Throttle
+
+
+def _tensors(state, prefix=""):
+    for key, value in state.items():
+        if isinstance(value, dict):
+            yield from _tensors(value, f"{prefix}{key}.")
+        elif isinstance(value, torch.Tensor):
+            yield f"{prefix}{key}", value
+
+
+def test_the_test_environment_keeps_its_specs(make_echo_env):
+    check_env_specs(make_echo_env(0), seed=0)
+
+
+def test_n_plus_n_equals_2n_bit_for_bit(make_train, tmp_path):
+    whole = make_train(tmp_path / "whole", total_frames=480)
+    whole.run()
+    half = make_train(tmp_path / "half", total_frames=240)
+    half.run()
+    rest = make_train(tmp_path / "half", total_frames=480, seed=7)  # the checkpoint decides everything, not the seed
+    rest.resume(tmp_path / "half")
+    assert rest.frames == 240
+    rest.run()
+    assert whole.learner.updates == rest.learner.updates == (480 - 40) // 4
+    states = [read_state(find_checkpoint(tmp_path / name)) for name in ("whole", "half")]
+    expected, found = (dict(_tensors(state)) for state in states)
+    assert expected.keys() == found.keys()
+    for part in ("actor.", "learner.optimizers.", "collector.carrier.", "collector.transforms.", "rng."):
+        assert any(name.startswith(part) for name in expected), part
+    assert states[0]["loop"] == states[1]["loop"] and states[0]["rng"]["python"] == states[1]["rng"]["python"]
+    for name, value in expected.items():
+        assert torch.equal(value, found[name]), name
+    stored, again = whole.replay.storage.get(slice(0, 300)), rest.replay.storage.get(slice(0, 300))
+    assert (stored == again).all()
+
+
+def test_resume_without_simulator_state_restarts_episodes_and_says_so(make_train, tmp_path):
+    make_train(total_frames=80, resumable=False).run()
+    rest = make_train(total_frames=120, resumable=False)
+    with pytest.warns(UserWarning, match="does not save its simulator's state: episodes restart"):
+        rest.resume(tmp_path / "run")
+    rest.run()
+    assert rest.frames == 120
+
+
+def test_resume_with_another_number_of_environments_says_so(make_train, tmp_path):
+    make_train(total_frames=80).run()
+    rest = make_train(total_frames=96, num_envs=8)
+    with pytest.warns(UserWarning, match="holds 4 environments, this run has 8"):
+        rest.resume(tmp_path / "run")
+    rest.run()
+
+
+def test_resume_takes_a_new_learning_rate(make_train, tmp_path):
+    make_train(total_frames=80).run()
+    rest = make_train(total_frames=80)
+    for group in rest.learner.optimizers["actor"].param_groups:
+        group["lr"] = 0.5
+    rest.resume(tmp_path / "run")
+    assert rest.learner.optimizers["actor"].param_groups[0]["lr"] == 0.5
+    assert rest.learner.optimizers["critic"].param_groups[0]["lr"] == 1e-3
+
+
+@pytest.mark.parametrize("utd_ratio, updates", [(0.0, 0), (0.125, 45), (0.3, 108), (1.0, 360)])
+def test_updates_per_step(make_train, utd_ratio, updates):
+    train = make_train(total_frames=400, utd_ratio=utd_ratio)
+    train.run()
+    assert abs(train.learner.updates - updates) <= 1  # 400 frames, the first 40 are warm-up; 0.3 is not exact in binary
+
+
+def test_without_a_ratio_the_learner_fills_the_throttled_time(make_train):
+    train = make_train(total_frames=60, utd_ratio=None, throttle=40.0, warmup_frames=20)
+    start = time.monotonic()
+    train.run()
+    assert time.monotonic() - start >= 60 / 40 - 0.2
+    assert train.learner.updates > 60 - 20
+
+
+def test_a_ratio_of_none_needs_a_throttle():
+    with pytest.raises(ValueError, match=r"needs a throttle: set train\.throttle=RATE"):
+        TrainSettings(total_frames=1, utd_ratio=None)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_bad_observation_is_refused_before_it_is_stored(make_train, bad):
+    train = make_train(total_frames=400)
+    train.collector.env.base_env.poison = bad
+    with pytest.raises(ValueError, match=r"not finite in 1 of 4 collected transitions"):
+        train.run()
+    assert len(train.replay) == 0
+
+
+def test_replay_holds_raw_style_and_no_copy_of_it(make_train):
+    train = make_train(total_frames=100)
+    train.run()
+    stored = train.replay.storage.get(slice(0, 100))
+    assert stored["style"].shape == (100, 1)
+    assert ("next", "style") not in stored.keys(True)
+    expected = -(stored["next", "style_features"] - stored["style"]).abs()
+    assert torch.equal(stored["next", "reward"], expected)
+
+
+def test_metrics_are_sums_over_episodes(make_train, tmp_path):
+    train = make_train(total_frames=400, log_interval=0.0)
+    train.run()
+    with (tmp_path / "run" / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["frames"]) for row in rows] == sorted(int(row["frames"]) for row in rows)
+    lengths = [float(row["episode/length"]) for row in rows if row["episode/length"]]
+    assert lengths and max(lengths) <= 20
+    for row in rows:
+        if row["episode/return"]:
+            assert float(row["episode/task_return"]) == 0.0
+            assert float(row["episode/return"]) == pytest.approx(float(row["episode/style_return"]))
+    counted = sum(int(row["episode/count"]) for row in rows)
+    ended = int(train.replay.storage.get(slice(0, 300))["next", "done"].sum())
+    assert counted >= ended > 0
+
+
+def test_evaluation_happens_when_due_and_changes_nothing(make_train, make_echo_env, tmp_path):
+    plain = make_train(tmp_path / "plain", total_frames=200)
+    plain.run()
+    calls = []
+    train = make_train(tmp_path / "evaluated", total_frames=200, eval_interval=50)
+    env = make_echo_env(5)
+
+    def evaluate():
+        calls.append(train.frames)
+        return evaluate_policy(env, train.collector.policy, max_steps=30)
+
+    train.evaluate = evaluate
+    metrics = train.run()
+    assert calls == [52, 100, 152, 200, 200]  # multiples of 50 rounded up to rounds of 4, and once at the end
+    assert metrics["eval/length"] <= 20
+    for name, value in _tensors(plain.learner.state_dict()):
+        assert torch.equal(value, dict(_tensors(train.learner.state_dict()))[name]), name
+
+
+def test_evaluation_counts_each_episode_once(make_echo_env):
+    def hold(td):
+        return td.set("action", torch.zeros(4, 1))
+
+    env = make_echo_env(3)
+    env.hold_style(torch.tensor([0.5]))
+    result = evaluate_policy(env, hold, max_steps=100, keys=["style_reward"])
+    assert result["return"] == pytest.approx(-0.5 * result["length"], rel=1e-5)
+    assert result["style_reward_per_step"] == pytest.approx(-0.5, rel=1e-5)
+    assert 0 < result["length"] <= 20
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_training_with_a_checkpoint(make_train, tmp_path, number):
+    train = make_train(total_frames=10**9)
+    before = signal.getsignal(number)
+    timer = threading.Timer(0.5, os.kill, (os.getpid(), number))
+    timer.start()
+    train.run()
+    assert signal.getsignal(number) is before
+    rest = make_train(total_frames=train.frames + 40)
+    rest.resume(tmp_path / "run")
+    assert rest.frames == train.frames
+    rest.run()
+
+
+def test_a_failed_checkpoint_does_not_end_the_training(make_train, tmp_path, monkeypatch):
+    train = make_train(total_frames=120, checkpoint_interval=0.0)
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("coachable.training.checkpoint._save_tensors", fail)
+    with pytest.warns(UserWarning, match=r"was not written .*No space left on device.*Training goes on"):
+        train.run()
+    assert train.frames == 120
+    assert not [p for p in (tmp_path / "run" / "checkpoints").iterdir() if p.name != "LATEST"]
+
+
+def test_csv_gains_columns_and_forgets_an_abandoned_future(tmp_path):
+    log = CsvLog(tmp_path / "m.csv")
+    log.write({"frames": 1, "a": 1.0})
+    log.write({"frames": 2, "b": 2.0})
+    log.write({"frames": 3, "a": 3.0})
+    again = CsvLog(tmp_path / "m.csv")
+    again.rewind(2)
+    again.write({"frames": 3, "b": 5.0})
+    assert (tmp_path / "m.csv").read_text().splitlines() == ["frames,a,b", "1,1.0,", "2,,2.0", "3,,5.0"]
+
+
+def test_progress_writes_json_lines_without_a_terminal():
+    stream = io.StringIO()
+    progress = Progress(100, stream, every=0.0)
+    progress.start(0, 0)
+    progress.update(50, 5, {"episode/return": 1.23456789})
+    line = json.loads(stream.getvalue())
+    assert line["frames"] == 50 and line["updates"] == 5 and line["episode/return"] == 1.23457
+    assert line["steps_per_s"] > 0 and line["updates_per_s"] > 0 and line["eta_min"] >= 0
+
+
+def test_progress_draws_a_bar_on_a_terminal():
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    stream = Terminal()
+    progress = Progress(100, stream)
+    progress.start(20, 0)
+    progress.update(60, 5, {"episode/return": 2.5}, force=True)
+    progress.close()
+    assert "60.0/100" in stream.getvalue() and "updates/s" in stream.getvalue() and "return 2.5" in stream.getvalue()
+
+
+def test_throttle_bounds_the_rate():
+    throttle = Throttle(100.0)
+    start = time.monotonic()
+    for _ in range(5):
+        throttle.wait()
+        throttle.add(10)
+    throttle.wait()
+    assert time.monotonic() - start >= 0.5 - 0.01
+    with pytest.raises(ValueError, match="positive number of env-steps per second"):
+        Throttle(0.0)
+
+
+def test_wandb_is_off_without_a_key(tmp_path, monkeypatch):
+    monkeypatch.delenv("WANDB_API_KEY", raising=False)
+    assert wandb_logger("run", tmp_path) is None
+    assert wandb_logger("run", tmp_path, mode="off") is None
+    with pytest.raises(ValueError, match="must be one of auto, online, offline, off"):
+        wandb_logger("run", tmp_path, mode="on")
+
+
+def test_no_warning_in_an_ordinary_training(make_train):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        make_train(total_frames=80).run()
