@@ -1,0 +1,278 @@
+"""What QR-SAC, RAC, Cat-RAC and categorical SAC share: one actor-critic loss with four things left open."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Literal, cast
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
+from torch import Tensor, nn
+from torchrl.data import TensorSpec
+from torchrl.objectives import SACLoss, ValueEstimators
+
+from coachable.losses.functional import bootstrap_target
+from coachable.losses.policy import PolicyReader
+from coachable.networks.mixed_action import MixedAction
+from coachable.networks.tanh_gaussian import at_least_float32
+
+Reduction = Literal["none", "mean", "sum"]
+
+
+class ActorCriticLoss(SACLoss):
+    """Soft actor-critic with a fixed entropy weight whose policy sample and critic a subclass defines.
+
+    `actor_loss(td)` and `qvalue_loss(td)` return `(loss, metadata)` and can be stepped one after the other, in which
+    case the target uses the policy as it then is; `forward` gives both from the same parameters. All three accept any
+    batch shape, `[B]` or `[B, n + 1]`. Rewards with `steps_to_next_obs` are n-step returns, discounted accordingly.
+    Everything after the networks is computed in float32 or wider, also under autocast.
+
+    Subclasses define `_sample` (action and negative entropy), `_values` (critic output to scalars), `_next_value`
+    (target critics' output to what is bootstrapped from) and `_errors` (regression of the critics on the target).
+    They are not for `loss` in their names, which TorchRL wraps.
+
+    Args:
+        actor_network: Policy, from `make_gaussian_actor` or `make_mixed_actor`.
+        qvalue_network: List of critics, one call of a critic factory each.
+        num_qvalue_nets: Number of critics, checked against the list.
+        alpha: Weight of the entropy, fixed.
+        action_spec: The environment's action spec; if given, checked against the actor.
+        reduction: `"mean"`, `"sum"` or `"none"`, over the batch.
+        deactivate_vmap: Evaluate the critics one after the other.
+        use_prioritized_weights: Whether `priority_weight` weighs the losses; `"auto"`: if present.
+
+    Raises:
+        ValueError: If a number is out of range, an option unknown, or the action space one that the loss cannot serve.
+    """
+
+    SUPPORTED_VALUE_ESTIMATORS = (ValueEstimators.TD0,)
+    _continuous_only = False
+    _policy: PolicyReader
+    _dropouts: list[nn.Module]
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        *,
+        num_qvalue_nets: int = 2,
+        alpha: float = 0.01,
+        action_spec: TensorSpec | None = None,
+        reduction: Reduction = "mean",
+        deactivate_vmap: bool = False,
+        use_prioritized_weights: bool | Literal["auto"] = "auto",
+    ) -> None:
+        name = type(self).__name__
+        critics = [qvalue_network] if isinstance(qvalue_network, nn.Module) else list(qvalue_network)
+        if num_qvalue_nets < 1 or len(critics) != num_qvalue_nets:
+            raise ValueError(
+                f"{name} got {len(critics)} critic(s) for num_qvalue_nets={num_qvalue_nets}: pass a list of that many, "
+                "each built separately"
+            )
+        if not (alpha > 0 and math.isfinite(alpha)):
+            raise ValueError(f"alpha must be positive and finite, got {alpha}")
+        if reduction not in ("none", "mean", "sum"):
+            raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
+        policy = PolicyReader(actor_network, name, continuous_only=self._continuous_only, action_spec=action_spec)
+        super().__init__(
+            actor_network,
+            critics,  # pyright: ignore[reportArgumentType]  # documented as a list too
+            num_qvalue_nets=num_qvalue_nets,
+            loss_function="l2",
+            alpha_init=alpha,
+            fixed_alpha=True,
+            target_entropy=0.0,  # unused; "auto" would need an action spec for the state dict
+            reduction=reduction,
+            deactivate_vmap=deactivate_vmap,
+            use_prioritized_weights=use_prioritized_weights,
+            scalar_output_mode="exclude",
+        )
+        self._policy = policy  # no submodule: the parameters are those of actor_network_params
+        networks = (actor_network, *critics)
+        self._dropouts = [m for net in networks for m in net.modules() if isinstance(m, nn.modules.dropout._DropoutNd)]
+        self.make_value_estimator()
+
+    # What a subclass defines.
+
+    def _sample(self, policy: MixedAction, *, relaxed: bool) -> tuple[Tensor, Tensor]:
+        """Action (..., A) and estimate of the negative entropy (...,): SAC's log-density of that same action."""
+        return policy.relaxed_sample() if relaxed else policy.hard_sample()
+
+    def _values(self, output: Tensor) -> Tensor:
+        """Critic output (K, ..., out) to values (K, ...)."""
+        raise NotImplementedError
+
+    def _next_value(self, output: Tensor) -> Tensor:
+        """Target critics' output (K, ..., out) to the successor's value (...,) or its quantiles (..., M)."""
+        return self._values(output).min(0).values
+
+    def _soft_target(
+        self, reward: Tensor, next_value: Tensor, log_prob: Tensor, terminated: Tensor, steps: Tensor | None
+    ) -> Tensor:
+        """Target with the entropy of the successor inside the discount: none at terminals."""
+        if next_value.ndim > log_prob.ndim:
+            log_prob = log_prob.unsqueeze(-1)
+        soft = next_value - self._alpha * log_prob
+        return bootstrap_target(reward, soft, terminated, self._gamma, steps)
+
+    def _errors(self, output: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        """Losses (K, ...) of the critics against the target, and their absolute TD errors (K, ...)."""
+        raise NotImplementedError
+
+    # What TorchRL calls.
+
+    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Policy loss `mean(alpha log pi - min_k Q_k)` with reparameterised, relaxed actions; no critic gradient.
+
+        Returns:
+            The loss, and `log_prob`, the negative entropy (...,) of each state.
+        """
+        policy = self._policy_at(tensordict)
+        with self._full_precision():
+            action, log_prob = self._sample(policy, relaxed=True)
+        output = self._critics_at(tensordict, action, self._cached_detached_qvalue_params)
+        with self._full_precision():
+            value = self._values(output).min(0).values
+            loss = self._alpha * log_prob - value
+            return self._reduced(loss, tensordict), {"log_prob": log_prob.detach()}
+
+    def qvalue_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Critic loss, summed over the critics; the target uses the policy's parameters as they are now.
+
+        Returns:
+            The loss, and `td_error` (...,), the largest of the critics'.
+        """
+        target = self.compute_target(tensordict)
+        output = self._critics_at(tensordict, None, self.qvalue_network_params)
+        with self._full_precision():
+            losses, errors = self._errors(at_least_float32(output), target)
+            loss = self._reduced(losses.sum(0), tensordict)
+            return loss, {"td_error": errors.detach().amax(0), **self._extra_metrics(target)}
+
+    def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """TorchRL's name of `qvalue_loss`."""
+        return self.qvalue_loss(tensordict)
+
+    @torch.no_grad()
+    def compute_target(self, tensordict: TensorDictBase) -> Tensor:
+        """Bootstrap target, (...,) or (..., M), from hard actions of the current policy and the target critics."""
+        successor = tensordict.get("next")
+        with self._without_dropout():
+            policy = self._policy_at(successor)
+            with self._full_precision():
+                action, log_prob = self._sample(policy, relaxed=False)
+            output = self._critics_at(successor, action, self.target_qvalue_network_params)
+        with self._full_precision():
+            next_value = self._next_value(at_least_float32(output))
+            return self._soft_target(
+                self._scalar(successor, self.tensor_keys.reward).to(next_value.dtype),
+                next_value,
+                log_prob,
+                self._scalar(successor, self.tensor_keys.terminated),
+                self._scalar(tensordict, self.value_estimator.tensor_keys.steps_to_next_obs, required=False),
+            )
+
+    @dispatch  # pyright: ignore[reportArgumentType]
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Both losses from the same parameters.
+
+        Args:
+            tensordict: Batch; only the priority (`td_error`) is written into it.
+
+        Returns:
+            `loss_actor`, `loss_qvalue`, and, unless the reduction is "none", `alpha` and `entropy`.
+        """
+        loss_qvalue, critic = self.qvalue_loss(tensordict)
+        loss_actor, actor = self.actor_loss(tensordict)
+        tensordict.set(self.tensor_keys.priority, critic.pop("td_error"))
+        losses = {"loss_actor": loss_actor, "loss_qvalue": loss_qvalue}
+        if self.reduction == "none":
+            return TensorDict(losses, batch_size=tensordict.batch_size)
+        return TensorDict({**losses, "alpha": self._alpha, "entropy": -actor["log_prob"].mean(), **critic})
+
+    @property
+    def out_keys(self) -> list[str]:
+        """Keys of what `forward` returns."""
+        scalars = [] if self.reduction == "none" else ["alpha", "entropy"]
+        return ["loss_actor", "loss_qvalue", *scalars]
+
+    @out_keys.setter
+    def out_keys(self, values: list[str]) -> None:
+        self._out_keys = values
+
+    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> ActorCriticLoss:
+        """Set `gamma`. Only TD(0) is served; n-step returns come as rewards with `steps_to_next_obs`."""
+        if value_type not in (None, ValueEstimators.TD0) or set(hyperparams) - {"gamma", "device"}:
+            raise ValueError(
+                f"{type(self).__name__} computes its own TD(0) target and takes gamma alone, got value_type="
+                f"{value_type}, {sorted(hyperparams)}; for n-step targets store n-step rewards with steps_to_next_obs"
+            )
+        super().make_value_estimator(ValueEstimators.TD0, **hyperparams)
+        return self
+
+    # Pieces.
+
+    def _extra_metrics(self, target: Tensor) -> dict[str, Tensor]:
+        """Further scalars of the critic update, for logging."""
+        return {}
+
+    def _policy_at(self, tensordict: TensorDictBase) -> MixedAction:
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            return self._policy.read(tensordict)
+
+    def _critics_at(self, tensordict: TensorDictBase, action: Tensor | None, params: TensorDictBase) -> Tensor:
+        """Raw output (K, ..., out) of all critics, at the stored action or another one."""
+        inputs = tensordict.select(*self.qvalue_network.in_keys, strict=False)
+        if action is not None:
+            inputs.set(self.tensor_keys.action, action)
+        critics = cast(Callable[..., TensorDictBase], self._vmap_qnetworkN0)
+        output = critics(inputs, params).get(self.tensor_keys.state_action_value)
+        expected = self._critic_width()
+        if output.shape[1:-1] != tensordict.batch_size or output.shape[-1] != expected:
+            raise RuntimeError(
+                f"{type(self).__name__} expects critics with {expected} output(s) per sample, "
+                f"({self.num_qvalue_nets}, *{tuple(tensordict.batch_size)}, {expected}), got {tuple(output.shape)}: "
+                "set num_outputs of the critic"
+            )
+        return output
+
+    @property
+    def _gamma(self) -> Tensor:
+        return cast(Tensor, self.value_estimator.gamma)
+
+    def _critic_width(self) -> int:
+        """Outputs of one critic."""
+        return 1
+
+    def _scalar(self, tensordict: TensorDictBase, key: Any, required: bool = True) -> Any:
+        """Entry (..., 1) or (...,) as (...,); None if it is missing and not required."""
+        value = tensordict.get(key) if required else tensordict.get(key, None)
+        if value is None or value.ndim == tensordict.ndim:
+            return value
+        return value.squeeze(-1)
+
+    def _reduced(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
+        weights = self._maybe_get_priority_weight(tensordict)
+        if weights is not None and weights.shape != loss.shape:
+            # One weight per record also where the batch is [B, n + 1].
+            weights = weights.squeeze(-1) if weights.ndim > loss.ndim else weights.unsqueeze(-1)
+            weights = weights.expand_as(loss)
+        return cast(Tensor, self._reduce_loss(loss, tensordict=tensordict, weights=weights))
+
+    def _full_precision(self) -> torch.autocast:
+        return torch.autocast(cast(Tensor, self.log_alpha).device.type, enabled=False)
+
+    @contextmanager
+    def _without_dropout(self) -> Iterator[None]:
+        """Evaluation mode for the target: dropout there is noise in what the critics regress on."""
+        training = [m for m in self._dropouts if m.training]
+        for module in training:
+            module.training = False
+        try:
+            yield
+        finally:
+            for module in training:
+                module.training = True

@@ -1,0 +1,65 @@
+"""Cat-RAC: RAC with a categorical critic trained on HL-Gauss encodings of its targets (Appendix B)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from torch import Tensor
+
+from coachable.losses.rac import RACLoss
+from coachable.networks.hl_gauss import HLGauss, Support
+
+
+class CatRACLoss(RACLoss):
+    """Loss of Cat-RAC: critics give logits over bins, `L_Q = sum_k mean CE(HLGauss(y), softmax(logits_k))`.
+
+    Values are decoded means; the minimum over critics is taken of those. `td_error` is the absolute difference of the
+    target and the decoded mean. The metadata of `qvalue_loss` and the output of `forward` hold `clipped_fraction`, the
+    share of targets outside the support (algorithms.md, section 3).
+
+    Build the critics with `make_hl_gauss_critic`, so that they start at a value of 0 instead of the middle of the
+    support.
+
+    Args:
+        actor_network: Policy, from `make_mixed_actor` or `make_gaussian_actor`.
+        qvalue_network: List of critics with `num_atoms` outputs.
+        v_min: Smallest value represented.
+        v_max: Largest value represented.
+        num_atoms: Number of bins.
+        sigma_ratio: Standard deviation of the target's Gaussian over the width of a bin.
+        hl_gauss_support: Whether the outer `"edges"` or the outer `"centres"` lie on v_min and v_max.
+        **options: See `RACLoss` and `ActorCriticLoss`.
+
+    Raises:
+        ValueError: If the support is empty or has fewer than two bins, or as `RACLoss`.
+    """
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        qvalue_network: TensorDictModule | Sequence[TensorDictModule],
+        *,
+        v_min: float = -600.0,
+        v_max: float = 1000.0,
+        num_atoms: int = 255,
+        sigma_ratio: float = 0.75,
+        hl_gauss_support: Support = "edges",
+        **options: Any,
+    ) -> None:
+        self.bins = HLGauss(v_min, v_max, num_atoms, sigma_ratio, hl_gauss_support)
+        super().__init__(actor_network, qvalue_network, **options)
+
+    def _critic_width(self) -> int:
+        return self.bins.num_atoms
+
+    def _values(self, output: Tensor) -> Tensor:
+        return self.bins.decode(output)
+
+    def _errors(self, output: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        value = self.bins.decode(output.detach())
+        return self.bins.cross_entropy(output, target), (value - target).abs()
+
+    def _extra_metrics(self, target: Tensor) -> dict[str, Tensor]:
+        return {"clipped_fraction": self.bins.clipped_fraction(target)}

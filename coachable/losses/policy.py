@@ -1,0 +1,100 @@
+"""How the losses read a policy: whatever actor TorchRL is given becomes one `MixedAction` per call."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictSequential
+from torchrl.data import TensorSpec
+from torchrl.modules import TanhNormal
+
+from coachable.networks.action_heads import ActionHeads, MixedActionSpec
+from coachable.networks.mixed_action import MixedAction
+
+
+class PolicyReader:
+    """Evaluates the deterministic part of an actor and wraps its parameters in a `MixedAction`.
+
+    The distribution that the actor would build is passed over: building a `TanhNormal` costs more than sampling one,
+    and it samples and scores in separate steps, which is wrong where tanh saturates (algorithms.md, section 11).
+
+    Args:
+        actor: A `ProbabilisticActor` with a `MixedAction` or a `TanhNormal`.
+        loss_name: Name for error messages.
+        continuous_only: Whether categorical heads are refused.
+        action_spec: Spec of the environment's action, checked against the actor if given.
+
+    Raises:
+        ValueError: If the loss cannot serve the actor's distribution or the action spec.
+    """
+
+    def __init__(
+        self,
+        actor: ProbabilisticTensorDictSequential,
+        loss_name: str,
+        *,
+        continuous_only: bool,
+        action_spec: TensorSpec | None = None,
+    ) -> None:
+        head = actor[-1] if isinstance(actor, ProbabilisticTensorDictSequential) else None
+        kind = getattr(head, "distribution_class", None)
+        if not (isinstance(head, ProbabilisticTensorDictModule) and isinstance(kind, type)):
+            raise ValueError(
+                f"{loss_name} needs a ProbabilisticActor, got {type(actor).__name__}: build it with "
+                "make_gaussian_actor or make_mixed_actor"
+            )
+        options: dict[str, Any] = dict(head.distribution_kwargs)
+        if issubclass(kind, MixedAction):
+            heads = options.get("heads")
+        elif issubclass(kind, TanhNormal) and not options.get("tanh_loc", False):
+            heads = None  # axes only; their number shows at the first call
+        else:
+            raise ValueError(
+                f"{loss_name} serves positive-part categorical heads and tanh-Gaussian axes (without tanh_loc), not "
+                f"{kind.__name__}: build the actor with make_gaussian_actor or make_mixed_actor"
+            )
+        categorical = heads.categorical if heads is not None else ()
+        if continuous_only and categorical:
+            raise ValueError(
+                f"{loss_name} serves continuous actions only, but the actor has categorical heads {categorical}: "
+                "use CatRACLoss, RACLoss or CategoricalSACLoss"
+            )
+        _check_spec(action_spec, loss_name, heads)
+        self._heads: ActionHeads | None = heads
+        self._bounds = {name: _unit_or_tensor(options.get(name, sign)) for name, sign in (("low", -1.0), ("high", 1.0))}
+        names = getattr(head, "dist_keys", head.in_keys)
+        self._parameters = list(zip(names, head.in_keys, strict=True))
+        # Shares the actor's modules, so that parameters swapped into the actor are used here.
+        self.body = TensorDictSequential(*cast(Any, actor.module)[:-1])
+
+    def read(self, tensordict: TensorDictBase) -> MixedAction:
+        """Distribution at the states of `tensordict`, which is left unchanged."""
+        outputs = self.body(tensordict.select(*self.body.in_keys, strict=False))
+        parameters = {name: outputs.get(key) for name, key in self._parameters}
+        if self._heads is None:
+            self._heads = ActionHeads(axes=parameters["loc"].shape[-1])
+        return MixedAction(**parameters, heads=self._heads, **self._bounds)
+
+
+def _unit_or_tensor(bound: Any) -> Any:
+    """A bound of all ±1 as the number, which needs no arithmetic; any other as a tensor."""
+    tensor = torch.as_tensor(bound, dtype=torch.float32)
+    first = tensor.flatten()[0].item()
+    return first if abs(first) == 1.0 and bool((tensor == first).all()) else tensor
+
+
+def _check_spec(spec: TensorSpec | None, loss_name: str, heads: ActionHeads | None) -> None:
+    if spec is None:
+        return
+    categorical = heads.categorical if heads is not None else ()
+    if isinstance(spec, MixedActionSpec):
+        if spec.heads != heads:
+            raise ValueError(f"{loss_name}: the environment's action is {spec.heads}, the actor's is {heads}")
+    elif not spec.dtype.is_floating_point or categorical:
+        raise ValueError(
+            f"{loss_name} cannot serve the action spec {type(spec).__name__}(shape={tuple(spec.shape)}, "
+            f"dtype={spec.dtype}) with an actor of {heads or 'tanh-Gaussian axes'}: give the environment the spec "
+            "ActionHeads(...).spec(), or a Bounded one for continuous actions"
+        )

@@ -1,0 +1,198 @@
+"""Squashed Gaussians, ``a = tanh(u)`` with ``u = loc + scale * z``: samples, densities and sampled entropies.
+
+Pure torch. Everything is expressed through ``log cosh u = |u| - log 2 + log1p(exp(-2|u|))``, since
+``log(1 - tanh(u)^2) = -2 log cosh u``; the direct form is ``log 0`` in float32 from ``|u|`` of about 9.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import cast
+
+import torch
+from torch import Tensor
+
+_HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
+_TWO_LOG2_E = 2.0 * math.log2(math.e)
+# Elements of one temporary of the sampled entropy: 1 MB in float32 on a CPU (cache), 64 MB on an accelerator.
+_CHUNK_ELEMENTS_CPU = 1 << 18
+_CHUNK_ELEMENTS_DEVICE = 1 << 24
+
+
+def at_least_float32(x: Tensor) -> Tensor:
+    """Promote half and bfloat16 tensors to float32 and leave the others alone.
+
+    Example:
+        >>> at_least_float32(torch.zeros(1, dtype=torch.bfloat16)).dtype
+        torch.float32
+    """
+    return x.float() if x.dtype in (torch.bfloat16, torch.float16) else x
+
+
+def log_cosh(u: Tensor) -> Tensor:
+    """Logarithm of cosh without overflow, any shape.
+
+    Example:
+        >>> log_cosh(torch.tensor([0.0, 1000.0])).tolist()
+        [0.0, 999.306...]
+    """
+    magnitude = u.abs()
+    return magnitude + torch.log1p(torch.exp(-2.0 * magnitude)) - math.log(2.0)
+
+
+def sample_tanh_gaussian(loc: Tensor, scale: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Reparameterised sample and its log-density, scored at the value before the tanh.
+
+    Scoring the rounded action instead gives an entropy of -4.8 where the truth is -7.07 (scale e^2).
+
+    Args:
+        loc: (..., A) location before the tanh.
+        scale: (..., A) positive standard deviation before the tanh.
+        noise: (..., A) standard normal draws; drawn here if None.
+
+    Returns:
+        The action (..., A) in [-1, 1] and its log-density per axis (..., A).
+    """
+    loc, scale = at_least_float32(loc), at_least_float32(scale)
+    noise = torch.randn_like(loc) if noise is None else noise
+    u = loc + scale * noise
+    log_prob = 2.0 * log_cosh(u) - 0.5 * noise.square() - scale.log() - _HALF_LOG_2PI
+    return torch.tanh(u), log_prob
+
+
+def tanh_gaussian_log_prob(action: Tensor, loc: Tensor, scale: Tensor) -> Tensor:
+    """Log-density per axis of given actions; prefer `sample_tanh_gaussian` for actions drawn here.
+
+    Args:
+        action: (..., A) in [-1, 1]; values that float rounding put on the border are moved inside by one rounding.
+        loc: (..., A) location before the tanh.
+        scale: (..., A) standard deviation before the tanh.
+
+    Returns:
+        (..., A) log-densities.
+    """
+    loc, scale, action = at_least_float32(loc), at_least_float32(scale), at_least_float32(action)
+    border = 1.0 - torch.finfo(action.dtype).eps
+    u = torch.atanh(action.clamp(-border, border))
+    return 2.0 * log_cosh(u) - 0.5 * ((u - loc) / scale).square() - scale.log() - _HALF_LOG_2PI
+
+
+def tanh_gaussian_entropy(
+    loc: Tensor,
+    scale: Tensor,
+    num_samples: int = 1000,
+    *,
+    shared_noise: bool = True,
+    noise: Tensor | None = None,
+) -> Tensor:
+    """Mean negative log-density of ``num_samples`` reparameterised samples per axis.
+
+    The regulariser of RAC for one Gaussian axis (Appendix B; 1000 samples per component). The gradient is the exact
+    derivative of the estimate, ``-2 mean tanh(u)`` for the location and ``1/scale - 2 mean(z tanh(u))`` for the scale,
+    computed along with the value, so no per-sample tensor outlives the call and memory does not grow with the batch.
+
+    The draws are independent between axes and samples. By default all states of a batch share them (our choice): each
+    state's estimate has the same distribution, errors are correlated between states, and the cost falls to a third.
+
+    Args:
+        loc: (..., A) location before the tanh.
+        scale: (..., A) positive standard deviation before the tanh.
+        num_samples: draws per axis, at least 1.
+        shared_noise: whether the states of the batch share their draws.
+        noise: standard normal draws to use instead, (num_samples, A) if shared, else (num_samples, ..., A).
+
+    Returns:
+        (..., A) entropy estimates [nat].
+
+    Example:
+        >>> h = tanh_gaussian_entropy(torch.zeros(3), torch.ones(3))
+        >>> bool(((h - 0.669804).abs() < 5 * 0.218 / 1000**0.5).all())
+        True
+    """
+    if num_samples < 1:
+        raise ValueError(f"num_samples must be at least 1, got {num_samples}.")
+    if noise is not None:
+        expected = (num_samples, loc.shape[-1]) if shared_noise else (num_samples, *loc.shape)
+        if tuple(noise.shape) != expected:
+            raise ValueError(f"noise must have shape {expected}, got {tuple(noise.shape)}.")
+    loc, scale = at_least_float32(loc), at_least_float32(scale)
+    needs_gradient = torch.is_grad_enabled() and (loc.requires_grad or scale.requires_grad)
+    with torch.autocast(loc.device.type, enabled=False):  # its matrix-vector products would round to bfloat16
+        return cast(Tensor, _SampledEntropy.apply(loc, scale, num_samples, shared_noise, noise, needs_gradient))
+
+
+class _SampledEntropy(torch.autograd.Function):
+    """Value and both derivatives of the sampled entropy in one pass over the samples."""
+
+    @staticmethod
+    def forward(
+        ctx, loc: Tensor, scale: Tensor, num_samples: int, shared: bool, noise: Tensor | None, needs_gradient: bool
+    ) -> Tensor:
+        shape, axes = loc.shape, loc.shape[-1]
+        # Samples last and axes first: (A, R, n), so that every reduction and product runs over contiguous memory.
+        mu, sigma = loc.detach().reshape(-1, axes).T, scale.detach().reshape(-1, axes).T
+        rows = mu.shape[1]
+        if noise is not None:
+            noise = noise.detach().to(loc.dtype)
+            noise = noise.T.unsqueeze(1) if shared else noise.reshape(num_samples, rows, axes).permute(2, 1, 0)
+        elif shared:
+            noise = torch.randn(axes, 1, num_samples, dtype=loc.dtype, device=loc.device)
+        limit = _CHUNK_ELEMENTS_CPU if loc.device.type == "cpu" else _CHUNK_ELEMENTS_DEVICE
+        step = max(1, limit // max(1, axes * num_samples))
+        parts = [
+            _entropy_of_rows(mu[:, i : i + step], sigma[:, i : i + step], num_samples, shared, noise, i, needs_gradient)
+            for i in range(0, rows, step)
+        ]
+        if not parts:
+            parts = [(mu, mu, mu)]  # an empty batch
+        value, *derivatives = (torch.cat(column, 1).T.reshape(shape) for column in zip(*parts, strict=True))
+        if needs_gradient:
+            ctx.save_for_backward(*derivatives)
+        return value
+
+    @staticmethod
+    def backward(ctx, grad: Tensor):  # type: ignore[override]
+        by_loc, by_scale = ctx.saved_tensors
+        return grad * by_loc, grad * by_scale, None, None, None, None
+
+
+def _entropy_of_rows(
+    mu: Tensor, sigma: Tensor, num_samples: int, shared: bool, noise: Tensor | None, first: int, needs_gradient: bool
+) -> tuple[Tensor, ...]:
+    """Entropy (A, R) and, if needed, its derivatives for one block of rows, in few passes over (A, R, n).
+
+    ``v = 2 log2(e) u``, so that ``exp(-2|u|) = exp2(-|v|)``: torch's exp2 is three times as fast as its exp on a CPU.
+    """
+    if noise is None:
+        z = torch.randn(*mu.shape, num_samples, dtype=mu.dtype, device=mu.device)
+    else:
+        z = noise if shared else noise[:, first : first + mu.shape[1]]
+    v = (sigma * _TWO_LOG2_E).unsqueeze(-1) * z
+    v += (mu * _TWO_LOG2_E).unsqueeze(-1)
+    magnitude = v.abs()
+    mean_magnitude = magnitude.sum(-1).div_(_TWO_LOG2_E * num_samples)
+    q = magnitude.neg_().exp2_().add_(1.0)  # 1 + exp(-2|u|), in (1, 2]
+    log_cosh_mean = mean_magnitude + _log_of_product(q) / num_samples - math.log(2.0)
+    half_square = z.square().mean(-1).mul_(0.5)  # (A, 1) if shared, else (A, R)
+    value = sigma.log() + _HALF_LOG_2PI + half_square - 2.0 * log_cosh_mean
+    if not needs_gradient:
+        return (value,)
+    tanh = q.reciprocal_().mul_(2.0).sub_(1.0).mul_(v.sign_())
+    by_loc = tanh.mean(-1).mul_(-2.0)
+    if shared:
+        # A matrix-vector product for each axis; the batched form is an order of magnitude slower on a CPU.
+        z_tanh = torch.stack([torch.mv(t, row[0]) for t, row in zip(tanh, z, strict=True)])
+    else:
+        z_tanh = tanh.mul_(z).sum(-1)
+    return value, by_loc, sigma.reciprocal() - z_tanh.mul_(2.0 / num_samples)
+
+
+def _log_of_product(q: Tensor) -> Tensor:
+    """Sum of log q over the last axis for q in (1, 2]: fold by halves three times, then take an eighth of the logs."""
+    remainder = 0.0
+    for _ in range(3):
+        n = q.shape[-1]
+        if n % 2:
+            remainder = remainder + q[..., -1].log()
+        q = q[..., : n // 2] * q[..., n // 2 : 2 * (n // 2)]
+    return q.log_().sum(-1) + remainder
