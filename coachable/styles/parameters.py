@@ -134,7 +134,9 @@ class Setpoint(_Numeric):
 
     def __post_init__(self) -> None:
         self._check("Setpoint")
-        default = (self.low + self.high) / 2 if self.default is None else float(self.default)
+        # Rounded, so that the middle of [0.3, 0.6] reads 0.45 and equals an explicit 0.45.
+        middle = float(f"{(self.low + self.high) / 2:.12g}")
+        default = middle if self.default is None else float(self.default)
         _check_inside(f"default of Setpoint {self.name!r}", default, self.low, self.high)
         object.__setattr__(self, "default", default)
         if self.encoding not in ("max", "range"):

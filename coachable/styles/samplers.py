@@ -97,7 +97,7 @@ class Uniform(Sampler):
         return len(self.low)
 
     def _draw(self, shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
-        # lerp, unlike low + u * (high - low), never rounds to a value outside [low, high].
+        # lerp rounds to values inside [low, high] only, which bounded specs insist on.
         u = _rand((*shape, self.dim), generator, device)
         return torch.lerp(constant(self.low, device), constant(self.high, device), u)
 

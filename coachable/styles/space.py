@@ -93,7 +93,7 @@ class StyleSpace:
     def __getitem__(self, name: str) -> Parameter:
         """Parameter of that name."""
         if name not in self.slices:
-            raise KeyError(f"no style parameter {name!r}: expected one of {list(self.names)}")
+            raise KeyError(f"no style parameter named {name}: expected {', '.join(self.names)}")
         return self.parameters[self.names.index(name)]
 
     def __iter__(self) -> Iterator[str]:

@@ -85,13 +85,18 @@ def feature(features: Features, key: FeatureKey) -> Tensor:
         name, column = key[:-1], key[-1]
     entry = None if isinstance(features, Tensor) else features.get(name, None)
     if entry is None:
-        offered = (
-            f"one tensor of {features.shape[-1]} columns, to be read by index or slice"
-            if isinstance(features, Tensor)
-            else f"the entries {sorted(map(str, features.keys(True, True)))}"
-        )
-        raise KeyError(f"no style feature {name!r}: the environment emits {offered}.")
+        raise KeyError(_no_such_feature(features, name))
     return entry if column is None else entry[..., column]
+
+
+def _no_such_feature(features: Features, name: Any) -> str:
+    if isinstance(features, Tensor):
+        return (
+            f"no style feature named {name}: the environment emits one tensor of {features.shape[-1]} columns, "
+            "to be read by index or slice."
+        )
+    paths = (key if isinstance(key, str) else ".".join(key) for key in features.keys(True, True))
+    return f"no style feature named {name}: the environment emits {', '.join(sorted(paths))}."
 
 
 def scalar_feature(features: Features, key: FeatureKey, like: Tensor) -> Tensor:

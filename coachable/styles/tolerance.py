@@ -87,7 +87,7 @@ def _decline(z: Tensor, sigmoid: str) -> Tensor:
         case "gaussian":
             return torch.exp(z.square().mul(-0.5))
         case "hyperbolic":
-            return torch.cosh(z).reciprocal()
+            return torch.cosh(z.clamp(max=80)).reciprocal()  # cosh(89) overflows float32, and its gradient is NaN
         case "long_tail":
             return z.square().add(1).reciprocal()
         case "reciprocal":

@@ -26,7 +26,7 @@ class StyleView(Mapping[str, Tensor]):
         try:
             return self.theta[..., self._space.columns[name]]
         except KeyError:
-            raise KeyError(f"no style parameter {name!r}: expected one of {list(self._space.names)}") from None
+            raise KeyError(f"no style parameter named {name}: expected {', '.join(self)}") from None
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._space.names)

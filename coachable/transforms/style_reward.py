@@ -1,5 +1,7 @@
 """`StyleRewardTransform`: adds the style part to the task reward of an environment."""
 
+from collections.abc import Iterable
+
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torchrl.data import Composite, Unbounded
@@ -52,14 +54,17 @@ class StyleRewardTransform(Transform):
         return next_tensordict.set(self.reward_key, task_reward + value)
 
     def _what_is_missing(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> str:
+        def listed(keys: Iterable[NestedKey]) -> str:
+            return ", ".join(sorted(map(str, keys)))
+
         if self.style_key not in tensordict.keys(True):
             return (
-                f"step got no {self.style_key!r}, only {sorted(map(str, tensordict.keys()))}: "
+                f"step got no {self.style_key}, only {listed(tensordict.keys())}: "
                 "put a StyleSampler before StyleRewardTransform, and keep its key in the tensordict."
             )
         return (
-            f"the environment emitted {sorted(map(str, next_tensordict.keys()))} after a step: StyleRewardTransform "
-            f"expects {self.task_reward_key!r} and {self.features_key!r}; emit them, or name yours in its arguments."
+            f"after a step the environment emitted {listed(next_tensordict.keys())}: StyleRewardTransform expects "
+            f"{self.task_reward_key} and {self.features_key}; emit them, or name yours in its arguments."
         )
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
