@@ -1,0 +1,29 @@
+"""Stratified replay: multi-tables and event tables (paper, Stratified Sampling)."""
+
+from coachable.replay.event_tables import EventTableBuffer
+from coachable.replay.events import (
+    EventPredicate,
+    KeyEvents,
+    KeyRoute,
+    PredicateEvents,
+    PredicateRoute,
+    Route,
+    StyleEvents,
+)
+from coachable.replay.n_step import NStep
+from coachable.replay.stratified import StratifiedSampler
+from coachable.replay.sum_tree import SumTree
+
+__all__ = [
+    "EventPredicate",
+    "EventTableBuffer",
+    "KeyEvents",
+    "KeyRoute",
+    "NStep",
+    "PredicateEvents",
+    "PredicateRoute",
+    "Route",
+    "StratifiedSampler",
+    "StyleEvents",
+    "SumTree",
+]

@@ -1,0 +1,304 @@
+"""The replay buffer with event tables and multi-tables (paper, Stratified Sampling; algorithms.md sections 6 and 7)."""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+from coachable.replay.events import EventPredicate, Route, StyleEvents
+from coachable.replay.files import load_state, save_state
+from coachable.replay.n_step import NStep
+from coachable.replay.settings import checked_horizon, checked_minimum, checked_proportions, make_regions
+from coachable.replay.stratified import StratifiedSampler, allot
+from coachable.replay.table_writer import TableWriter
+
+__all__ = ["EventTableBuffer"]
+
+
+class EventTableBuffer(TensorDictReplayBuffer):
+    """Replay in several first-in-first-out tables, of which every batch holds an exact share.
+
+    Every step goes to one routed table: the table "default", or with `route` the one of its scenario (multi-tables).
+    When an event fires, it and the steps before it, at most `event_horizon` in all and none from before the episode's
+    start, are copied to the event's table as well, unless they are there already (event tables). Copies keep their
+    labels and stay when the default table has long dropped the originals.
+
+    Batches `(steps,)` are read as time-major (all environments at one time, then at the next), batches `(num_envs,
+    time)` as TorchRL's collectors yield them. Trajectory numbers, `("collector", "traj_ids")`, override both. Episodes
+    may span any number of `extend` calls; batches of several workers may be interleaved (`extend(data, worker=i)`,
+    needed only where trajectory numbers are not unique across workers). All of it runs in the process that calls
+    `extend`.
+
+    Samples carry `index` and `table`, the number of the table in `names`.
+
+    Args:
+        table_capacities: Records per table, by name: routed tables and event tables.
+        events: Which event tables there are and when their events fire (`coachable.replay.events`).
+        event_horizon: H_max, steps stored per event, the event step included. Needed with `events`.
+        route: Which routed tables there are and where each step goes; without it there is one, "default".
+        table_proportions: Share of each table in a batch. By default event tables share one half equally, routed tables
+            the other (our choice).
+        table_minimum: Records, for all tables or by name, below which a table is left out of batches and the other
+            shares are renormalised.
+        num_envs: Environments in a batch `(steps,)` that carries no trajectory numbers.
+        n_steps: Steps summed into one transition, before routing; see `coachable.replay.n_step.NStep`.
+        gamma: Discount of that sum.
+        discounted_keys: What is summed besides rewards.
+        prioritized: Whether to draw within each table in proportion to priorities; importance weights are relative to
+            the table.
+        priority_alpha: Exponent of the priorities.
+        priority_beta: Exponent of the importance weights (`rb.sampler.beta` may be changed later).
+        storage: Makes the storage for a number of records, such as `partial(LazyTensorStorage, device="cuda")` or
+            `LazyMemmapStorage`.
+        **kwargs: `batch_size`, `transform`, `generator`, `priority_key`, `pin_memory`, `collate_fn` of
+            `TensorDictReplayBuffer`.
+
+    Raises:
+        ValueError: If a capacity is not positive, names do not match, shares do not sum to 1, `event_horizon` is
+            missing or exceeds a table, or `batch_size` is below the number of tables. The first `extend` checks shapes.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from coachable.replay import KeyEvents
+        >>> rb = EventTableBuffer(
+        ...     {"default": 100, "hit": 20}, events=KeyEvents(["hit"]), event_horizon=2, num_envs=1, batch_size=4
+        ... )
+        >>> hit = torch.tensor([[False], [False], [True], [False]])
+        >>> step = {"done": torch.zeros(4, 1, dtype=torch.bool), "events": hit}
+        >>> _ = rb.extend(TensorDict({"t": torch.arange(4), "next": step}, [4]))
+        >>> rb.table("hit")["t"].tolist()
+        [1, 2]
+        >>> rb.sample()["table"].tolist()
+        [0, 0, 1, 1]
+    """
+
+    _storage: LazyTensorStorage
+    _writer: TableWriter
+    _sampler: StratifiedSampler
+
+    def __init__(
+        self,
+        table_capacities: Mapping[str, int],
+        *,
+        events: EventPredicate | None = None,
+        event_horizon: int | None = None,
+        route: Route | None = None,
+        table_proportions: Mapping[str, float] | None = None,
+        table_minimum: int | Mapping[str, int] = 1,
+        num_envs: int | None = None,
+        n_steps: int = 1,
+        gamma: float | None = None,
+        discounted_keys: Sequence[str | tuple[str, ...]] = (),
+        prioritized: bool = False,
+        priority_alpha: float = 0.6,
+        priority_beta: float = 0.4,
+        storage: Callable[[int], LazyTensorStorage] = LazyTensorStorage,
+        **kwargs: Any,
+    ) -> None:
+        regions = make_regions(table_capacities, route, events)
+        routed = len(route.names) if route is not None else 1
+        horizon = checked_horizon(regions, routed, events, event_horizon, num_envs)
+        shares = checked_proportions(regions.names, routed, table_proportions)
+        minimum = checked_minimum(regions, table_minimum)
+        if kwargs.get("batch_size") is not None:
+            allot(kwargs["batch_size"], shares, shares > 0)
+        for name in ("prefetch", "sampler", "writer", "shared", "sample_unit", "consume_after_n_samples", "dim_extend"):
+            if kwargs.get(name):
+                raise ValueError(f"EventTableBuffer takes no {name}: it has its own sampler and writer, in one process")
+        if n_steps != 1 and gamma is None:
+            raise ValueError(f"n_steps is {n_steps} but gamma is missing: give the discount of the loss")
+        n_step = NStep(n_steps, gamma or 1.0, discounted_keys) if n_steps != 1 else None
+        self.regions = regions
+        super().__init__(
+            storage=storage(regions.total),
+            sampler=StratifiedSampler(regions, shares, minimum, prioritized, priority_alpha, priority_beta),
+            writer=TableWriter(regions, route, events, horizon, n_step, num_envs),
+            **kwargs,
+        )
+
+    @classmethod
+    def for_styles(
+        cls,
+        space: Any,
+        *,
+        capacity: int,
+        event_capacity: int,
+        event_horizon: int,
+        extra: Sequence[str] = (),
+        event_admission: str = "nonzero",
+        **kwargs: Any,
+    ) -> "EventTableBuffer":
+        """A default table and one event table per weight of a `StyleSpace` (paper, combat).
+
+        Args:
+            space: `coachable.styles.StyleSpace`; its weights, in order, are the columns of `("next", "events")`.
+            capacity: Records of the default table.
+            event_capacity: Records of each event table.
+            event_horizon: H_max.
+            extra: Names of further event columns, admitted whatever the style.
+            event_admission: "nonzero" or "positive".
+            **kwargs: As for the class.
+        """
+        events = StyleEvents.of(space, extra, event_admission)
+        capacities = {"default": capacity, **dict.fromkeys(events.names, event_capacity)}
+        return cls(capacities, events=events, event_horizon=event_horizon, **kwargs)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the tables; `table` in a sample is the position here."""
+        return self.regions.names
+
+    def __len__(self) -> int:
+        """Records in all tables, copies included; `write_count` counts every step once."""
+        return int(self.regions.sizes.sum())
+
+    def __getitem__(self, index: Any) -> Any:
+        """Records by slot, as in `index` of a sample; a slice runs over live records only, table after table."""
+        if isinstance(index, slice):
+            index = np.concatenate([self.regions.slots(i) for i in range(len(self.regions))])[index]
+        return super().__getitem__(index)
+
+    def table(self, name: str) -> TensorDictBase:
+        """Records of one table, oldest first, without transforms.
+
+        Raises:
+            KeyError: If there is no such table.
+        """
+        if name not in self.names:
+            raise KeyError(f"no table {name!r}: the tables are {', '.join(self.names)}")
+        slots = torch.from_numpy(self.regions.slots(self.names.index(name)))
+        with self._replay_lock:
+            return self._storage.get(slots.to(self._storage.device))  # type: ignore[arg-type]
+
+    def statistics(self) -> dict[str, dict[str, int | float]]:
+        """Per table: size, capacity, fill, records written and evicted, events admitted, copies lost to eviction."""
+        return self._writer.statistics()
+
+    def stats(self) -> dict[str, int | float | bool]:
+        """TorchRL's snapshot, with `tables/NAME/...` of `statistics`."""
+        tables = {f"tables/{name}/{key}": v for name, row in self.statistics().items() for key, v in row.items()}
+        return {**super().stats(), **tables}
+
+    def extend(self, tensordicts: TensorDictBase, *, worker: int = 0, update_priority: bool | None = None) -> Tensor:
+        """Adds steps; the input is left as it is.
+
+        Args:
+            tensordicts: `(steps,)`, time-major, or `(num_envs, time)`, as collectors yield them.
+            worker: Number of the worker that collected them.
+            update_priority: Not used: new records get the largest priority seen so far.
+
+        Returns:
+            Slots written to: those of the steps, then those of copies in event tables.
+
+        Raises:
+            ValueError: If shapes do not fit the tables (see the class).
+        """
+        tensordicts = self._transform.inv(tensordicts)
+        if tensordicts is None:
+            return torch.zeros(0, dtype=torch.long)
+        with self._replay_lock, self._write_lock:
+            index = self._writer.extend(tensordicts, worker)
+            self._sampler.extend(index)
+        return index
+
+    def add(self, data: TensorDictBase) -> Tensor:
+        """Adds one step; see `extend`."""
+        return self.extend(data.unsqueeze(0))
+
+    def finish(self) -> Tensor:
+        """Ends every open episode where its data ends, for instance because the environments are going to be reset.
+
+        Held back n-step sums are written, bootstrapping from the last state seen, and no later window reaches back over
+        this point. Call it after loading a checkpoint, too, unless the environments were restored with it.
+
+        Returns:
+            Slots written to.
+        """
+        with self._replay_lock, self._write_lock:
+            index = self._writer.finish()
+            self._sampler.extend(index)
+        return index
+
+    def update_tensordict_priority(self, data: TensorDictBase) -> None:
+        """Sets priorities from `priority_key` of a sample; of several labels of one record the largest counts."""
+        if self._sampler.prioritized:
+            self.update_priority(data.get("index"), data.get(self.priority_key))
+
+    def update_priority(self, index: Tensor, priority: Tensor) -> None:
+        """Sets priorities of slots; see `StratifiedSampler.update_priority`."""
+        with self._replay_lock, self._write_lock:
+            self._sampler.update_priority(index, priority)
+
+    def mark_update(self, index: int | Tensor) -> None:
+        """Does nothing: records are written by `extend` alone, which sets their priorities."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything, tensors and plain containers only."""
+        with self._replay_lock:
+            return {"_storage": self._storage.state_dict(), "_batch_size": self._batch_size, **self._light_state()}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restores `state_dict`; the tables must be the same.
+
+        Raises:
+            ValueError: If tables, horizon or prioritisation differ.
+        """
+        with self._replay_lock:
+            self._writer.load_state_dict(state_dict["_writer"])  # checks the tables before anything is overwritten
+            if state_dict["_storage"]["initialized"]:
+                self._storage.load_state_dict(state_dict["_storage"])
+            self._load_light_state(state_dict)
+            self._batch_size = state_dict["_batch_size"]
+
+    def dumps(self, path: Path | str) -> None:
+        """Saves the buffer to a folder, as memory-mapped tensors and JSON, without pickle."""
+        path = Path(path).absolute()
+        path.mkdir(parents=True, exist_ok=True)
+        with self._replay_lock:
+            initialized = self._storage.initialized
+            if initialized:
+                self._storage.dumps(path / "storage")
+            save_state(self._light_state(), path / "state")
+            metadata = {"batch_size": self._batch_size, "initialized": initialized}
+            (path / "buffer.json").write_text(json.dumps(metadata), encoding="utf-8")
+
+    def loads(self, path: Path | str) -> None:
+        """Restores what `dumps` saved; the tables must be the same.
+
+        Raises:
+            ValueError: If tables, horizon or prioritisation differ.
+        """
+        path = Path(path).absolute()
+        metadata = json.loads((path / "buffer.json").read_text(encoding="utf-8"))
+        state = load_state(path / "state")
+        with self._replay_lock:
+            self._writer.load_state_dict(state["_writer"])
+            if metadata["initialized"]:
+                self._storage.loads(path / "storage")
+            self._load_light_state(state)
+            self._batch_size = metadata["batch_size"]
+
+    def _light_state(self) -> dict[str, Any]:
+        """All but the records."""
+        rng = None if self._rng is None else {"state": self._rng.get_state().clone(), "device": str(self._rng.device)}
+        return {
+            "_writer": self._writer.state_dict(),
+            "_sampler": self._sampler.state_dict(),
+            "_transforms": dict(self._transform.state_dict()),
+            "_rng": rng,
+        }
+
+    def _load_light_state(self, state: Mapping[str, Any]) -> None:
+        self._storage._len = self.regions.used_prefix
+        self._sampler.load_state_dict(state["_sampler"])
+        self._transform.load_state_dict(state["_transforms"])
+        if state["_rng"] is not None:
+            generator = torch.Generator(device=state["_rng"]["device"])
+            generator.set_state(state["_rng"]["state"].cpu())
+            self.set_rng(generator)

@@ -1,0 +1,248 @@
+"""What the tables are filled by: which event fired at a step, and which table a step belongs to.
+
+An event predicate is any object with `names`, one per event table, and `__call__(steps)`, which maps a flat tensordict
+of transitions to booleans `(steps, len(names))`. A route has `names` too and returns the table of each step, integers
+`(steps,)`. The classes below cover the domains of this library; a domain of your own may bring its own.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol, runtime_checkable
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from coachable.keys import EVENTS, STYLE
+
+__all__ = ["EventPredicate", "KeyEvents", "KeyRoute", "PredicateEvents", "PredicateRoute", "Route", "StyleEvents"]
+
+Key = str | tuple[str, ...]
+
+
+@runtime_checkable
+class EventPredicate(Protocol):
+    """Says which events happened at each step."""
+
+    names: tuple[str, ...]
+
+    def __call__(self, steps: TensorDictBase) -> Tensor:
+        """Maps transitions `(steps,)` to booleans `(steps, len(names))`."""
+        ...
+
+
+@runtime_checkable
+class Route(Protocol):
+    """Sends every step to exactly one table."""
+
+    names: tuple[str, ...]
+
+    def __call__(self, steps: TensorDictBase) -> Tensor:
+        """Maps transitions `(steps,)` to table numbers `(steps,)`, each in `[0, len(names))`."""
+        ...
+
+
+class StyleEvents:
+    """Event i is admitted iff the trajectory's weight w_i is set and the event fired (paper, Stratified Sampling).
+
+    Args:
+        names: Names of the styles, in the order of the event columns; the tables are named after them.
+        columns: Entry of theta that holds each weight.
+        extra: Names of event columns after these, admitted whatever the style (such as a kill table).
+        event_admission: "nonzero" admits when w_i != 0, "positive" when w_i > 0 (our choice).
+        events: Key of the booleans, `(steps, len(names) + len(extra))`.
+        style: Key of the raw theta, `(steps, d_theta)`.
+
+    Raises:
+        ValueError: If lengths differ, a name repeats or `event_admission` is unknown.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> events = StyleEvents(["melee", "traps"], [0, 1])
+        >>> fired = torch.tensor([[True, True]])
+        >>> steps = TensorDict({"style": torch.tensor([[1.0, 0.0]]), "next": {"events": fired}}, [1])
+        >>> events(steps)
+        tensor([[ True, False]])
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        columns: Sequence[int],
+        extra: Sequence[str] = (),
+        event_admission: str = "nonzero",
+        events: Key = ("next", EVENTS),
+        style: Key = STYLE,
+    ) -> None:
+        if len(names) != len(columns):
+            raise ValueError(
+                f"StyleEvents got {len(names)} names for {len(columns)} columns of theta: expected one each"
+            )
+        if event_admission not in ("nonzero", "positive"):
+            raise ValueError(f"event_admission is {event_admission!r}: expected 'nonzero' or 'positive'")
+        self.names = _distinct((*names, *extra))
+        self.columns = torch.tensor(list(columns), dtype=torch.long)
+        self.event_admission = event_admission
+        self.events = events
+        self.style = style
+
+    @classmethod
+    def of(cls, space: "object", extra: Sequence[str] = (), event_admission: str = "nonzero") -> "StyleEvents":
+        """One event per `Weight` of a `StyleSpace`, in the space's order.
+
+        Args:
+            space: A `coachable.styles.StyleSpace`.
+            extra: As above.
+            event_admission: As above.
+        """
+        slices = space.slices  # type: ignore[attr-defined]
+        weights = [p.name for p in space.parameters if p.kind == "weight"]  # type: ignore[attr-defined]
+        return cls(weights, [slices[name].start for name in weights], extra, event_admission)
+
+    def __call__(self, steps: TensorDictBase) -> Tensor:
+        """Booleans `(steps, len(names))`."""
+        fired = steps.get(self.events)
+        if fired.shape[-1] != len(self.names):
+            raise ValueError(
+                f"{self.events} has shape {tuple(fired.shape)}: expected {len(self.names)} events, one for each of "
+                f"{', '.join(self.names)} (names and extra of StyleEvents)"
+            )
+        weight = steps.get(self.style).index_select(-1, self.columns.to(fired.device))
+        wanted = weight != 0 if self.event_admission == "nonzero" else weight > 0
+        admitted = fired.clone()
+        admitted[..., : len(self.columns)] &= wanted
+        return admitted
+
+
+class KeyEvents:
+    """Events exactly as the environment reports them, whatever the style.
+
+    Args:
+        names: One per column.
+        events: Key of the booleans, `(steps, len(names))`.
+    """
+
+    def __init__(self, names: Sequence[str], events: Key = ("next", EVENTS)) -> None:
+        self.names = _distinct(names)
+        self.events = events
+
+    def __call__(self, steps: TensorDictBase) -> Tensor:
+        """Booleans `(steps, len(names))`."""
+        return steps.get(self.events)
+
+
+class PredicateEvents:
+    """One function per event table.
+
+    Args:
+        predicates: By table name, each mapping transitions `(steps,)` to booleans `(steps,)`.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> events = PredicateEvents({"fast": lambda steps: steps["next", "speed"] > 50.0})
+        >>> events(TensorDict({"next": {"speed": torch.tensor([10.0, 60.0])}}, [2])).tolist()
+        [[False], [True]]
+    """
+
+    def __init__(self, predicates: Mapping[str, Callable[[TensorDictBase], Tensor]]) -> None:
+        self.names = _distinct(predicates)
+        self.predicates = dict(predicates)
+
+    def __call__(self, steps: TensorDictBase) -> Tensor:
+        """Booleans `(steps, len(names))`."""
+        columns = {name: predicate(steps) for name, predicate in self.predicates.items()}
+        for name, column in columns.items():
+            if column.shape != steps.shape:
+                raise ValueError(
+                    f"the predicate of table {name!r} returned shape {tuple(column.shape)}: "
+                    f"expected {tuple(steps.shape)}, one boolean per step"
+                )
+        return torch.stack(list(columns.values()), -1)
+
+
+class KeyRoute:
+    """Routes by an integer that the data carries, such as the scenario's number.
+
+    Args:
+        names: Table of each number.
+        key: Key of the integers, `(steps,)` or `(steps, 1)`.
+    """
+
+    def __init__(self, names: Sequence[str], key: Key = "scenario") -> None:
+        self.names = _distinct(names)
+        self.key = key
+
+    def __call__(self, steps: TensorDictBase) -> Tensor:
+        """Table numbers `(steps,)`."""
+        number = steps.get(self.key)
+        return number.squeeze(-1) if number.shape == (*steps.shape, 1) else number
+
+
+class PredicateRoute:
+    """Routes to the first table whose predicate holds.
+
+    Args:
+        predicates: By table name, each mapping transitions `(steps,)` to booleans `(steps,)`, in order of precedence.
+        otherwise: Table of the steps for which none holds; comes first in the order of the tables.
+
+    Raises:
+        ValueError: If a name repeats.
+    """
+
+    def __init__(
+        self, predicates: Mapping[str, Callable[[TensorDictBase], Tensor]], otherwise: str = "default"
+    ) -> None:
+        self.names = _distinct((otherwise, *predicates))
+        self.predicates = PredicateEvents(predicates)
+
+    def __call__(self, steps: TensorDictBase) -> Tensor:
+        """Table numbers `(steps,)`."""
+        held = self.predicates(steps)
+        return torch.where(held.any(-1), held.int().argmax(-1) + 1, 0)
+
+
+def checked_events(predicate: EventPredicate, steps: TensorDictBase) -> Tensor:
+    """Evaluates a predicate.
+
+    Raises:
+        ValueError: If the result is not boolean `(steps, len(names))`.
+    """
+    fired = predicate(steps)
+    wanted = (*steps.shape, len(predicate.names))
+    if not isinstance(fired, Tensor) or fired.dtype != torch.bool or tuple(fired.shape) != wanted:
+        got = f"{fired.dtype} {tuple(fired.shape)}" if isinstance(fired, Tensor) else type(fired).__name__
+        raise ValueError(
+            f"the event predicate {type(predicate).__name__} returned {got}: expected torch.bool {wanted}, "
+            f"one column for each of its tables ({', '.join(predicate.names)})"
+        )
+    return fired
+
+
+def checked_route(route: Route, steps: TensorDictBase) -> Tensor:
+    """Evaluates a route.
+
+    Raises:
+        ValueError: If the result is not integer `(steps,)` or names no table.
+    """
+    table = route(steps)
+    if (
+        not isinstance(table, Tensor)
+        or table.is_floating_point()
+        or table.dtype == torch.bool
+        or table.shape != steps.shape
+    ):
+        got = f"{table.dtype} {tuple(table.shape)}" if isinstance(table, Tensor) else type(table).__name__
+        raise ValueError(f"the route {type(route).__name__} returned {got}: expected integers {tuple(steps.shape)}")
+    low, high = (int(bound) for bound in table.aminmax()) if table.numel() else (0, 0)
+    if low < 0 or high >= len(route.names):
+        raise ValueError(
+            f"the route {type(route).__name__} returned table numbers from {low} to {high}: expected 0 to "
+            f"{len(route.names) - 1}, for the tables {', '.join(route.names)}"
+        )
+    return table
+
+
+def _distinct(names: Sequence[str] | Mapping[str, object]) -> tuple[str, ...]:
+    names = tuple(names)
+    if len(set(names)) != len(names):
+        raise ValueError(f"table names repeat: {', '.join(names)}")
+    return names

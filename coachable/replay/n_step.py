@@ -1,0 +1,159 @@
+"""n-step transitions from a stream of one-step transitions (algorithms.md section 2)."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from coachable.keys import EVENTS, STYLE_FEATURES, STYLE_REWARD, TASK_REWARD
+from coachable.replay.steps import Steps
+
+__all__ = ["NStep"]
+
+Key = str | tuple[str, ...]
+REWARDS = (("next", "reward"), ("next", TASK_REWARD), ("next", STYLE_REWARD))
+
+
+class NStep:
+    """Sums rewards over up to `n_steps` steps and lets `next` point at the last state seen.
+
+    The transition at t gets `R_t = sum_{l<k} gamma^l r_{t+l}`, the `next` entries of step t+k-1, `steps_to_next_obs =
+    k` (TorchRL's key, which its value estimators read) and `discount = gamma^k`, both `(..., 1)`. k is `n_steps`, or
+    less where the episode ends first, terminated or truncated: the discount is gamma to the steps summed, and whoever
+    computes the target bootstraps unless `("next", "terminated")`.
+
+    Steps whose sum is still open are held back until the steps after them arrive, so that several calls per episode
+    give the same transitions as one. `flush` ends all of them where the data ends.
+
+    Args:
+        n_steps: Steps to sum, N.
+        gamma: Discount per step.
+        discounted_keys: What is summed besides the rewards. `("next", "style_features")` belongs here if, and only if,
+            the style reward is linear in the features; otherwise the features are dropped from n-step transitions,
+            because relabelling from the last step's features would be wrong.
+        patience: A stream of which nothing arrived for that many steps has ended.
+
+    Raises:
+        ValueError: If `n_steps` is not positive or `gamma` lies outside (0, 1].
+    """
+
+    def __init__(self, n_steps: int, gamma: float, discounted_keys: Sequence[Key] = (), patience: int = 2**62) -> None:
+        if n_steps < 1:
+            raise ValueError(f"n_steps is {n_steps}: expected at least 1")
+        if not 0.0 < gamma <= 1.0:
+            raise ValueError(f"gamma is {gamma}: expected a discount in (0, 1] (needed because n_steps is {n_steps})")
+        self.n_steps = n_steps
+        self.gamma = gamma
+        self.summed = tuple(
+            dict.fromkeys((*REWARDS, *(tuple(k) if not isinstance(k, str) else k for k in discounted_keys)))
+        )
+        self.patience = patience
+        self._data: TensorDictBase | None = None
+        self._steps: Steps | None = None
+
+    def __len__(self) -> int:
+        """Number of steps held back."""
+        return 0 if self._steps is None else len(self._steps)
+
+    def push(self, data: TensorDictBase, steps: Steps) -> tuple[TensorDictBase, Steps]:
+        """Adds steps and returns the transitions that became complete, in the order in which they did.
+
+        Args:
+            data: `(steps,)` one-step transitions.
+            steps: their bookkeeping, which the returned transitions inherit from the step they start at.
+        """
+        if self._data is not None and self._steps is not None:
+            data = torch.cat([self._data, data])  # type: ignore[assignment]
+            steps = Steps.cat([self._steps, steps])
+        return self._emit(data, steps, finish=False)
+
+    def flush(self) -> tuple[TensorDictBase, Steps] | None:
+        """Returns what is held back, every sum ending where the data ends; None if there is nothing."""
+        if self._data is None or self._steps is None:
+            return None
+        return self._emit(self._data, self._steps, finish=True)
+
+    def _emit(self, data: TensorDictBase, steps: Steps, finish: bool) -> tuple[TensorDictBase, Steps]:
+        cut = steps.in_episodes()
+        row = np.arange(len(steps))
+        last = cut.last[cut.number]
+        full = row + self.n_steps - 1
+        # A piece is closed by its own end, by another episode of the same stream, or by having been abandoned.
+        followed = np.zeros(len(cut.last), dtype=bool)
+        followed[:-1] = cut.stream[cut.last[:-1]] == cut.stream[cut.start[1:]]
+        abandoned = steps.arrival[cut.order[cut.last]] < steps.arrival.max() - self.patience
+        closed = cut.ends[cut.last] | followed | abandoned | finish
+        complete = (full <= last) | closed[cut.number]
+        last = np.minimum(full, last)
+
+        # Order of completion: by the step that completes a sum. A piece cut by the next episode completes with its
+        # first step.
+        by = cut.order[last]
+        ended_short = (full > last) & ~cut.ends[last]
+        completing = np.where(ended_short & followed[cut.number], cut.order[np.minimum(last + 1, len(row) - 1)], by)
+        emitted = np.flatnonzero(complete)
+        emitted = emitted[np.lexsort((emitted, completing[emitted]))]
+
+        transitions = self._sum(data, cut.order, emitted, last[emitted])
+        held = np.sort(cut.order[~complete])
+        self._data = data[torch.from_numpy(held).to(data.device or "cpu")] if len(held) else None
+        self._steps = steps[held] if len(held) else None
+        return transitions, steps[cut.order[emitted]]
+
+    def _sum(self, data: TensorDictBase, order: np.ndarray, start: np.ndarray, last: np.ndarray) -> TensorDictBase:
+        device = data.device or "cpu"
+        first_row = torch.from_numpy(order[start]).to(device)
+        count = torch.from_numpy(last - start + 1).to(device)
+        following: TensorDictBase = data.get("next")  # type: ignore[assignment]
+        out: Any = data.exclude("next")[first_row]
+        nxt: Any = following[torch.from_numpy(order[last]).to(device)]
+        if ("next", STYLE_FEATURES) not in self.summed:
+            nxt = nxt.exclude(STYLE_FEATURES)
+        if following.get(EVENTS, None) is not None:
+            nxt.set(
+                EVENTS, following.get(EVENTS)[first_row]
+            )  # the events of the step that the table membership is about
+        out.set("next", nxt)
+        for key in self.summed:
+            value: Any = data.get(key, None)
+            if value is None:
+                continue
+            total = value[first_row].clone()
+            for lag in range(1, self.n_steps):
+                at = torch.from_numpy(order[np.minimum(start + lag, last)]).to(device)
+                _add(total, value[at], self.gamma**lag, count > lag)
+            out.set(key, total)
+        out.set("steps_to_next_obs", count.unsqueeze(-1))
+        out.set(
+            "discount",
+            torch.as_tensor(self.gamma, dtype=torch.float64).pow(count.cpu()).float().to(device).unsqueeze(-1),
+        )
+        return out
+
+    def clear(self) -> None:
+        """Forgets the held back steps."""
+        self._data = self._steps = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """What is held back."""
+        if self._data is None or self._steps is None:
+            return {}
+        return {"data": self._data.to_dict(), "steps": self._steps.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any], device: torch.device | None = None) -> None:
+        """Restores what was held back."""
+        self.clear()
+        if state:
+            self._steps = Steps.from_state_dict(state["steps"])
+            self._data = TensorDict(state["data"], batch_size=[len(self._steps)], device=device).clone()
+
+
+def _add(total: Any, value: Any, factor: float, where: torch.Tensor) -> None:
+    if isinstance(total, TensorDictBase):
+        for key in total.keys(include_nested=True, leaves_only=True):
+            _add(total.get(key), value.get(key), factor, where)
+    else:
+        mask = where.reshape(-1, *[1] * (total.ndim - 1))
+        total += torch.where(mask, factor * value, torch.zeros_like(value))

@@ -1,0 +1,114 @@
+"""One storage cut into contiguous regions, one per table, each with its own FIFO cursor."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+__all__ = ["Regions"]
+
+
+class Regions:
+    """Where the records of each table live in one storage.
+
+    Regions are laid out in reverse order of the tables: the first table, usually by far the largest, comes last, so
+    that the used prefix of the storage stays short while it fills (checkpoints write that prefix).
+
+    Args:
+        capacities: Records per table, by name.
+
+    Raises:
+        ValueError: If there is no table, or a capacity is not a positive integer.
+
+    Examples:
+        >>> regions = Regions({"default": 4, "melee": 2})
+        >>> regions.allocate(np.array([0, 0, 1]))[0].tolist()
+        [2, 3, 0]
+        >>> regions.sizes.tolist()
+        [2, 1]
+    """
+
+    def __init__(self, capacities: Mapping[str, int]) -> None:
+        if not capacities:
+            raise ValueError("table_capacities is empty: expected at least one table, such as {'default': 100_000}")
+        for name, capacity in capacities.items():
+            if isinstance(capacity, bool) or not isinstance(capacity, int | np.integer) or capacity <= 0:
+                raise ValueError(f"table_capacities[{name!r}] is {capacity!r}: expected a positive integer")
+        self.names = tuple(capacities)
+        self.capacities = np.array(list(capacities.values()), dtype=np.int64)
+        ends = np.cumsum(self.capacities[::-1])[::-1]
+        self.offsets = ends - self.capacities
+        self.total = int(self.capacities.sum())
+        self.written = np.zeros(len(self.names), dtype=np.int64)
+        self.version = 0  # changes whenever a size does, so that samplers may cache what follows from the sizes
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """Live records per table, `(tables,)`."""
+        return np.minimum(self.written, self.capacities)
+
+    @property
+    def used_prefix(self) -> int:
+        """Number of leading slots of the storage outside which nothing was ever written."""
+        sizes = self.sizes
+        return int((self.offsets + sizes)[sizes > 0].max(initial=0))
+
+    def allocate(self, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Takes the next slots, first in first out.
+
+        Args:
+            table: `(records,)` table of each record, in the order in which they are appended.
+
+        Returns:
+            Slots `(records,)`, -1 for a record that a later one of the same call replaces because the table is too
+            small for all of them; and serial numbers `(records,)`, counting what was ever appended to that table.
+        """
+        counts = np.bincount(table, minlength=len(self))
+        order = np.argsort(table, kind="stable")
+        rank = np.empty_like(order)
+        rank[order] = np.arange(len(table)) - (np.cumsum(counts) - counts)[table[order]]
+        serial = self.written[table] + rank
+        slot = self.offsets[table] + serial % self.capacities[table]
+        slot[rank < (counts - self.capacities)[table]] = -1
+        before = self.sizes
+        self.written += counts
+        self.version += int((before != self.sizes).any())
+        return slot, serial
+
+    def table_of(self, slot: np.ndarray) -> np.ndarray:
+        """Table that each slot belongs to, `(slots,)`."""
+        ascending = np.argsort(self.offsets)
+        return ascending[np.searchsorted(self.offsets[ascending], slot, side="right") - 1]
+
+    def slots(self, table: int) -> np.ndarray:
+        """Slots of the live records of one table, oldest first."""
+        size, written = int(self.sizes[table]), int(self.written[table])
+        return self.offsets[table] + np.arange(written - size, written) % self.capacities[table]
+
+    def clear(self) -> None:
+        """Forgets every record."""
+        self.written[:] = 0
+        self.version += 1
+
+    def state_dict(self) -> dict[str, Any]:
+        """Names, capacities and write counts, from which cursors and fill counts follow."""
+        return {"names": list(self.names), "capacities": self.capacities.tolist(), "written": self.written.tolist()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restores the cursors.
+
+        Raises:
+            ValueError: If the tables are others than the saved ones.
+        """
+        saved = dict(zip(state["names"], state["capacities"], strict=True))
+        present = dict(zip(self.names, self.capacities.tolist(), strict=True))
+        if list(saved.items()) != list(present.items()):
+            raise ValueError(
+                f"the saved tables are {saved}, this buffer's are {present}: give the same table_capacities "
+                "in the same order"
+            )
+        self.written[:] = state["written"]
+        self.version += 1

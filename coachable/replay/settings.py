@@ -1,0 +1,117 @@
+"""Checks of what an `EventTableBuffer` is made from; every mistake is reported before anything is allocated."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from coachable.replay.events import EventPredicate, Route
+from coachable.replay.regions import Regions
+
+__all__ = ["checked_horizon", "checked_minimum", "checked_proportions", "make_regions"]
+
+
+def make_regions(capacities: Mapping[str, int], route: Route | None, events: EventPredicate | None) -> Regions:
+    """Puts the tables in order: routed tables, then event tables.
+
+    Raises:
+        ValueError: If names are missing, unknown or given twice, or a capacity is not positive.
+    """
+    routed = tuple(route.names) if route is not None else ("default",)
+    fed = tuple(events.names) if events is not None else ()
+    both = sorted(set(routed) & set(fed))
+    if both:
+        raise ValueError(f"tables {both} are both routed to and event tables: give one of the two other names")
+    missing = [name for name in (*routed, *fed) if name not in capacities]
+    stray = [name for name in capacities if name not in (*routed, *fed)]
+    if missing or stray:
+        raise ValueError(
+            f"table_capacities lacks {missing} and has no use for {stray}: expected exactly the routed tables "
+            f"{list(routed)} (route=) and the event tables {list(fed)} (events=)"
+        )
+    return Regions({name: capacities[name] for name in (*routed, *fed)})
+
+
+def checked_horizon(
+    regions: Regions, routed: int, events: EventPredicate | None, horizon: int | None, num_envs: int | None
+) -> int:
+    """Checks H_max against the tables.
+
+    Raises:
+        ValueError: If it is missing, not positive, or larger than a table.
+    """
+    if num_envs is not None and num_envs < 1:
+        raise ValueError(f"num_envs is {num_envs}: expected a positive integer")
+    if events is None:
+        if horizon is not None:
+            raise ValueError(
+                f"event_horizon is {horizon} but there are no event tables: give events= as well, or neither"
+            )
+        return 1
+    if horizon is None or horizon < 1:
+        raise ValueError(f"event_horizon is {horizon}: expected the number of steps to store per event, at least 1")
+    for name, capacity in zip(regions.names[routed:], regions.capacities[routed:].tolist(), strict=True):
+        if horizon > capacity:
+            raise ValueError(
+                f"event_horizon is {horizon}, larger than table_capacities[{name!r}] = {capacity}: a table must hold "
+                "at least one window"
+            )
+    needed = horizon * (num_envs or 1)
+    for name, capacity in zip(regions.names[:routed], regions.capacities[:routed].tolist(), strict=True):
+        if needed > capacity:
+            raise ValueError(
+                f"table_capacities[{name!r}] is {capacity}, less than event_horizon * num_envs = {needed}: windows are "
+                "copied out of this table, so it must hold the last steps of every environment"
+            )
+    return horizon
+
+
+def checked_proportions(names: Sequence[str], routed: int, given: Mapping[str, float] | None) -> np.ndarray:
+    """Shares of the tables in a batch.
+
+    Args:
+        names: Tables, the routed ones first.
+        routed: How many are routed.
+        given: Shares by name; by default 0.5 for the routed tables and 0.5 for the event tables, each split equally.
+
+    Returns:
+        `(tables,)` shares.
+
+    Raises:
+        ValueError: If names differ, a share is negative, or they do not sum to 1.
+    """
+    if given is None:
+        fed = len(names) - routed
+        base = 0.5 if fed else 1.0
+        return np.array([base / routed] * routed + [0.5 / max(fed, 1)] * fed)
+    if set(given) != set(names):
+        raise ValueError(f"table_proportions names {sorted(given)}: expected exactly the tables {sorted(names)}")
+    shares = np.array([float(given[name]) for name in names])
+    if not np.isfinite(shares).all() or (shares < 0).any() or abs(shares.sum() - 1.0) > 1e-6:
+        raise ValueError(
+            f"table_proportions are {dict(given)}, with sum {shares.sum():.6g}: expected shares >= 0 that sum to 1"
+        )
+    return shares
+
+
+def checked_minimum(regions: Regions, given: int | Mapping[str, int]) -> np.ndarray:
+    """Records below which a table is left out of batches.
+
+    Args:
+        regions: The tables.
+        given: For all tables, or by name (1 where not given).
+
+    Returns:
+        `(tables,)` int64.
+
+    Raises:
+        ValueError: If a name is unknown, or a number lies outside [1, capacity].
+    """
+    by_name = dict.fromkeys(regions.names, given) if not isinstance(given, Mapping) else dict(given)
+    stray = [name for name in by_name if name not in regions.names]
+    if stray:
+        raise ValueError(f"table_minimum names {stray}: the tables are {list(regions.names)}")
+    minimum = np.array([by_name.get(name, 1) for name in regions.names], dtype=np.int64)
+    for name, least, capacity in zip(regions.names, minimum.tolist(), regions.capacities.tolist(), strict=True):
+        if not 1 <= least <= capacity:
+            raise ValueError(f"table_minimum of {name!r} is {least}: expected 1 to its capacity, {capacity}")
+    return minimum

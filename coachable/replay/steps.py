@@ -1,0 +1,165 @@
+"""Bookkeeping of steps beside their data: which stream each belongs to, and where episodes begin and end."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from tensordict import LazyStackedTensorDict, TensorDictBase
+from torch import Tensor
+
+__all__ = ["Steps", "flatten_time_major", "read_steps"]
+
+TRAJECTORY = ("collector", "traj_ids")
+_MASK = ("collector", "mask")
+# Stream numbers are worker * 2^40 + trajectory or slot.
+_WORKER_SHIFT = 40
+
+
+@dataclass
+class Steps:
+    """Bookkeeping of consecutive steps of many streams, on the CPU: rows of one stream are in the order of time.
+
+    A stream is one environment slot of one worker, or one trajectory where the collector numbers them.
+    """
+
+    stream: np.ndarray  # (steps,) int64
+    begins: np.ndarray  # (steps,) bool, first step of an episode as far as the data says so (`is_init`)
+    ends: np.ndarray  # (steps,) bool, last step of an episode, terminated or truncated
+    fired: np.ndarray  # (steps, event tables) bool
+    route: np.ndarray  # (steps,) int64, table that the step itself goes to
+    arrival: np.ndarray  # (steps,) int64, how many steps had been received before
+
+    def __len__(self) -> int:
+        return len(self.stream)
+
+    def __getitem__(self, rows: np.ndarray) -> "Steps":
+        return Steps(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
+    @staticmethod
+    def unrelated(n: int) -> "Steps":
+        """Steps of which nobody needs to know the order."""
+        yes_no, number = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
+        return Steps(number, yes_no, yes_no, np.zeros((n, 0), dtype=bool), number, number)
+
+    @staticmethod
+    def cat(parts: "Sequence[Steps]") -> "Steps":
+        """Concatenates."""
+        return Steps(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Steps)})
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Columns as tensors."""
+        return {f.name: torch.from_numpy(getattr(self, f.name).copy()) for f in fields(self)}
+
+    @staticmethod
+    def from_state_dict(state: dict[str, Tensor]) -> "Steps":
+        """Inverse of `state_dict`."""
+        return Steps(**{f.name: state[f.name].cpu().numpy().copy() for f in fields(Steps)})
+
+    def in_episodes(self) -> "Episodes":
+        """Sorts the steps by stream and cuts them into episodes."""
+        order = np.argsort(self.stream, kind="stable")
+        stream, ends = self.stream[order], self.ends[order]
+        first_of_stream = np.ones(len(order), dtype=bool)
+        first_of_stream[1:] = stream[1:] != stream[:-1]
+        first = first_of_stream | self.begins[order]
+        first[1:] |= ends[:-1]
+        starts = np.flatnonzero(first)
+        return Episodes(
+            order=order,
+            stream=stream,
+            ends=ends,
+            first_of_stream=first_of_stream,
+            number=np.cumsum(first) - 1,
+            start=starts,
+            last=np.append(starts[1:] - 1, len(order) - 1),
+        )
+
+
+@dataclass
+class Episodes:
+    """Steps sorted by stream, cut into (pieces of) episodes."""
+
+    order: np.ndarray  # (steps,) row of each sorted step
+    stream: np.ndarray  # (steps,)
+    ends: np.ndarray  # (steps,)
+    first_of_stream: np.ndarray  # (steps,) bool
+    number: np.ndarray  # (steps,) which piece a step is in
+    start: np.ndarray  # (pieces,) sorted position of the first step
+    last: np.ndarray  # (pieces,) sorted position of the last step
+
+
+def flatten_time_major(data: TensorDictBase) -> tuple[TensorDictBase, int | None]:
+    """Flattens a batch so that steps of one environment stay in the order of time.
+
+    Args:
+        data: `(steps,)`, already time-major, or `(num_envs, time)` as TorchRL's collectors and rollouts yield it.
+
+    Returns:
+        `(steps,)` and the number of environments, if the shape tells.
+
+    Raises:
+        ValueError: For another number of batch dimensions.
+    """
+    if data.ndim not in (1, 2):
+        raise ValueError(
+            f"extend got a batch of shape {tuple(data.shape)}: expected (steps,), time-major, or (num_envs, time) as "
+            "collectors yield it"
+        )
+    num_envs = None
+    if isinstance(data, LazyStackedTensorDict):
+        data = data.contiguous()  # a rollout is a lazy stack, a hundred times slower to flatten
+    if data.ndim == 2:
+        num_envs = data.shape[0]
+        data = data.transpose(0, 1).reshape(-1)
+    mask = data.get(_MASK, None)
+    if mask is not None and not bool(mask.all()):
+        data = data[mask]  # padding of `split_trajs`
+    return data, num_envs
+
+
+def read_steps(data: TensorDictBase, num_envs: int | None, worker: int, arrived: int) -> Steps:
+    """Reads streams and episode ends; events and routes are left empty.
+
+    Args:
+        data: `(steps,)`.
+        num_envs: Environments in the batch; needed if the data carries no trajectory numbers.
+        worker: Number of the worker that sent the data.
+        arrived: Steps received before.
+
+    Returns:
+        One row per step.
+
+    Raises:
+        ValueError: If streams cannot be told apart.
+    """
+    n = len(data)
+    trajectory = data.get(TRAJECTORY, None)
+    if trajectory is not None:
+        stream = trajectory.reshape(n, -1)[:, 0].to("cpu", torch.int64).numpy()
+    elif num_envs is None:
+        raise ValueError(
+            f"cannot tell which of the {n} steps belong to one episode: give EventTableBuffer num_envs (batches are "
+            f"then read as time-major), extend with (num_envs, time) batches, or keep {TRAJECTORY} in the data"
+        )
+    elif n % num_envs:
+        raise ValueError(f"extend got {n} steps of {num_envs} environments: expected a multiple (num_envs)")
+    else:
+        stream = np.arange(n) % num_envs
+    steps = Steps.unrelated(n)
+    steps.stream = stream + (worker << _WORKER_SHIFT)
+    steps.begins = _flag(data.get("is_init", None), n)
+    steps.ends = _flag(_done(data), n)
+    steps.arrival = arrived + np.arange(n)
+    return steps
+
+
+def _done(data: TensorDictBase) -> Tensor:
+    done = data.get(("next", "done"), None)
+    if done is None:
+        raise ValueError("the data has no ('next', 'done'): expected transitions as TorchRL's collectors yield them")
+    return done
+
+
+def _flag(value: Tensor | None, n: int) -> np.ndarray:
+    return np.zeros(n, dtype=bool) if value is None else value.reshape(n, -1).any(-1).cpu().numpy()

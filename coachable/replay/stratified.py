@@ -1,0 +1,260 @@
+"""Batches with an exact number of records from every table, uniform or prioritised within the table."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torchrl.data.replay_buffers import Storage
+from torchrl.data.replay_buffers.samplers import Sampler
+
+from coachable.keys import TABLE
+from coachable.replay.regions import Regions
+from coachable.replay.sum_tree import SumTree
+
+__all__ = ["StratifiedSampler", "allot"]
+
+
+def allot(batch_size: int, proportions: np.ndarray, available: np.ndarray) -> np.ndarray:
+    """Records per table: proportions renormalised over the available tables, largest remainder, at least 1 each.
+
+    Tables whose quota is below 1 get exactly 1, and the rest of the batch is shared by the others. Ties of remainders
+    go to the table that comes first.
+
+    Args:
+        batch_size: Records in the batch, B.
+        proportions: `(tables,)` shares.
+        available: `(tables,)` bool.
+
+    Returns:
+        `(tables,)` int64 that sums to `batch_size`; 0 where a table is not available or has no share.
+
+    Raises:
+        ValueError: If no table is available, or more than `batch_size` are.
+
+    Examples:
+        >>> allot(10, np.array([0.5, 0.3, 0.2]), np.array([True, True, True])).tolist()
+        [5, 3, 2]
+        >>> allot(10, np.array([0.5, 0.3, 0.2]), np.array([True, False, True])).tolist()
+        [7, 0, 3]
+        >>> allot(4, np.array([0.98, 0.01, 0.01]), np.array([True, True, True])).tolist()
+        [2, 1, 1]
+    """
+    sharing = available & (proportions > 0)
+    counts = np.zeros(len(proportions), dtype=np.int64)
+    if not sharing.any():
+        raise ValueError("no table holds enough records to sample from: extend the buffer first (see table_minimum)")
+    if sharing.sum() > batch_size:
+        raise ValueError(
+            f"a batch of {batch_size} cannot hold a record of each of {sharing.sum()} tables: raise batch_size, or "
+            "give tables the proportion 0"
+        )
+    left = batch_size
+    while True:
+        # Only float rounding is removed here: 0.3 * 10 is 3, not 2.9999999999999996.
+        quota = np.round(proportions * sharing / proportions[sharing].sum() * left, 9)
+        small = sharing & (quota < 1)
+        if not small.any():
+            break
+        counts[small] = 1
+        left -= int(small.sum())
+        sharing = sharing & ~small
+        if not sharing.any():
+            break
+    if sharing.any():
+        floor = np.floor(quota).astype(np.int64)
+        remainder = np.where(sharing, quota - floor, -1.0)
+        extra = np.argsort(-remainder, kind="stable")[: left - int(floor[sharing].sum())]
+        counts[sharing] = floor[sharing]
+        counts[extra] += 1
+    return counts
+
+
+@dataclass
+class _Plan:
+    """What all batches of one size share until a table grows."""
+
+    counts: np.ndarray
+    table: Tensor  # (B,) int64
+    offset: Tensor  # (B,) int64, first slot of the record's table
+    size: Tensor  # (B,) float64, live records of it
+
+
+class StratifiedSampler(Sampler):
+    """Draws the same share of every batch from each table (paper, Stratified Sampling; SSET, Kompella 2023).
+
+    Args:
+        regions: The tables.
+        proportions: `(tables,)` shares that sum to 1.
+        minimum: `(tables,)` records below which a table is left out and the others are renormalised.
+        prioritized: Whether to draw within a table in proportion to priorities instead of uniformly.
+        alpha: Exponent of the priorities.
+        beta: Exponent of the importance weights; may be changed while training.
+        eps: Added to priorities, so that none is 0.
+    """
+
+    def __init__(
+        self,
+        regions: Regions,
+        proportions: np.ndarray,
+        minimum: np.ndarray,
+        prioritized: bool = False,
+        alpha: float = 0.6,
+        beta: float = 0.4,
+        eps: float = 1e-8,
+    ) -> None:
+        if alpha < 0 or beta < 0 or eps <= 0:
+            raise ValueError(f"priority_alpha is {alpha}, priority_beta {beta}: expected numbers >= 0")
+        self.regions = regions
+        self.proportions = proportions
+        self.minimum = minimum
+        self.prioritized = prioritized
+        self.alpha = alpha
+        self.beta = beta
+        self.eps = eps
+        self._plans: dict[tuple[int, torch.device], tuple[int, _Plan]] = {}
+        self._tree: SumTree | None = None
+        self._largest: Tensor | None = None
+        self._pending_leaves: Tensor | None = None
+
+    def counts(self, batch_size: int) -> dict[str, int]:
+        """How many records of each table a batch holds at present.
+
+        Raises:
+            ValueError: If the buffer cannot fill such a batch.
+        """
+        return dict(zip(self.regions.names, self._allot(batch_size).tolist(), strict=True))
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
+        """Draws slots, grouped by table.
+
+        Returns:
+            Slots `(batch_size,)` and `{"table": (batch_size,)}`, with `priority_weight` if prioritised: `(n
+            P(i))^-beta`, n records and P(i) the probability within the table, divided by the largest of the batch.
+        """
+        device = getattr(storage, "device", None)
+        device = device if isinstance(device, torch.device) else torch.device("cpu")
+        plan = self._plan(batch_size, device)
+        # float64: a float32 draw reaches at most 2^24 different records.
+        uniform = torch.rand(batch_size, dtype=torch.float64, device=device, generator=self._rng)
+        info = {TABLE: plan.table.clone()}
+        if not self.prioritized:
+            return uniform.mul_(plan.size).long().add_(plan.offset), info
+        tree = self._tree_on(device)
+        slot = tree.draw(plan.table, uniform)
+        probability = tree.get(slot) / tree.totals[plan.table]
+        weight = (plan.size * probability).pow(-self.beta)
+        info["priority_weight"] = (weight / weight.max()).float()
+        return slot, info
+
+    def can_sample(self, storage: Storage, batch_size: int) -> bool:
+        """Whether a batch can be drawn."""
+        try:
+            self._allot(batch_size)
+        except ValueError:
+            return False
+        return True
+
+    def extend(self, index: Tensor) -> None:
+        """Gives new records the largest priority seen so far."""
+        if self.prioritized and len(index):
+            tree = self._tree_on(index.device)
+            tree.update(index, self._largest_priority(index.device).expand(len(index)))
+
+    def add(self, index: int | Tensor) -> None:
+        """Like `extend`, for one record."""
+        self.extend(torch.as_tensor(index).reshape(-1))
+
+    def update_priority(self, index: Any, priority: Any, *, storage: Storage | None = None) -> None:
+        """Sets priorities to `(|priority| + eps)^alpha`; of a slot given more than once the largest counts.
+
+        Args:
+            index: Slots of any shape.
+            priority: TD errors or the like, of that shape, possibly with further dimensions, over which the largest
+                counts.
+            storage: Not used.
+
+        Raises:
+            RuntimeError: If the sampler is not prioritised.
+        """
+        if not self.prioritized:
+            raise RuntimeError("this buffer draws uniformly within its tables: priorities need prioritized=True")
+        index = torch.as_tensor(index)
+        priority = torch.as_tensor(priority, device=index.device).detach().abs().double().add(self.eps)
+        priority = priority.expand(index.shape) if not priority.ndim else priority.reshape(*index.shape, -1).amax(-1)
+        priority = priority.pow(self.alpha)
+        tree = self._tree_on(index.device)
+        tree.update(index, priority)
+        self._largest = torch.maximum(self._largest_priority(index.device), priority.max())
+
+    def _allot(self, batch_size: int) -> np.ndarray:
+        return allot(batch_size, self.proportions, self.regions.sizes >= self.minimum)
+
+    def _plan(self, batch_size: int, device: torch.device) -> _Plan:
+        version, plan = self._plans.get((batch_size, device), (-1, None))
+        if plan is None or version != self.regions.version:
+            counts = self._allot(batch_size)
+            if plan is not None and np.array_equal(plan.counts, counts):
+                table = plan.table
+            else:
+                table = torch.from_numpy(np.repeat(np.arange(len(counts)), counts)).to(device)
+            columns = np.stack([self.regions.offsets, self.regions.sizes])[:, np.repeat(np.arange(len(counts)), counts)]
+            both = torch.from_numpy(columns).to(device)
+            plan = _Plan(counts, table, both[0], both[1].double())
+            self._plans[batch_size, device] = self.regions.version, plan
+        return plan
+
+    def _tree_on(self, device: torch.device) -> SumTree:
+        if self._tree is None:
+            self._tree = SumTree(self.regions.capacities, self.regions.offsets, device=device)
+            if self._pending_leaves is not None:
+                self._tree.load_leaves(self._pending_leaves.to(device))
+                self._pending_leaves = None
+        return self._tree
+
+    def _largest_priority(self, device: torch.device) -> Tensor:
+        if self._largest is None:
+            self._largest = torch.tensor(1.0, dtype=torch.float64, device=device)
+        return self._largest
+
+    def _empty(self) -> None:
+        self._plans.clear()
+        self._tree = self._largest = self._pending_leaves = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Priorities, if prioritised."""
+        if not self.prioritized:
+            return {}
+        tree = self._tree if self._tree is not None else self._tree_on(torch.device("cpu"))
+        return {"priorities": tree.leaves(), "largest": self._largest_priority(tree.device).clone(), "beta": self.beta}
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restores priorities.
+
+        Raises:
+            ValueError: If only one of the two samplers is prioritised.
+        """
+        if bool(state_dict) != self.prioritized:
+            raise ValueError(
+                f"the saved buffer was {'' if state_dict else 'not '}prioritised, this one is "
+                f"{'' if self.prioritized else 'not'}: give the same prioritized="
+            )
+        self._empty()
+        if state_dict:
+            self._pending_leaves = state_dict["priorities"].clone()
+            self._largest = state_dict["largest"].clone()
+            self.beta = state_dict["beta"]
+
+    def dumps(self, path: Any) -> None:
+        """Not used: `EventTableBuffer.dumps` saves the state dict."""
+        raise NotImplementedError("save the buffer (EventTableBuffer.dumps), not its sampler")
+
+    def loads(self, path: Any) -> None:
+        """Not used: `EventTableBuffer.loads` restores the state dict."""
+        raise NotImplementedError("load the buffer (EventTableBuffer.loads), not its sampler")
+
+    def __repr__(self) -> str:
+        shares = ", ".join(f"{n}={p:.3g}" for n, p in zip(self.regions.names, self.proportions, strict=True))
+        return f"StratifiedSampler({shares}, prioritized={self.prioritized})"

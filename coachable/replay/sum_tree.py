@@ -1,0 +1,135 @@
+"""Sum trees in pure torch, for proportional priorities (arXiv 1511.05952) on CPU and GPU.
+
+TorchRL's `PrioritizedSampler` needs a compiled extension that torch 2.13 cannot load. A wide tree costs few kernels:
+with 64 children per node, three levels serve 262 144 slots.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+__all__ = ["SumTree"]
+
+
+class SumTree:
+    """Priorities of the slots of several contiguous regions, and draws from a region in proportion to them.
+
+    Every region has a tree of its own inside the same tensors, so draws never leak into a neighbour and the rounding of
+    one region's sums does not depend on another's. All sums are float64 and are recomputed from the children they
+    belong to, so they neither drift nor count an index twice that is given twice.
+
+    Args:
+        capacities: Slots of each region.
+        offsets: First slot of each region.
+        fanout: Children per node.
+        device: Where the tree lives.
+
+    Examples:
+        >>> tree = SumTree([3], [0])
+        >>> tree.update(torch.tensor([0, 2]), torch.tensor([1.0, 3.0]))
+        >>> tree.totals.tolist()
+        [4.0]
+        >>> tree.draw(torch.tensor([0, 0]), torch.tensor([0.1, 0.9], dtype=torch.float64)).tolist()
+        [0, 2]
+    """
+
+    def __init__(
+        self,
+        capacities: Sequence[int] | np.ndarray,
+        offsets: Sequence[int] | np.ndarray,
+        fanout: int = 64,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        if fanout < 2:
+            raise ValueError(f"fanout is {fanout}: expected at least 2")
+        self.fanout = fanout
+        self.device = torch.device(device)
+        self.capacities = np.asarray(capacities, dtype=np.int64)
+        self.offsets = np.asarray(offsets, dtype=np.int64)
+        ascending = np.argsort(self.offsets)
+        self._region_at = torch.as_tensor(ascending, device=self.device)
+        self._boundaries = torch.as_tensor(self.offsets[ascending][1:], device=self.device)
+        self._offsets = torch.as_tensor(self.offsets, device=self.device)
+        # levels[l] has one row of children per node of level l + 1; the last level has one row per region.
+        self.levels: list[Tensor] = []
+        self._first_row: list[Tensor] = []
+        rows = self.capacities
+        while not self.levels or (rows > 1).any():
+            rows = -(-rows // fanout)
+            self.levels.append(torch.zeros(int(rows.sum()), fanout, dtype=torch.float64, device=self.device))
+            self._first_row.append(torch.as_tensor(np.cumsum(rows) - rows, device=self.device))
+
+    @property
+    def totals(self) -> Tensor:
+        """Sum of the priorities of each region, `(regions,)` float64."""
+        return self.levels[-1].sum(-1)
+
+    def update(self, slot: Tensor, priority: Tensor) -> None:
+        """Sets priorities.
+
+        Args:
+            slot: Slots of any shape, possibly repeated: the largest of the given priorities then counts.
+            priority: Non-negative, of the same shape.
+        """
+        slot = slot.reshape(-1).to(self.device)
+        priority = priority.detach().reshape(-1).to(self.device, torch.float64)
+        region, entry = self._locate(slot)
+        leaves = self.levels[0].view(-1)
+        leaves.index_fill_(0, entry, 0.0)
+        leaves.scatter_reduce_(0, entry, priority, "amax")
+        for level in range(len(self.levels) - 1):
+            row = entry.div(self.fanout, rounding_mode="floor")
+            entry = row - self._first_row[level][region] + self._first_row[level + 1][region] * self.fanout
+            self.levels[level + 1].view(-1)[entry] = self.levels[level][row].sum(-1)
+
+    def get(self, slot: Tensor) -> Tensor:
+        """Priorities of slots, float64 of the same shape."""
+        _, entry = self._locate(slot.to(self.device))
+        return self.levels[0].view(-1)[entry]
+
+    def draw(self, region: Tensor, uniform: Tensor) -> Tensor:
+        """Draws slots in proportion to their priority; a slot of priority 0 is never drawn.
+
+        Args:
+            region: `(draws,)` region of each draw, none of which may be all zero.
+            uniform: `(draws,)` float64 in [0, 1).
+
+        Returns:
+            `(draws,)` slots.
+        """
+        row = region
+        entry = region
+        for level in reversed(range(len(self.levels))):
+            children = self.levels[level][row]  # (draws, fanout)
+            upper = children.cumsum(-1)
+            total = upper[:, -1]
+            # u < 1, but u * total may round up to total, which belongs to no child.
+            target = torch.minimum(uniform * total, torch.nextafter(total, torch.zeros_like(total))).unsqueeze(-1)
+            child = torch.searchsorted(upper, target, right=True)
+            share = children.gather(-1, child)
+            below = upper.gather(-1, child) - share
+            # What is left of the number, stretched to [0, 1), decides among the grandchildren.
+            uniform = ((target - below) / share).clamp(0.0, 1.0 - 2.0**-53).squeeze(-1)
+            entry = (row - self._first_row[level][region]) * self.fanout + child.squeeze(-1)
+            if level:
+                row = self._first_row[level - 1][region] + entry
+        return self._offsets[region] + entry
+
+    def clear(self) -> None:
+        """Sets every priority to 0."""
+        for level in self.levels:
+            level.zero_()
+
+    def leaves(self) -> Tensor:
+        """All priorities by slot, float64 `(slots,)`: what a checkpoint has to keep."""
+        return self.get(torch.arange(int(self.capacities.sum()), device=self.device))
+
+    def load_leaves(self, leaves: Tensor) -> None:
+        """Restores what `leaves` returned."""
+        self.update(torch.arange(leaves.numel(), device=self.device), leaves)
+
+    def _locate(self, slot: Tensor) -> tuple[Tensor, Tensor]:
+        region = self._region_at[torch.bucketize(slot, self._boundaries, right=True)]
+        return region, self._first_row[0][region] * self.fanout + slot - self._offsets[region]

@@ -1,0 +1,215 @@
+"""Which steps an event sends to its table: windows that never reach back over the start of an episode."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from coachable.replay.steps import Episodes, Steps
+
+__all__ = ["Copies", "WindowHistory"]
+
+
+@dataclass
+class Copies:
+    """Steps to append to event tables, in the order in which they are appended."""
+
+    table: np.ndarray  # (copies,) event number
+    row: np.ndarray  # (copies,) row of the present batch, or -1
+    slot: np.ndarray  # (copies,) slot of the storage where row is -1, otherwise -1
+    serial: np.ndarray  # (copies,) serial number of that slot's record, to see whether it is still there
+
+
+class WindowHistory:
+    """Finds, for every event, the at most `horizon` steps up to it that its table does not hold yet.
+
+    The window is the event step and the `horizon - 1` steps before it (tau = H_max - 1 in SSET, Kompella 2023), cut at
+    the episode's start and at the previous event of the same table, whose window covered the rest. Between batches it
+    remembers, for every stream with an open episode, where the last `horizon - 1` steps are stored and when each event
+    last fired.
+
+    Args:
+        events: Number of event tables.
+        horizon: H_max.
+        patience: A stream of which nothing arrived for that many steps is forgotten, since its steps have left the
+            storage.
+    """
+
+    def __init__(self, events: int, horizon: int, patience: int = 2**62) -> None:
+        self.events = events
+        self.horizon = horizon
+        self.patience = patience
+        self.clear()
+
+    def clear(self) -> None:
+        """Forgets every open episode."""
+        self._allocate(1)
+
+    def __len__(self) -> int:
+        """Number of open episodes."""
+        return int((self.key >= 0).sum())
+
+    def update(self, steps: Steps, slot: np.ndarray, serial: np.ndarray) -> Copies:
+        """Takes in a batch.
+
+        Args:
+            steps: The batch.
+            slot: `(steps,)` where each step is going to be stored.
+            serial: `(steps,)` serial number of each record.
+
+        Returns:
+            What to append to the event tables: tables in order, within each by the time of the event, oldest step
+            first.
+        """
+        cut = steps.in_episodes()
+        first = np.flatnonzero(cut.first_of_stream)
+        known = self._find(cut.stream[first])
+        continues = (known >= 0) & ~steps.begins[cut.order[first]]
+
+        # Continued episodes: where they are kept, and how long they were before this batch.
+        kept = np.full(len(cut.start), -1)
+        kept[cut.number[first[continues]]] = known[continues]
+        before = np.where(kept >= 0, self.length[kept], 0)
+        position = np.arange(len(steps)) - cut.start[cut.number] + before[cut.number]
+
+        fired = steps.fired[cut.order]
+        table, at = np.nonzero(fired.T)  # by table, then by stream and time
+        copies = self._windows(cut, table, at, position, kept, before)
+        self._remember(cut, table, at, position, kept, known, first, slot, serial, steps)
+        return copies
+
+    def _windows(
+        self,
+        cut: Episodes,
+        table: np.ndarray,
+        at: np.ndarray,
+        position: np.ndarray,
+        kept: np.ndarray,
+        before: np.ndarray,
+    ) -> Copies:
+        place = kept[cut.number[at]]
+        previous = np.where(place >= 0, self.last_event[place, table], -1)
+        again = (table[1:] == table[:-1]) & (cut.number[at[1:]] == cut.number[at[:-1]])
+        previous[1:][again] = position[at[:-1]][again]
+        begin = np.maximum(position[at] - self.horizon + 1, previous + 1).clip(0)
+
+        by_time = np.lexsort((cut.order[at], table))
+        table, at, begin = table[by_time], at[by_time], begin[by_time]
+        count = position[at] - begin + 1
+        event = np.repeat(np.arange(len(at)), count)
+        wanted = begin[event] + np.arange(len(event)) - (np.cumsum(count) - count)[event]  # position in the episode
+        at = at[event]
+        episode = cut.number[at]
+        here = wanted >= before[episode]
+        row = np.full(len(event), -1)
+        row[here] = cut.order[(at - position[at] + wanted)[here]]
+        slot, serial = np.full(len(event), -1), np.full(len(event), -1)
+        if not here.all():
+            past = ~here
+            ring = wanted[past] % (self.horizon - 1)
+            slot[past] = self.slot[kept[episode[past]], ring]
+            serial[past] = self.serial[kept[episode[past]], ring]
+        return Copies(table[event], row, slot, serial)
+
+    def _remember(
+        self,
+        cut: Episodes,
+        table: np.ndarray,
+        at: np.ndarray,
+        position: np.ndarray,
+        kept: np.ndarray,
+        known: np.ndarray,
+        first: np.ndarray,
+        slot: np.ndarray,
+        serial: np.ndarray,
+        steps: Steps,
+    ) -> None:
+        streams = len(first)
+        stream_of = np.cumsum(cut.first_of_stream) - 1
+        last = np.append(first[1:] - 1, len(position) - 1)
+        episode = cut.number[last]  # the one that may go on
+        is_open = ~cut.ends[last]
+
+        closing = (known >= 0) & ~is_open
+        if closing.any():
+            self.key[known[closing]] = -1
+            self._sorted = None
+        place = np.where(is_open, known, -1)
+        self.arrival[place[place >= 0]] = steps.arrival.max()  # before `_open`, which looks for forgotten rows
+        fresh = is_open & (known < 0)
+        if fresh.any():
+            place[fresh] = self._open(cut.stream[first[fresh]], int(steps.arrival.max()))
+
+        latest = np.full((streams, self.events), -1)
+        going_on = kept[episode] >= 0
+        latest[going_on] = self.last_event[kept[episode[going_on]]]
+        current = cut.number[at] == episode[stream_of[at]]
+        np.maximum.at(latest, (stream_of[at[current]], table[current]), position[at[current]])
+
+        self.length[place[is_open]] = position[last[is_open]] + 1
+        self.last_event[place[is_open]] = latest[is_open]
+        if self.horizon > 1:
+            recent = is_open[stream_of] & (cut.number == episode[stream_of])
+            recent &= position > position[last[stream_of]] - (self.horizon - 1)
+            rows = np.flatnonzero(recent)
+            target = place[stream_of[rows]], position[rows] % (self.horizon - 1)
+            self.slot[target] = slot[cut.order[rows]]
+            self.serial[target] = serial[cut.order[rows]]
+
+    # Open episodes are rows of these arrays; a free row has key -1.
+
+    def _allocate(self, rows: int) -> None:
+        self.key = np.full(rows, -1)
+        self.length = np.zeros(rows, dtype=np.int64)
+        self.arrival = np.zeros(rows, dtype=np.int64)
+        self.last_event = np.full((rows, self.events), -1)
+        self.slot = np.full((rows, self.horizon - 1), -1)
+        self.serial = np.full((rows, self.horizon - 1), -1)
+        self._sorted: tuple[np.ndarray, np.ndarray] | None = None
+
+    def _find(self, key: np.ndarray) -> np.ndarray:
+        if self._sorted is None:
+            order = np.argsort(self.key)
+            self._sorted = order, self.key[order]
+        order, ascending = self._sorted
+        at = np.searchsorted(ascending, key).clip(max=len(ascending) - 1)
+        return np.where(ascending[at] == key, order[at], -1)
+
+    def _open(self, key: np.ndarray, now: int) -> np.ndarray:
+        self.key[self.arrival < now - self.patience] = -1
+        free = np.flatnonzero(self.key < 0)
+        if len(free) < len(key):
+            old = self.state_dict()
+            rows = len(self.key)
+            self._allocate(max(2 * rows, rows + len(key)))
+            for name, value in old.items():
+                getattr(self, name)[:rows] = value.numpy()
+            free = np.flatnonzero(self.key < 0)
+        place = free[: len(key)]
+        self.key[place] = key
+        self.arrival[place] = now
+        self._sorted = None
+        return place
+
+    def state_dict(self) -> dict[str, Any]:
+        """Open episodes as tensors."""
+        names = ("key", "length", "arrival", "last_event", "slot", "serial")
+        return {name: torch.from_numpy(getattr(self, name).copy()) for name in names}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores open episodes.
+
+        Raises:
+            ValueError: If the horizon or the number of event tables differs.
+        """
+        rows, events = state["last_event"].shape
+        horizon = state["slot"].shape[1] + 1
+        if (events, horizon) != (self.events, self.horizon):
+            raise ValueError(
+                f"the saved history has {events} event tables and event_horizon {horizon}, this buffer "
+                f"{self.events} and {self.horizon}: make it like the saved one"
+            )
+        self._allocate(rows)
+        for name, value in state.items():
+            getattr(self, name)[:] = value.cpu().numpy()

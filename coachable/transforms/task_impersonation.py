@@ -1,0 +1,175 @@
+"""`TaskImpersonation`: sampled transitions under further styles (paper, Task Impersonation)."""
+
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase, is_tensor_collection
+from torch import Tensor
+from torchrl.envs import Transform
+
+from coachable import keys
+from coachable.styles.reward import StyleReward
+from coachable.styles.samplers import Sampler
+from coachable.styles.space import StyleSpace
+
+
+class TaskImpersonation(Transform):
+    """Replay transform `[B]` to `[B, n+1]`: every transition with its own style and n freshly drawn ones.
+
+    Column 0 keeps the stored label and reward. Columns 1 to n get a style each, drawn independently for every
+    transition from the training distribution, and `reward = task_reward + style_reward(style_features, style)` by the
+    StyleReward that the environment uses. `style` and `("next", "style")` are both written; nothing else depends on the
+    style, and nothing is filtered, weighted or written back (paper). Everything else is expanded without a copy, so do
+    not write to it in place. With n = 0 the sample passes through untouched, and no random number is drawn.
+
+    TorchRL expands what a sample carries besides, `index`, `table` and `priority_weight`, over the columns, and a
+    priority update takes the largest over a transition's columns (`EventTableBuffer`, or the default reduction of
+    TorchRL's own buffers).
+
+    Of n-step transitions only style rewards that are linear in the features can be relabelled: let the buffer sum the
+    features too (`discounted_keys` of `EventTableBuffer`).
+
+    Args:
+        style_reward: The only code that computes style rewards, the environment's own object.
+        space: Source of styles; the one of `style_reward` if None.
+        n: Further styles per transition (paper: 4).
+        sampler: Distribution of styles if not the one the space trains with.
+        seed: Of the transform's own generator, whose state is in the state dict.
+        style_key: Key of the raw theta, here and in `next`.
+        features_key: Key of the features in `next`.
+        task_reward_key: Key of the task reward in `next`.
+        reward_key: Key of the reward in `next`.
+        style_reward_key: Key of the style part in `next`; kept up to date if the data has it.
+
+    Raises:
+        ValueError: If n is negative, or the sampler draws styles of another size.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from coachable.styles import Weight, WeightedFeature
+        >>> space = StyleSpace([Weight("fuel", 0.0, 1.0)])
+        >>> relabel = TaskImpersonation(StyleReward(space, {"fuel": WeightedFeature("fuel", 0)}), n=2)
+        >>> one = torch.ones(8, 1)
+        >>> nxt = {"task_reward": one, "style_features": one, "reward": 2 * one, "style": one}
+        >>> batch = relabel(TensorDict({"style": one, "next": nxt}, [8]))
+        >>> batch.shape, bool((batch["next", "reward"] == 1 + batch["style"]).all())
+        (torch.Size([8, 3]), True)
+    """
+
+    def __init__(
+        self,
+        style_reward: StyleReward,
+        space: StyleSpace | None = None,
+        n: int = 4,
+        sampler: Sampler | None = None,
+        seed: int = 0,
+        style_key: NestedKey = keys.STYLE,
+        features_key: NestedKey = keys.STYLE_FEATURES,
+        task_reward_key: NestedKey = keys.TASK_REWARD,
+        reward_key: NestedKey = "reward",
+        style_reward_key: NestedKey = keys.STYLE_REWARD,
+    ) -> None:
+        super().__init__(in_keys=[], out_keys=[])
+        if isinstance(n, bool) or not isinstance(n, int) or n < 0:
+            raise ValueError(f"TaskImpersonation got n = {n!r}: expected the number of further styles, 0 or more")
+        self.style_reward = style_reward
+        self.space = style_reward.space if space is None else space
+        self.n = n
+        self.sampler = self.space.sampler if sampler is None else sampler
+        if self.sampler.dim != self.space.dim:
+            raise ValueError(
+                f"the sampler of TaskImpersonation draws styles of {self.sampler.dim} numbers: expected "
+                f"{self.space.dim} ({', '.join(self.space.names)})"
+            )
+        self.style_key = style_key
+        self.next_style_key = _in_next(style_key)
+        self.features_key = _in_next(features_key)
+        self.task_reward_key = _in_next(task_reward_key)
+        self.reward_key = _in_next(reward_key)
+        self.style_reward_key = _in_next(style_reward_key)
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def set_seed(self, seed: int) -> None:
+        """Restarts the transform's generator."""
+        self.generator.manual_seed(seed)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Relabels a sample.
+
+        Args:
+            tensordict: `[...]`, transitions with the style, features and task reward.
+
+        Returns:
+            `[..., n+1]`, a new tensordict; the input itself for n = 0.
+
+        Raises:
+            KeyError: If an entry is missing.
+            ValueError: If the stored style has another size than the space.
+        """
+        if not self.n:
+            return tensordict
+        stored, features, task_reward, reward = self._entries(tensordict)
+        shape = tensordict.batch_size
+        drawn = self.sampler.sample((*shape, self.n), self.generator, stored.device)
+        dim = len(shape)
+        features = features.unsqueeze(dim)
+        features = features.expand(*shape, self.n, *features.shape[dim + 1 :])
+        style_reward = self.style_reward(features, drawn)
+
+        columns = self.n + 1
+        out = tensordict.apply(
+            lambda x: x.unsqueeze(dim).expand(*shape, columns, *x.shape[dim:]), batch_size=[*shape, columns]
+        )
+        assert out is not None  # only an in-place apply returns nothing
+        out.set(self.style_key, torch.cat([stored.unsqueeze(dim), drawn], dim))
+        following = tensordict.get(self.next_style_key, None)
+        following = stored if following is None else following
+        out.set(self.next_style_key, torch.cat([following.unsqueeze(dim), drawn], dim))
+        relabelled = task_reward.unsqueeze(dim) + style_reward
+        out.set(self.reward_key, torch.cat([reward.unsqueeze(dim), relabelled], dim))
+        logged = tensordict.get(self.style_reward_key, None)
+        if logged is not None:
+            out.set(self.style_reward_key, torch.cat([logged.unsqueeze(dim), style_reward], dim))
+        return out
+
+    def _entries(self, tensordict: TensorDictBase) -> tuple[Tensor, Any, Tensor, Tensor]:
+        wanted = (self.style_key, self.features_key, self.task_reward_key, self.reward_key)
+        found = [tensordict.get(key, None) for key in wanted]
+        missing = [key for key, value in zip(wanted, found, strict=True) if value is None]
+        if missing:
+            raise KeyError(
+                f"TaskImpersonation found no {', '.join(map(repr, missing))} in the sample: store them, or name yours "
+                "in its arguments. An n-step buffer keeps features only if discounted_keys lists them."
+            )
+        stored, features, task_reward, reward = found
+        if stored.shape[-1] != self.space.dim:
+            raise ValueError(
+                f"the sampled {self.style_key!r} has shape {tuple(stored.shape)}: expected {self.space.dim} numbers "
+                f"({', '.join(self.space.names)}). Give TaskImpersonation the space that the data was collected with."
+            )
+        if is_tensor_collection(features) and features.batch_size != tensordict.batch_size:
+            features = features.copy()
+            features.batch_size = tensordict.batch_size
+        return stored, features, task_reward, reward
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        raise RuntimeError(
+            "TaskImpersonation relabels replay samples: give it to a replay buffer (transform= or append_transform), "
+            "not to an environment"
+        )
+
+    def get_extra_state(self) -> dict[str, Tensor]:
+        """State of the generator, part of the state dict."""
+        return {"generator": self.generator.get_state()}
+
+    def set_extra_state(self, state: dict[str, Tensor]) -> None:
+        """Restores the generator."""
+        self.generator.set_state(state["generator"].cpu().clone())
+
+    def extra_repr(self) -> str:
+        """Number of styles per transition."""
+        return f"n={self.n}"
+
+
+def _in_next(key: NestedKey) -> NestedKey:
+    return ("next", *((key,) if isinstance(key, str) else key))

@@ -1,0 +1,207 @@
+"""Saving and restoring: a resumed buffer goes on as if it had never stopped."""
+
+import pickle
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.checkpoint import Checkpoint
+from torchrl.data import LazyMemmapStorage
+
+from coachable.replay import EventTableBuffer, KeyEvents, KeyRoute
+from coachable.styles import StyleReward, StyleSpace, Weight, WeightedFeature
+from coachable.transforms import TaskImpersonation
+
+SPACE = StyleSpace([Weight("a", -1.0, 1.0)])
+REWARD = StyleReward(SPACE, {"a": WeightedFeature("a", 0)})
+
+
+def make(n_steps: int = 1, prioritized: bool = False, relabel: bool = False, **kwargs) -> EventTableBuffer:
+    return EventTableBuffer(
+        {"x": 120, "y": 120, "hit": 15, "miss": 40},
+        events=KeyEvents(["hit", "miss"]),
+        event_horizon=4,
+        route=KeyRoute(["x", "y"]),
+        num_envs=3,
+        n_steps=n_steps,
+        gamma=0.9 if n_steps > 1 else None,
+        prioritized=prioritized,
+        discounted_keys=[("next", "style_features")],
+        batch_size=24,
+        generator=torch.Generator().manual_seed(5),
+        transform=TaskImpersonation(REWARD, n=2, seed=3) if relabel else None,
+        **kwargs,
+    )
+
+
+def batch(seed: int, time: int = 5) -> TensorDict:
+    g = torch.Generator().manual_seed(seed)
+    n = 3 * time
+    style, task, features = torch.rand(n, 1, generator=g), torch.rand(n, 1, generator=g), torch.rand(n, 1, generator=g)
+    terminated = torch.rand(n, 1, generator=g) < 0.05
+    return TensorDict(
+        {
+            "id": 1000 * seed + torch.arange(n),
+            "style": style,
+            "scenario": torch.randint(2, (n,), generator=g),
+            "next": {
+                "task_reward": task,
+                "style_features": features,
+                "reward": task + style * features,
+                "terminated": terminated,
+                "done": terminated | (torch.rand(n, 1, generator=g) < 0.05),
+                "events": torch.rand(n, 2, generator=g) < 0.1,
+            },
+        },
+        [n],
+    )
+
+
+def use(buffer: EventTableBuffer, start: int, stop: int) -> list[TensorDict]:
+    """Extends, samples and updates priorities, as a training does."""
+    samples = []
+    for seed in range(start, stop):
+        buffer.extend(batch(seed), worker=seed % 2)
+        samples.append(buffer.sample())
+        if buffer.sampler.prioritized:
+            samples[-1]["td_error"] = samples[-1]["next", "reward"].squeeze(-1)
+            buffer.update_tensordict_priority(samples[-1])
+    return samples
+
+
+def assert_same(one: EventTableBuffer, other: EventTableBuffer) -> None:
+    assert one.statistics() == other.statistics() and len(one) == len(other) and one.write_count == other.write_count
+    for name in one.names:
+        if one.statistics()[name]["size"]:
+            a, b = one.table(name), other.table(name)
+            assert set(a.keys(True)) == set(b.keys(True)) and (a == b).all()
+
+
+def by_state_dict(saved, fresh, folder):
+    fresh.load_state_dict(saved.state_dict())
+
+
+def by_torch_file(saved, fresh, folder):
+    torch.save(saved.state_dict(), folder / "replay.pt")
+    fresh.load_state_dict(torch.load(folder / "replay.pt", weights_only=True))
+
+
+def by_dumps(saved, fresh, folder):
+    saved.dumps(folder / "replay")
+    fresh.loads(folder / "replay")
+
+
+def by_checkpoint(saved, fresh, folder):
+    Checkpoint(replay=saved).save(folder / "checkpoint")
+    Checkpoint(replay=fresh).load(folder / "checkpoint")
+
+
+@pytest.mark.parametrize("way", [by_state_dict, by_torch_file, by_dumps, by_checkpoint])
+@pytest.mark.parametrize(
+    "kwargs",
+    [{}, {"n_steps": 4}, {"prioritized": True}, {"n_steps": 3, "prioritized": True, "relabel": True}],
+    ids=["plain", "n-step", "prioritised", "all"],
+)
+@pytest.mark.parametrize("before", [2, 30], ids=["filling", "full"])
+def test_resumed_equals_uninterrupted(way, kwargs, before, tmp_path):
+    saved = make(**kwargs)
+    use(saved, 0, before)
+    resumed = make(**kwargs)
+    way(saved, resumed, tmp_path)
+    assert_same(saved, resumed)
+    after = before + 6
+    for a, b in zip(use(saved, before, after), use(resumed, before, after), strict=True):
+        assert set(a.keys(True)) == set(b.keys(True)) and (a == b).all()
+    assert_same(saved, resumed)
+    saved.finish(), resumed.finish()
+    assert_same(saved, resumed)
+
+
+@pytest.mark.parametrize("way", [by_state_dict, by_dumps])
+def test_a_buffer_in_use_can_be_restored_to_another_state(way, tmp_path):
+    saved, used = make(n_steps=3), make(n_steps=3)
+    use(saved, 0, 5)
+    use(used, 50, 70)
+    way(saved, used, tmp_path)
+    assert_same(saved, used)
+    use(saved, 5, 9), use(used, 5, 9)
+    assert_same(saved, used)
+
+
+def test_a_loaded_buffer_shares_no_memory_with_what_it_was_loaded_from(tmp_path):
+    saved, other = make(n_steps=3), make(n_steps=3)
+    use(saved, 0, 3)
+    kept = {name: saved.table(name).clone() for name in saved.names if saved.statistics()[name]["size"]}
+    other.load_state_dict(saved.state_dict())
+    use(other, 100, 160)
+    assert all((saved.table(name) == table).all() for name, table in kept.items())
+    saved.dumps(tmp_path / "a")
+    twin = make(n_steps=3)
+    twin.loads(tmp_path / "a")
+    use(twin, 100, 160)
+    again = make(n_steps=3)
+    again.loads(tmp_path / "a")
+    assert_same(again, saved)
+
+
+@pytest.mark.parametrize("way", [by_state_dict, by_dumps])
+def test_an_empty_buffer_round_trips(way, tmp_path):
+    saved, fresh = make(n_steps=3, relabel=True), make(n_steps=3, relabel=True)
+    way(saved, fresh, tmp_path)
+    for a, b in zip(use(saved, 0, 3), use(fresh, 0, 3), strict=True):
+        assert (a == b).all()
+
+
+def test_folders_hold_no_pickle(tmp_path, monkeypatch):
+    saved = make(n_steps=3, prioritized=True, relabel=True)
+    use(saved, 0, 4)
+
+    def refuse(*args, **kwargs):
+        raise AssertionError("pickle was used")
+
+    for module, names in [(pickle, ("dump", "dumps", "load", "loads")), (torch, ("save", "load"))]:
+        for name in names:
+            monkeypatch.setattr(module, name, refuse)
+    saved.dumps(tmp_path / "replay")
+    fresh = make(n_steps=3, prioritized=True, relabel=True)
+    fresh.loads(tmp_path / "replay")
+    assert_same(saved, fresh)
+
+
+def test_dumping_twice_into_one_folder(tmp_path):
+    saved = make(n_steps=3)
+    use(saved, 0, 3)
+    saved.dumps(tmp_path / "replay")
+    use(saved, 3, 9)
+    saved.finish()
+    saved.dumps(tmp_path / "replay")
+    fresh = make(n_steps=3)
+    fresh.loads(tmp_path / "replay")
+    assert_same(saved, fresh)
+
+
+def test_other_tables_are_refused():
+    saved = make()
+    use(saved, 0, 2)
+    other = EventTableBuffer({"x": 120, "y": 90}, route=KeyRoute(["x", "y"]))
+    with pytest.raises(ValueError, match="same table_capacities"):
+        other.load_state_dict(saved.state_dict())
+    with pytest.raises(ValueError, match="prioritized"):
+        make(prioritized=True).load_state_dict(saved.state_dict())
+    longer = EventTableBuffer(
+        {"x": 120, "y": 120, "hit": 15, "miss": 40},
+        events=KeyEvents(["hit", "miss"]),
+        event_horizon=5,
+        route=KeyRoute(["x", "y"]),
+    )
+    with pytest.raises(ValueError, match="event_horizon 4"):
+        longer.load_state_dict(saved.state_dict())
+
+
+def test_memory_mapped_storage(tmp_path):
+    saved = make(storage=LazyMemmapStorage)
+    use(saved, 0, 4)
+    saved.dumps(tmp_path / "replay")
+    fresh = make(storage=LazyMemmapStorage)
+    fresh.loads(tmp_path / "replay")
+    assert_same(saved, fresh)
