@@ -26,7 +26,7 @@ from coachable.training.loop import REPLAY_KEYS, Train
 from coachable.training.replay_files import replay_bytes
 from coachable.training.rng import seed_everything
 from coachable.training.weights import agent_state, initialise_from
-from coachable.transforms import CoachableEnv, coachable_env
+from coachable.transforms import CoachableEnv, TaskImpersonation, coachable_env
 
 
 def build(config: dict[str, Any]) -> Train:
@@ -69,6 +69,8 @@ def build(config: dict[str, Any]) -> Train:
 
     # Replay and collector
     replay = make(config["replay"])()
+    if config["impersonation"]["n"]:
+        replay.append_transform(TaskImpersonation(style_reward, seed=config["seed"], **config["impersonation"]))
     if config["checkpoint"]["replay"]:  # two at a time: the old one is removed when the new one is complete
         check_writable(run_dir, required_bytes=2 * replay_bytes(probe, REPLAY_KEYS, config["replay_capacity"]))
     collector = make(config["collector"])(

@@ -27,6 +27,21 @@ GROUPS = {folder.name: sorted(f.stem for f in folder.glob("*.yaml")) for folder 
 # What a checkpoint decides: its weights, its replay buffer and its generators belong to these values.
 _FIXED = ("domain", "seed", "network", "loss", "gamma", "style_reward", "replay", "replay_capacity", "init_from")
 
+# Options of Hydra that are followed by a value.
+_VALUED = (
+    "--cfg",
+    "-c",
+    "--package",
+    "-p",
+    "--config-path",
+    "-cp",
+    "--config-name",
+    "-cn",
+    "--config-dir",
+    "-cd",
+    "--info",
+)
+
 
 def run_recipe(config_name: str, train: Callable[[dict[str, Any]], Any]) -> None:
     """Runs a recipe from the command line.
@@ -79,7 +94,7 @@ def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
         SystemExit: naming what is misspelt or of a wrong type, and the valid choices.
     """
     try:
-        overrides = OverridesParser.create().parse_overrides([a for a in arguments if not a.startswith("-")])
+        overrides = OverridesParser.create().parse_overrides(_without_options(arguments))
     except HydraException as error:
         raise SystemExit(f"error: {error}\nexpected KEY=VALUE, for example loss=sac or train.batch_size=256") from None
     chosen = {
@@ -175,6 +190,12 @@ def _same_kind(default: Any, value: Any) -> bool:
     if OmegaConf.is_list(default):
         return isinstance(value, list)
     return isinstance(value, dict)
+
+
+def _without_options(arguments: list[str]) -> list[str]:
+    """Leaves out Hydra's own options, such as `--cfg job`, with their values."""
+    before = ["", *arguments[:-1]]
+    return [a for a, b in zip(arguments, before, strict=True) if not a.startswith("-") and b not in _VALUED]
 
 
 def _choices(given: str, valid: list[str]) -> str:

@@ -1,0 +1,141 @@
+"""The `coachable` command. Each sub-command imports what it needs only when it runs."""
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+__all__ = ["main"]
+
+_SOURCE_HELP = "a run's folder, a checkpoint, a weights file, or a domain that ships with weights"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command line.
+
+    Args:
+        arguments: without the program's name; `sys.argv` by default.
+
+    Returns:
+        The exit status: 0, 1 where a check failed, 2 for something that the user has to change.
+    """
+    options = _parser().parse_args(arguments)
+    run: Callable[[argparse.Namespace], int] = options.run
+    try:
+        return run(options)
+    except (ValueError, ImportError, OSError) as error:
+        print(f"coachable {options.command}: {error}", file=sys.stderr)
+        return 2
+    except RuntimeError as error:
+        from coachable.training.checkpoint import CheckpointError
+
+        if not isinstance(error, CheckpointError):
+            raise
+        print(f"coachable {options.command}: {error}", file=sys.stderr)
+        return 2
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="coachable", description="Train one agent, coach it while it acts.")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    evaluate = commands.add_parser("evaluate", help="measure every style of an agent: tables and a figure")
+    evaluate.add_argument("source", help=_SOURCE_HELP)
+    evaluate.add_argument("--out", type=Path, default=Path("evaluation"), help="folder (default: %(default)s)")
+    evaluate.add_argument("--episodes", type=int, default=20, help="per style (default: %(default)s)")
+    evaluate.add_argument(
+        "--switch-episodes", type=int, default=60, help="with switching styles (default: %(default)s)"
+    )
+    evaluate.add_argument("--steps", type=int, help="length of an episode (default: the domain's)")
+    evaluate.add_argument("--seed", type=int, default=0)
+    evaluate.add_argument("--threads", type=int, dest="num_threads", help="physics threads (default: all free cores)")
+    evaluate.set_defaults(run=_evaluate)
+
+    render = commands.add_parser("render", help="film an agent whose style is switched while it acts")
+    render.add_argument("source", help=_SOURCE_HELP)
+    render.add_argument("--out", type=Path, default=Path("coachable.mp4"), help=".mp4, .gif or .png (%(default)s)")
+    render.add_argument(
+        "--style",
+        action="append",
+        type=_style,
+        dest="styles",
+        metavar="NAME=VALUE,...",
+        help="one request, such as pose=t_pose,step_length=0.5; repeat it to switch (default: a tour of the styles)",
+    )
+    render.add_argument("--seconds", type=float, default=4.0, dest="seconds_per_style", help="per style (%(default)s)")
+    render.add_argument("--size", type=_size, default=(640, 480), metavar="WIDTHxHEIGHT")
+    render.add_argument("--seed", type=int, default=0)
+    render.set_defaults(run=_render)
+
+    weights = commands.add_parser("weights", help="write the small weights file of a checkpoint")
+    weights.add_argument("source", help="a run's folder or a checkpoint")
+    weights.add_argument("out", type=Path, help="the file, such as coachable/pretrained/humanoid/weights.pt")
+    weights.set_defaults(run=_weights)
+
+    doctor = commands.add_parser("doctor", help="check this installation and say what it can do")
+    doctor.set_defaults(run=_doctor)
+    return parser
+
+
+def _evaluate(options: argparse.Namespace) -> int:
+    from coachable.evaluation.evaluate import evaluate
+
+    print(evaluate(options.source, **_arguments(options, without=("source",))))
+    return 0
+
+
+def _render(options: argparse.Namespace) -> int:
+    from coachable.gl import choose_gl_backend
+
+    choose_gl_backend()  # before MuJoCo is imported
+    from coachable.evaluation.video import render
+
+    print(f"wrote {render(options.source, **_arguments(options, without=('source',)))}")
+    return 0
+
+
+def _weights(options: argparse.Namespace) -> int:
+    from coachable.training.weights import export_weights
+
+    file = export_weights(options.source, options.out)
+    print(f"wrote {file} ({file.stat().st_size / 1e6:.1f} MB)")
+    return 0
+
+
+def _doctor(_options: argparse.Namespace) -> int:
+    from coachable.doctor import examine
+
+    checks = examine()
+    for check in checks:
+        print(f"{check.verdict:<7} {check.name:<10} {check.finding}")
+    return 1 if any(check.verdict == "problem" for check in checks) else 0
+
+
+def _arguments(options: argparse.Namespace, without: Sequence[str] = ()) -> dict[str, Any]:
+    return {name: value for name, value in vars(options).items() if name not in ("run", "command", *without)}
+
+
+def _style(text: str) -> dict[str, Any]:
+    style: dict[str, Any] = {}
+    for part in text.split(","):
+        name, equals, value = part.partition("=")
+        if not equals:
+            raise argparse.ArgumentTypeError(f"{part!r} is no NAME=VALUE")
+        try:
+            style[name.strip()] = float(value)
+        except ValueError:
+            style[name.strip()] = value.strip()
+    return style
+
+
+def _size(text: str) -> tuple[int, int]:
+    try:
+        width, height = map(int, text.lower().split("x"))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no WIDTHxHEIGHT, such as 640x480") from None
+    return width, height
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,119 @@
+"""`coachable doctor`: whether this installation is sound, and what this machine offers."""
+
+import os
+import platform
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import metadata
+from typing import Literal
+
+__all__ = ["Check", "examine"]
+
+Verdict = Literal["ok", "note", "problem"]
+_SHOWN = ("torch", "torchrl", "tensordict", "mujoco", "dm_control", "numpy", "hydra-core", "wandb")
+_EXTRAS = {"ui": ("viser", "mjviser"), "video": ("av",), "export": ("onnx", "onnxruntime"), "explain": ("captum",)}
+
+
+@dataclass(frozen=True)
+class Check:
+    """One finding.
+
+    Attributes:
+        name: what was looked at.
+        verdict: "ok", "note" (works, but good to know) or "problem" (to be changed).
+        finding: one sentence, with the remedy where one is needed.
+    """
+
+    name: str
+    verdict: Verdict
+    finding: str
+
+
+def examine() -> list[Check]:
+    """Looks at versions, MuJoCo, rendering, precision, threads and extras.
+
+    Returns:
+        The findings; nothing is changed.
+    """
+    parts: tuple[Callable[[], list[Check]], ...] = (_versions, _mujoco, _rendering, _hardware, _extras)
+    return [check for part in parts for check in part()]
+
+
+def installed(name: str) -> str | None:
+    """Version of an installed distribution, or None."""
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _versions() -> list[Check]:
+    checks = [Check("python", "ok", f"{platform.python_version()} on {platform.system()} {platform.machine()}")]
+    for name in _SHOWN:
+        version = installed(name)
+        verdict, finding = (
+            ("ok", version) if version else ("problem", "missing: pip install -e . in a fresh environment")
+        )
+        checks.append(Check(name, verdict, finding))
+    return checks
+
+
+def _mujoco() -> list[Check]:
+    """An in-place downgrade from MuJoCo 4 leaves files of mujoco-core 4 in the same folder."""
+    mujoco, core = installed("mujoco"), installed("mujoco-core")
+    if mujoco and core and _major(mujoco) < 4:
+        return [
+            Check(
+                "mujoco",
+                "problem",
+                f"mujoco-core {core} lies beside mujoco {mujoco}, in the same folder: make a fresh virtual environment",
+            )
+        ]
+    if mujoco and _major(mujoco) >= 4:
+        return [Check("mujoco", "problem", f"{mujoco} breaks dm_control: pip install 'mujoco>=3.17,<4' afresh")]
+    return []
+
+
+def _rendering() -> list[Check]:
+    from coachable.gl import INSTALL_HINT, NO_BACKEND, choose_gl_backend
+
+    before = os.environ.get("MUJOCO_GL")
+    backend = choose_gl_backend()
+    if before is None:
+        os.environ.pop("MUJOCO_GL", None)
+    if backend == NO_BACKEND:
+        return [Check("rendering", "note", f"training works, videos do not: {INSTALL_HINT}")]
+    return [Check("rendering", "ok", f"MUJOCO_GL={backend}" + (" (set by you)" if before else ""))]
+
+
+def _hardware() -> list[Check]:
+    if installed("torch") is None or installed("torchrl") is None:
+        return []
+    from coachable.training.hardware import choose_preset, detect, share_threads
+
+    hardware = detect()
+    threads = share_threads(hardware=hardware)
+    slow = "" if hardware.bf16 else "; without bf16 in hardware an update takes two to three times as long"
+    checks = [
+        Check("hardware", "ok" if hardware.bf16 else "note", hardware.describe() + slow),
+        Check("preset", "ok", f"{choose_preset(hardware)} (what preset=auto chooses)"),
+        Check("threads", "ok", f"simulator {threads.simulator}, learner {threads.learner} (set threads.* to change)"),
+    ]
+    limit = os.environ.get("OMP_NUM_THREADS", "")
+    if limit.isdigit() and int(limit) > hardware.cores:
+        finding = f"OMP_NUM_THREADS={limit} exceeds the {hardware.cores} cores: updates become many times slower"
+        checks.append(Check("threads", "problem", finding))
+    return checks
+
+
+def _extras() -> list[Check]:
+    checks = []
+    for extra, names in _EXTRAS.items():
+        missing = [name for name in names if installed(name) is None]
+        finding = f"not installed ({', '.join(missing)}): pip install -e '.[{extra}]'" if missing else "installed"
+        checks.append(Check(f"[{extra}]", "note" if missing else "ok", finding))
+    return checks
+
+
+def _major(version: str) -> int:
+    return int(version.split(".")[0])

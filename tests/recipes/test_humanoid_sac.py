@@ -1,0 +1,176 @@
+"""The humanoid recipe: its configuration, its errors, and a short run of every part."""
+
+import csv
+import inspect
+import json
+import subprocess
+import sys
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+import torch
+from recipe_config import GROUPS, checked_arguments, compose_config
+
+from coachable.envs.humanoid import HumanoidEnv, humanoid_style_reward
+from coachable.training import Learner
+from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
+from coachable.training.loop import TrainSettings
+from coachable.training.weights import load_policy
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+RECIPE = REPOSITORY / "recipes" / "humanoid_sac.py"
+TINY = ["preset=smoke", "env.num_envs=2", "threads.simulator=1", "threads.learner=1", "train.eval_interval=0"]
+TINY += ["init_random_frames=8", "train.warmup_frames=8", "train.batch_size=8", "eval.max_steps=5"]
+
+
+def _compose(*arguments):
+    return compose_config("humanoid_sac", list(arguments))
+
+
+def _run(run_dir, *arguments):
+    import humanoid_sac
+
+    train = humanoid_sac.build(_compose(*TINY, f"run_dir={run_dir}", *arguments))
+    train.run()
+    return train
+
+
+def _resume(run_dir, *arguments):
+    import humanoid_sac
+
+    train = humanoid_sac.build(_compose(f"resume={run_dir}", *arguments))
+    train.run()
+    return train
+
+
+@pytest.mark.parametrize("group, choice", [(g, c) for g, choices in GROUPS.items() for c in choices])
+def test_every_choice_composes(group, choice):
+    config = _compose(f"{group}={choice}")
+    assert config["domain"] == "humanoid"
+    assert config["preset"] in ("cpu", "gpu", "paper", "smoke"), "auto was replaced by what it chose"
+
+
+def test_the_paper_preset_is_the_papers():
+    config = _compose("preset=paper")
+    assert config["gamma"] == 0.99 and config["replay_capacity"] == 750_000
+    assert config["learner"]["actor_lr"] == config["learner"]["critic_lr"] == 1e-4
+    assert config["learner"]["update_order"] == "simultaneous"
+    assert config["loss"]["alpha_init"] == 0.01 and config["loss"]["fixed_alpha"] is True
+    assert config["train"]["warmup_frames"] == 15_000 and config["train"]["throttle"] == 60
+    assert config["network"]["actor"]["widths"] == config["network"]["critic"]["widths"] == [512, 512, 512]
+
+
+def test_the_configuration_lists_what_its_targets_take():
+    """Every key is an argument of what it configures, and the style rewards' values are the library's defaults."""
+    config = _compose("preset=cpu")
+    defaults = {
+        name: parameter.default
+        for name, parameter in inspect.signature(humanoid_style_reward).parameters.items()
+        if name != "space"
+    }
+    assert config["style_reward"] == defaults
+    assert set(config["train"]) - {"_target_"} == {field.name for field in fields(TrainSettings)}
+    assert set(config["learner"]) - {"_target_"} <= set(inspect.signature(Learner).parameters)
+    assert set(config["env"]) - {"_target_"} <= set(inspect.signature(HumanoidEnv.__init__).parameters)
+
+
+@pytest.mark.parametrize(
+    "argument, message",
+    [
+        ("los=sac", r"los does not exist.*Did you mean loss\?"),
+        ("loss=sacc", r"loss=sacc does not exist\. Did you mean sac\? Valid: .*sac"),
+        ("preset=fast", r"preset=fast does not exist\. Valid: auto, cpu, gpu, paper, smoke"),
+        ("train.batchsize=3", r"train has no 'batchsize'\. Did you mean batch_size\? Valid: .*total_frames"),
+        ("train.batch_size=many", r"wrong type: expected a whole number \(it is 256 by default\)"),
+        ("train.batch_size=1.5", r"wrong type: expected a whole number"),
+        ("learner.compile=2", r"wrong type: expected true or false"),
+        ("learner.actor_lr=fast", r"wrong type: expected a number"),
+        ("network.actor.widths=512", r"wrong type: expected a list"),
+        ("gamma.x=1", r"gamma has no 'x'"),
+        ("train.batch_size", r"expected KEY=VALUE"),
+    ],
+)
+def test_mistakes_are_named_with_the_valid_choices(argument, message):
+    with pytest.raises(SystemExit, match=message):
+        _compose(argument)
+
+
+def test_hydras_options_pass_through():
+    arguments = checked_arguments("humanoid_sac", ["--cfg", "job", "preset=cpu", "train.total_frames=1e6"])
+    assert arguments == ["--cfg", "job", "preset=cpu", "train.total_frames=1e6"]
+    assert _compose("+note=mine")["note"] == "mine"
+
+
+@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # torch tensors in numpy.array
+def test_resumed_runs_equal_uninterrupted_ones(tmp_path):
+    """Bit for bit on one thread, the physics of the running episodes included."""
+    _run(tmp_path / "whole", "train.total_frames=120")
+    _run(tmp_path / "half", "train.total_frames=60")
+    _resume(tmp_path / "half", "train.total_frames=120")
+    states = [read_state(find_checkpoint(tmp_path / name)) for name in ("whole", "half")]
+    updates = {state["learner"]["updates"] for state in states}
+    assert updates == {(120 - 8) // 8}
+    for part in ("learner", "collector", "rng", "loop"):
+        _assert_equal(states[0][part], states[1][part], part)
+
+
+def _assert_equal(a, b, where):
+    if isinstance(a, dict):
+        assert a.keys() == b.keys(), where
+        for key in a:
+            _assert_equal(a[key], b[key], f"{where}.{key}")
+    elif isinstance(a, torch.Tensor):
+        assert torch.equal(a, b), where
+    else:
+        assert a == b, where
+
+
+def test_a_resumed_run_keeps_its_configuration(tmp_path):
+    _run(tmp_path / "run", "train.total_frames=24", "learner.tau=0.5")
+    config = _compose(f"resume={tmp_path / 'run'}", "train.total_frames=32", "learner.actor_lr=1e-5")
+    assert config["preset"] == "smoke" and config["learner"]["tau"] == 0.5
+    assert config["train"]["total_frames"] == 32 and config["learner"]["actor_lr"] == 1e-5
+    assert config["run_dir"] == str(tmp_path / "run")
+    with pytest.raises(SystemExit, match=r"gamma cannot change in a resumed run: start a new one with init_from="):
+        _compose(f"resume={tmp_path / 'run'}", "gamma=0.9")
+    with pytest.raises(SystemExit, match="a resumed run keeps its preset"):
+        _compose(f"resume={tmp_path / 'run'}", "preset=cpu")
+    with pytest.raises(CheckpointError, match="no checkpoint at"):
+        _compose(f"resume={tmp_path / 'nowhere'}")
+
+
+def test_a_new_run_starts_from_another_ones_weights(tmp_path):
+    _run(tmp_path / "first", "train.total_frames=24")
+    second = _run(tmp_path / "second", "train.total_frames=4", f"init_from={tmp_path / 'first'}")
+    assert second.learner.updates == 0
+    first = read_state(find_checkpoint(tmp_path / "first"))
+    for name, value in read_state(find_checkpoint(tmp_path / "second"))["actor"].items():
+        assert torch.equal(value, first["actor"][name]), name
+
+
+def test_the_command_line_from_another_folder(tmp_path):
+    """The smoke preset as a user starts it: trains, evaluates, writes a checkpoint that loads and can be resumed."""
+    command = [sys.executable, str(RECIPE), "preset=smoke", "train.total_frames=1_000"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0, done.stderr
+    (run,) = (tmp_path / "runs" / "humanoid").iterdir()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["runs"], "Hydra leaves nothing behind"
+    assert sorted(p.name for p in run.iterdir()) == ["checkpoints", "config.json", "metrics.csv"]
+    assert json.loads((run / "config.json").read_text())["preset"] == "smoke"
+    with (run / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert int(rows[-1]["frames"]) == 1_000 and any(row["eval/return"] for row in rows)
+    assert float(rows[-1]["loss/loss_qvalue"]) > 0 and rows[-1]["step/style_pose"]
+    policy = load_policy(run)
+    assert policy.metadata["frames"] == 1_000 and policy.space.dim == 4
+    last = json.loads(done.stderr.strip().splitlines()[-1])
+    assert last["frames"] == 1_000 and last["updates"] == 100
+
+
+@pytest.mark.slow
+def test_workers_in_other_processes(tmp_path):
+    command = [sys.executable, str(RECIPE), "preset=smoke", "collector=process", f"run_dir={tmp_path / 'run'}"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=500, check=False)
+    assert done.returncode == 0, done.stderr
+    assert read_state(find_checkpoint(tmp_path / "run"))["loop"]["frames"] == 2_000
