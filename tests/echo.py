@@ -17,7 +17,8 @@ from coachable.training.checkpoint import CheckpointStore
 from coachable.training.collection import make_collector
 from coachable.training.episodes import EpisodeSums
 from coachable.training.logging import MetricsLog, Progress
-from coachable.training.loop import Train, TrainSettings
+from coachable.training.loop import Train
+from coachable.training.settings import TrainSettings
 from coachable.training.weights import agent_state
 from coachable.transforms import CoachableEnv, coachable_env
 

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import TensorSpec, Unbounded
+from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from coachable.keys import STYLE, STYLE_FEATURES, STYLE_REWARD, TASK_REWARD
@@ -38,7 +38,8 @@ class EpisodeSums(Transform):
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Adds the sums."""
-        shape = (*observation_spec.shape, len(_SUMMED) + 1)
+        assert isinstance(observation_spec, Composite)
+        shape = torch.Size((*observation_spec.shape, len(_SUMMED) + 1))
         observation_spec[_SUMS] = Unbounded(shape=shape, dtype=torch.float32, device=observation_spec.device)
         return observation_spec
 

@@ -5,7 +5,6 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +21,12 @@ from coachable.training.learner import Learner
 from coachable.training.logging import MetricsLog, Progress
 from coachable.training.replay_files import read_replay
 from coachable.training.rng import rng_state, set_rng_state
+from coachable.training.settings import TrainSettings
 from coachable.training.stopping import stop_signals
 from coachable.training.throttle import Throttle
 from coachable.training.weights import require_same_agent
 
-__all__ = ["REPLAY_KEYS", "Train", "TrainSettings"]
+__all__ = ["REPLAY_KEYS", "Train"]
 
 REPLAY_KEYS: tuple[str | tuple[str, ...], ...] = (
     "observation",
@@ -40,42 +40,6 @@ REPLAY_KEYS: tuple[str | tuple[str, ...], ...] = (
     ("next", STYLE_FEATURES),
 )
 """What replay stores: what losses and relabelling read. `("next", "style")` equals `style` and is not stored."""
-
-
-@dataclass(frozen=True)
-class TrainSettings:
-    """When the loop does what.
-
-    Attributes:
-        total_frames: [env-steps] of the whole training, resumed parts included.
-        batch_size: transitions per update.
-        warmup_frames: [env-steps] before the first update.
-        utd_ratio: updates per env-step, fractions allowed; None makes as many as fit into the time that the throttle
-            leaves.
-        throttle: [env-steps/s] upper bound on collection, or None.
-        eval_interval: [env-steps] between evaluations, 0 for none but the last.
-        log_interval: [s] between rows of metrics.
-        checkpoint_interval: [s] between checkpoints.
-    """
-
-    total_frames: int
-    batch_size: int = 256
-    warmup_frames: int = 0
-    utd_ratio: float | None = 1.0
-    throttle: float | None = None
-    eval_interval: int = 0
-    log_interval: float = 20.0
-    checkpoint_interval: float = 300.0
-
-    def __post_init__(self) -> None:
-        """Refuses what cannot work."""
-        for name in ("total_frames", "batch_size"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.utd_ratio is None and self.throttle is None:
-            raise ValueError("utd_ratio=null (as many updates as fit) needs a throttle: set train.throttle=RATE")
-        if self.utd_ratio is not None and self.utd_ratio < 0:
-            raise ValueError(f"utd_ratio must not be negative, got {self.utd_ratio}")
 
 
 class Train:
@@ -124,13 +88,15 @@ class Train:
         self.replay_keys = replay_keys
         self.frames = 0
         self.owed = 0.0  # updates that utd_ratio asks for and that are not made yet
-        self.seconds = dict.fromkeys(("collect", "store", "update", "evaluate", "log", "checkpoint", "wait"), 0.0)
+        parts = ("collect", "store", "update", "evaluate", "log", "checkpoint", "wait")
+        self.seconds: dict[str, float] = dict.fromkeys(parts, 0.0)
         self._device = next(learner.loss_module.parameters()).device
         self._throttle = Throttle(settings.throttle)
         self._episodes = EpisodeStatistics(style_terms)
         self._losses = Means()
         self._latest: dict[str, float] = {}
         self._evaluations = 0
+        self._filled_from = 0  # env-steps when the replay buffer was empty
         self._logged = self._saved = time.monotonic()
 
     def run(self) -> dict[str, float]:
@@ -178,7 +144,8 @@ class Train:
             self.replay.extend(data.select(*self.replay_keys))
 
     def _update(self, new_frames: int, stop: threading.Event) -> None:
-        if self.frames <= self.settings.warmup_frames or len(self.replay) < self.settings.batch_size:
+        warming_up = self.frames - self._filled_from <= self.settings.warmup_frames
+        if warming_up or len(self.replay) < self.settings.batch_size:
             return
         with self._timed("update"):
             if self.settings.utd_ratio is None:  # the learner fills the time that the throttle leaves
@@ -192,7 +159,7 @@ class Train:
             if not isinstance(
                 self.collector, Collector
             ):  # a single-process collector acts with the learner's own weights
-                self.collector.update_policy_weights_()
+                self.collector.update_policy_weights_()  # pyright: ignore[reportCallIssue]
 
     def _update_once(self) -> None:
         batch = self.replay.sample(self.settings.batch_size).to(self._device)
@@ -259,7 +226,12 @@ class Train:
         """Everything that the rest of the training depends on, but for the replay buffer."""
         return {
             "learner": self.learner.state_dict(),
-            "loop": {"frames": self.frames, "owed": self.owed, "evaluations": self._evaluations},
+            "loop": {
+                "frames": self.frames,
+                "owed": self.owed,
+                "evaluations": self._evaluations,
+                "filled_from": self._filled_from,
+            },
             "collector": collector_state(self.collector),
             "rng": rng_state(),
         }
@@ -298,10 +270,15 @@ class Train:
         self.frames = state["loop"]["frames"]
         self.owed = state["loop"]["owed"]
         self._evaluations = state["loop"]["evaluations"]
+        self._filled_from = state["loop"]["filled_from"]
         if replay is not None:
             read_replay(self.replay, replay)
         else:
-            warnings.warn("the checkpoint has no replay buffer: the resumed training fills a new one", stacklevel=2)
+            self._filled_from = self.frames
+            warnings.warn(
+                f"the checkpoint has no replay buffer: updates go on after {self.settings.warmup_frames} new env-steps",
+                stacklevel=2,
+            )
         load_collector_state(self.collector, state["collector"])
         set_rng_state(state["rng"])  # last: what is restored above draws random numbers
 

@@ -28,10 +28,11 @@ def write_replay(replay: ReplayBuffer, folder: Path) -> None:
         OSError: if writing fails.
     """
     folder.mkdir()
-    filled = len(replay.storage)
-    index: dict[str, Any] = {"filled": filled, "capacity": replay.storage.max_size, "entries": []}
+    storage: Any = replay.storage  # typed too narrowly in TorchRL: it takes slices and tensors
+    filled = len(storage)
+    index: dict[str, Any] = {"filled": filled, "capacity": storage.max_size, "entries": []}
     if filled:
-        data = replay.storage.get(slice(0, filled))
+        data = storage.get(slice(0, filled))
         for key, value in data.items(include_nested=True, leaves_only=True):
             path = [key] if isinstance(key, str) else list(key)
             file = ".".join(path) + ".npy"
@@ -40,7 +41,7 @@ def write_replay(replay: ReplayBuffer, folder: Path) -> None:
                 header = {"descr": np.lib.format.dtype_to_descr(_numpy(value[:1]).dtype), "fortran_order": False}
                 np.lib.format.write_array_header_1_0(stream, {**header, "shape": tuple(value.shape)})
                 for start in range(0, filled, _CHUNK):
-                    stream.write(memoryview(_numpy(value[start : start + _CHUNK])).cast("B"))
+                    _numpy(value[start : start + _CHUNK]).tofile(stream)
                 stream.flush()
                 os.fsync(stream.fileno())
     state = {"writer": replay.writer.state_dict(), "sampler": replay.sampler.state_dict()}
@@ -68,10 +69,11 @@ def read_replay(replay: ReplayBuffer, folder: Path) -> int:
         ValueError: if the capacities differ (a ring buffer's order depends on it).
     """
     index = json.loads((folder / "index.json").read_text(encoding="utf-8"))
-    if index["capacity"] != replay.storage.max_size:
+    storage: Any = replay.storage
+    if index["capacity"] != storage.max_size:
         raise ValueError(
-            f"the saved replay buffer holds {index['capacity']} records, this run's {replay.storage.max_size}: "
-            "set the same capacity (replay.capacity), or resume without it (resume_replay=false)"
+            f"the saved replay buffer holds {index['capacity']} records, this run's {storage.max_size}: "
+            "set the same capacity (replay_capacity), or remove the checkpoint's replay folder to resume without it"
         )
     arrays = {tuple(e["key"]): np.load(folder / e["file"], mmap_mode="r", allow_pickle=False) for e in index["entries"]}
     for start in range(0, index["filled"], _CHUNK):
@@ -79,7 +81,7 @@ def read_replay(replay: ReplayBuffer, folder: Path) -> int:
         chunk = TensorDict({}, batch_size=[stop - start])
         for key, array in arrays.items():
             chunk.set(key, torch.from_numpy(np.array(array[start:stop])))
-        replay.storage.set(torch.arange(start, stop), chunk)
+        storage.set(torch.arange(start, stop), chunk)
     cursors = torch.load(folder / "cursors.pt", weights_only=True)
     replay.writer.load_state_dict(cursors["writer"])
     replay.sampler.load_state_dict(cursors["sampler"])

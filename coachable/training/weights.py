@@ -54,7 +54,8 @@ def agent_state(
         space: its styles.
         actor: its policy.
         loss_module: holds the critics' weights.
-        network: how to build the actor again: `{"actor": {"_target_": "coachable.networks....", arguments}}`; `space` is added.
+        network: how to build the actor again: `{"actor": {"_target_": "coachable.networks...", **arguments}}`; the
+            argument `space` is added.
         config: resolved configuration, plain containers.
 
     Returns:

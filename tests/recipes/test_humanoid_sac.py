@@ -15,7 +15,7 @@ from recipe_config import GROUPS, checked_arguments, compose_config
 from coachable.envs.humanoid import HumanoidEnv, humanoid_style_reward
 from coachable.training import Learner
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
-from coachable.training.loop import TrainSettings
+from coachable.training.settings import TrainSettings
 from coachable.training.weights import load_policy
 
 REPOSITORY = Path(__file__).resolve().parents[2]

@@ -16,7 +16,7 @@ from torchrl.envs.utils import check_env_specs
 from coachable.training.checkpoint import find_checkpoint, read_state
 from coachable.training.collection import evaluate_policy
 from coachable.training.logging import CsvLog, Progress, wandb_logger
-from coachable.training.loop import TrainSettings
+from coachable.training.settings import TrainSettings
 from coachable.training.throttle import Throttle
 
 
@@ -253,3 +253,14 @@ def test_no_warning_in_an_ordinary_training(make_train):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         make_train(total_frames=80).run()
+
+
+def test_resume_without_a_replay_buffer_warms_up_again(make_train, tmp_path):
+    train = make_train(total_frames=120)
+    train.checkpoints.replay = False
+    train.run()
+    rest = make_train(total_frames=200)
+    with pytest.warns(UserWarning, match="no replay buffer: updates go on after 40 new env-steps"):
+        rest.resume(tmp_path / "run")
+    rest.run()
+    assert rest.learner.updates - train.learner.updates == (200 - 120 - 40) // 4

@@ -1,0 +1,41 @@
+"""When the training loop does what."""
+
+from dataclasses import dataclass
+
+__all__ = ["TrainSettings"]
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """When the loop does what.
+
+    Attributes:
+        total_frames: [env-steps] of the whole training, resumed parts included.
+        batch_size: transitions per update.
+        warmup_frames: [env-steps] before the first update.
+        utd_ratio: updates per env-step, fractions allowed; None makes as many as fit into the time that the throttle
+            leaves.
+        throttle: [env-steps/s] upper bound on collection, or None.
+        eval_interval: [env-steps] between evaluations, 0 for none but the last.
+        log_interval: [s] between rows of metrics.
+        checkpoint_interval: [s] between checkpoints.
+    """
+
+    total_frames: int
+    batch_size: int = 256
+    warmup_frames: int = 0
+    utd_ratio: float | None = 1.0
+    throttle: float | None = None
+    eval_interval: int = 0
+    log_interval: float = 20.0
+    checkpoint_interval: float = 300.0
+
+    def __post_init__(self) -> None:
+        """Refuses what cannot work."""
+        for name in ("total_frames", "batch_size"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.utd_ratio is None and self.throttle is None:
+            raise ValueError("utd_ratio=null (as many updates as fit) needs a throttle: set train.throttle=RATE")
+        if self.utd_ratio is not None and self.utd_ratio < 0:
+            raise ValueError(f"utd_ratio must not be negative, got {self.utd_ratio}")
