@@ -41,6 +41,12 @@ class Sampler:
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
+        known = _REGISTRY.get(cls.__name__, cls)
+        # Redefining a class (notebooks, reloads) is fine; another class of that name would hijack stored descriptions.
+        if (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
+            raise TypeError(
+                f"a sampler named {cls.__name__} exists already, in {known.__module__}: choose another name."
+            )
         _REGISTRY[cls.__name__] = cls
 
     def sample(

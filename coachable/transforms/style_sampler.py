@@ -59,7 +59,7 @@ class StyleSampler(Transform):
         self.sampler = space.sampler if sampler is None else sampler
         if self.sampler.dim != space.dim:
             raise ValueError(
-                f"sampler has dimension {self.sampler.dim}, the style space {list(space.names)} {space.dim}."
+                f"sampler has dimension {self.sampler.dim}, the style space {list(space.names)} has {space.dim}."
             )
         self.key = key
         self.generator = torch.Generator(device)

@@ -197,7 +197,7 @@ def test_description_round_trip(name):
 
 
 @dataclass(frozen=True)
-class Triangular(Sampler):
+class Tent(Sampler):
     """A sampler as a user would write it."""
 
     high: float
@@ -211,10 +211,16 @@ class Triangular(Sampler):
 
 
 def test_own_samplers_compose_and_describe_themselves(generator):
-    sampler = Product([Triangular(4.0), Uniform(0, 1)])
+    sampler = Product([Tent(4.0), Uniform(0, 1)])
     assert Sampler.from_dict(sampler.to_dict()) == sampler
     assert sampler.support() is None
     assert within_standard_errors(sampler.sample((N,), generator), torch.tensor([2.0, 0.5]))
+
+
+def test_names_of_samplers_are_unique():
+    with pytest.raises(TypeError, match=r"named Uniform exists already, in coachable\.styles\.samplers"):
+        type("Uniform", (Sampler,), {"__module__": "elsewhere"})
+    assert Sampler.from_dict(Uniform(0, 1).to_dict()) == Uniform(0, 1)
 
 
 @pytest.mark.parametrize(
