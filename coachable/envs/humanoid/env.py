@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from typing import Any
 
 import numpy as np
 import torch
@@ -167,30 +168,34 @@ class HumanoidEnv(EnvBase):
 
     # -- state -----------------------------------------------------------------------------------------------------
 
-    def simulator_state(self) -> dict[str, object]:
+    def simulator_state(self) -> dict[str, Any]:
         """Everything that the next step depends on, as tensors and plain values, for exact resumption."""
-        arrays = {"state": self.simulation.state, "course": self.course, "steps": self.steps, "observation": self._observation}
+        arrays = {
+            "state": self.simulation.state,
+            "course": self.course,
+            "steps": self.steps,
+            "observation": self._observation,
+        }
         arrays |= {f"gait.{name}": value for name, value in self.gait.arrays().items()}
-        tensors: dict[str, object] = {name: torch.from_numpy(value.copy()) for name, value in arrays.items()}
+        tensors: dict[str, Any] = {name: torch.from_numpy(value.copy()) for name, value in arrays.items()}
         return tensors | {"random": self._random.bit_generator.state}
 
-    def load_simulator_state(self, state: dict[str, object]) -> None:
+    def load_simulator_state(self, state: dict[str, Any]) -> None:
         """Restore what `simulator_state` returned.
 
         Raises:
             ValueError: if it comes from another number of envs.
         """
-        physics = state["state"]
-        assert isinstance(physics, torch.Tensor)
-        if len(physics) != self.num_envs:
-            raise ValueError(f"state of {len(physics)} envs given, this env has {self.num_envs}")
-        self.simulation.state[:] = physics.numpy()
-        self.course[:] = np.asarray(state["course"])
-        self.steps[:] = np.asarray(state["steps"])
-        self._observation[:] = np.asarray(state["observation"])
+        arrays = {name: value.numpy() for name, value in state.items() if isinstance(value, torch.Tensor)}
+        if len(arrays["state"]) != self.num_envs:
+            raise ValueError(f"state of {len(arrays['state'])} envs given, this env has {self.num_envs}")
+        self.simulation.state[:] = arrays["state"]
+        self.course[:] = arrays["course"]
+        self.steps[:] = arrays["steps"]
+        self._observation[:] = arrays["observation"]
         for name in self.gait.arrays():
-            setattr(self.gait, name, np.array(state[f"gait.{name}"]))
-        self._random.bit_generator.state = state["random"]  # type: ignore[assignment]
+            setattr(self.gait, name, arrays[f"gait.{name}"].copy())
+        self._random.bit_generator.state = state["random"]
 
     def _start_episodes(self, rows: np.ndarray) -> None:
         """Upright, feet on the ground, random arms, heading near the course."""
@@ -235,9 +240,7 @@ class HumanoidEnv(EnvBase):
     def _observe(self, kinematics: Kinematics, rows: np.ndarray) -> np.ndarray:
         """Scaled observation (len(rows), 82) float32 of the states that `kinematics` belongs to."""
         course = self.course[rows]
-        suite = suite_observation(
-            self.simulation.positions[rows], self.simulation.velocities[rows], kinematics, course
-        )
+        suite = suite_observation(self.simulation.positions[rows], self.simulation.velocities[rows], kinematics, course)
         pelvis = orientation_to_course(kinematics.pelvis_quaternion, course)
         values = np.concatenate([suite, pelvis, self.gait.observe()[rows]], axis=1) * OBSERVATION_SCALE
         return values.astype(np.float32)

@@ -20,8 +20,8 @@ class StepReport:
         completed: (N,) bool, the expected foot struck.
         length: (N,) distance along the course between the striking foot and the other one [m]; 0 without a strike.
         duration: (N,) time since the previous strike [s]; 0 without a strike.
-        stride_fraction: (N,) share of this step in the stride, i.e. in the sum of this step and the previous one. 0 where
-            either did not go forward; 1/2 for the first step of an episode, which has no stride yet.
+        stride_fraction: (N,) share of this step in the stride, i.e. in the sum of this step and the previous one.
+            0 where either did not go forward; 1/2 for the first step of an episode, which has no stride yet.
         knee_min: (N,) smallest knee angle of both legs during the step [rad].
         knee_max: (N,) largest one [rad].
         timed_out: (N,) bool, no strike for longer than `step_max`.
@@ -116,7 +116,7 @@ class GaitTracker:
 
         vector = feet[index, self.expected] - feet[index, 1 - self.expected]
         length = vector[:, 0]
-        # The other foot was the one that struck last, so its step began the stride: its length is minus our start vector.
+        # The other foot struck last: the length of its step, which began the stride, is minus our start vector.
         previous = -self.step_vector[:, 0]
         stride = length + previous
         forward = (length > 0) & (previous > 0)
@@ -151,8 +151,8 @@ class GaitTracker:
         """What the policy must know about the step under way.
 
         Returns:
-            (N, 11): one-hot of the expected foot 2, smallest and largest angle of each knee since the step began 4 [rad],
-            start vectors of the step and of the stride 4 [m], time since the last strike / step_max 1 (clipped at 2).
+            (N, 11): one-hot of the expected foot 2, smallest and largest angle of each knee since the step began 4
+            [rad], start vectors of the step and of the stride 4 [m], time since the last strike / step_max 1 (at most 2).
         """
         onehot = np.eye(2)[self.expected]
         timer = np.minimum(self.clock * CONTROL_STEP / self.step_max, 2.0)

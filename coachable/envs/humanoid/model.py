@@ -1,8 +1,8 @@
 """MuJoCo models of the DeepMind Control humanoid, and where its quantities lie in the state.
 
-Two compiled models share the suite's body. The *dynamics* model integrates; it has no sensors, because the suite's force
-sensors alone cost a pass of inverse dynamics per physics step. The *kinematics* model has only the sensors that our
-features need and every force switched off, so that one cheap step of it reads the geometry of any state.
+Two compiled models share the suite's body. The *dynamics* model integrates; it has no sensors, because the suite's
+force sensors alone cost a pass of inverse dynamics per physics step. The *kinematics* model has only the sensors that
+our features need and every force switched off, so that one cheap step of it reads the geometry of any state.
 """
 
 from __future__ import annotations

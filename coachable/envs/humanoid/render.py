@@ -77,7 +77,7 @@ class HumanoidRenderer:
         self._gl.free()
 
 
-def _make_gl_context(width: int, height: int):  # noqa: ANN202 - MuJoCo's context classes share no base
+def _make_gl_context(width: int, height: int):
     """An OpenGL context of the chosen backend, made current.
 
     `mujoco.Renderer` is not used because it knows only the backend that was set when MuJoCo was first imported.

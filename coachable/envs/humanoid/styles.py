@@ -15,7 +15,7 @@ from coachable.styles import Choice, ChoiceTolerance, Setpoint, StyleReward, Sty
 
 STEP_LENGTH_RANGE = (0.30, 0.65)  # [m]
 
-# Joint bounds of each pose [deg]: right shoulder1, shoulder2, elbow. The left arm mirrors the signs of the shoulder joints.
+# Joint bounds of each pose [deg]: right shoulder1, shoulder2, elbow. The left arm mirrors the shoulder joints' signs.
 # Centres: the reach of the hand in the pose's direction, maximised within the joint limits; the elbow nearly straight.
 _SHOULDER_HALF_WIDTH_DEG = 15.0
 _SHOULDER_CENTRES_DEG = {
@@ -80,7 +80,9 @@ def humanoid_style_space() -> StyleSpace:
     return StyleSpace(
         [
             Choice("pose", POSES, help="how the arms are held"),
-            Setpoint("step_length", low, high, unit="m", help="distance between the feet at a strike", encoding="range"),
+            Setpoint(
+                "step_length", low, high, unit="m", help="distance between the feet at a strike", encoding="range"
+            ),
         ],
         name="humanoid",
     )
@@ -137,7 +139,9 @@ def humanoid_style_reward(
             value_at_margin=0.0,
         )
         knees = tolerance(features[..., KNEE_MIN], knee_low, math.inf, margin=knee_margin, sigmoid="long_tail")
-        knees = knees * tolerance(features[..., KNEE_MAX], -math.inf, knee_high, margin=knee_margin, sigmoid="long_tail")
+        knees = knees * tolerance(
+            features[..., KNEE_MAX], -math.inf, knee_high, margin=knee_margin, sigmoid="long_tail"
+        )
         control_steps = features[..., DURATION] / CONTROL_STEP
         earned = features[..., COMPLETED] * control_steps * closeness * even * knees
         return earned - timeout_penalty * features[..., TIMED_OUT]

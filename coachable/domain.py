@@ -1,0 +1,106 @@
+"""What the training, evaluation and coaching code needs to know of a domain, in one declaration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import Any, Protocol
+
+import numpy as np
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from coachable.styles import StyleReward, StyleSpace
+
+# Where each built-in domain is declared; imported only when asked for.
+_DECLARATIONS = {"humanoid": "coachable.envs.humanoid.domain"}
+
+
+class StyleMeasures(Protocol):
+    """Measured style: what the agent did, in the units of what was requested."""
+
+    def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
+        """Quantities of one env step.
+
+        Args:
+            transition: output of `env.step`, batch shape (N,), with `style` and `next`.
+
+        Returns:
+            Name to (N,) tensors.
+        """
+        ...
+
+    def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
+        """Quantities of whole episodes, or of any stretch of them.
+
+        Args:
+            record: name to (T, N), the outputs of `step`.
+            alive: (T, N) bool, steps that count.
+
+        Returns:
+            Name to (N,); NaN where an episode gives no value.
+        """
+        ...
+
+    def complies(self, record: Mapping[str, Tensor]) -> Tensor:
+        """(T, N) bool: in this step the agent did what its style asks for."""
+        ...
+
+
+class Renderer(Protocol):
+    """Draws one env of a batch."""
+
+    def draw(self, env: EnvBase, row: int = 0) -> np.ndarray:
+        """(height, width, 3) uint8."""
+        ...
+
+    def close(self) -> None:
+        """Release the graphics context."""
+        ...
+
+
+@dataclass(frozen=True)
+class Domain:
+    """One domain.
+
+    Attributes:
+        name: as the user types it.
+        make_env: `(num_envs, seed, num_threads) -> EnvBase`, without style transforms.
+        make_space: the style space that its pretrained weights were trained on.
+        make_reward: `(space, **scales) -> StyleReward`.
+        measures: measured style.
+        make_renderer: `(width, height) -> Renderer`.
+        grid: values of each style parameter that make up the evaluation grid.
+        control_step: duration of one env step [s].
+        episode_steps: length of a full episode.
+        columns: metrics of the published table, in order, with the format of their values.
+    """
+
+    name: str
+    make_env: Callable[..., EnvBase]
+    make_space: Callable[[], StyleSpace]
+    make_reward: Callable[..., StyleReward]
+    measures: StyleMeasures
+    make_renderer: Callable[..., Renderer]
+    grid: Mapping[str, Sequence[Any]]
+    control_step: float
+    episode_steps: int
+    columns: Mapping[str, str] = field(default_factory=dict)
+
+
+def domain_names() -> list[str]:
+    """The built-in domains."""
+    return sorted(_DECLARATIONS)
+
+
+def load_domain(name: str) -> Domain:
+    """The declaration of a built-in domain.
+
+    Raises:
+        ValueError: if there is no such domain; lists those that exist.
+    """
+    if name not in _DECLARATIONS:
+        raise ValueError(f"unknown domain {name!r}: expected one of {domain_names()}")
+    return import_module(_DECLARATIONS[name]).DOMAIN

@@ -1,0 +1,102 @@
+"""`coachable evaluate`: the style grid and the switching test of a trained agent, as tables and a figure."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from coachable.domain import Domain, load_domain
+from coachable.evaluation.figures import draw_style_grid
+from coachable.evaluation.style_grid import StyleGrid, evaluate_grid, markdown_table, mean_of, write_csv
+from coachable.evaluation.switching import SwitchReport, evaluate_switching
+from coachable.training.weights import LoadedPolicy, load_policy
+
+
+def evaluate(
+    source: str | Path,
+    out: Path,
+    *,
+    episodes: int = 20,
+    switch_episodes: int = 60,
+    steps: int | None = None,
+    seed: int = 0,
+    num_threads: int | None = None,
+    progress: bool = True,
+) -> str:
+    """Evaluate an agent and write `grid.csv`, `response.csv`, `report.md`, `grid.png` and `summary.json` into a folder.
+
+    Args:
+        source: checkpoint, run folder, weights file, or the name of a domain that ships with weights.
+        out: folder for the results, created if missing.
+        episodes: per cell of the grid.
+        switch_episodes: episodes with a style that switches every 100 steps.
+        steps: length of an episode; default: the domain's.
+        seed: of initial states and switched styles. The same seed gives the same files.
+        num_threads: physics threads.
+        progress: show progress bars.
+
+    Returns:
+        The report, Markdown.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    agent = load_policy(source)
+    domain = load_domain(agent.metadata["domain"])
+    options: dict[str, Any] = {"steps": steps, "seed": seed, "num_threads": num_threads, "progress": progress}
+    grid = evaluate_grid(domain, agent.actor, agent.space, episodes=episodes, **options)
+    switching = evaluate_switching(domain, agent.actor, agent.space, episodes=switch_episodes, **options)
+    rows, response = grid.rows(), grid.response(agent.space)
+    write_csv(rows, out / "grid.csv")
+    if response:
+        write_csv(response, out / "response.csv")
+    panels = [name for name in ("survived", "pose_held", "forward_speed") if name in grid.episodes]
+    title = f"{domain.name}: {episodes} episodes of {grid.steps} steps per style, 95 % intervals"
+    draw_style_grid(grid, agent.space, out / "grid.png", title, panels)
+    report = _report(domain, agent, grid, rows, response, switching, switch_episodes)
+    (out / "report.md").write_text(report)
+    (out / "summary.json").write_text(json.dumps(_summary(grid, rows, switching), indent=2) + "\n")
+    return report
+
+
+def _summary(grid: StyleGrid, rows: list[dict[str, Any]], switching: SwitchReport) -> dict[str, Any]:
+    """The worst and the mean cell of each metric, and the switching test."""
+    spans = {}
+    for name, values in grid.episodes.items():
+        means = [mean for mean in map(mean_of, values) if not math.isnan(mean)]
+        if means:
+            spans[name] = {"lowest_cell": min(means), "mean": sum(means) / len(means), "highest_cell": max(means)}
+    return {
+        "grid": spans,
+        "cells": len(rows),
+        "episodes_per_cell": grid.episodes["survived"].shape[1],
+        "seed": grid.seed,
+        "switching": {**switching.metrics, "complied": switching.complied, "switches": switching.switches},
+    }
+
+
+def _report(
+    domain: Domain,
+    agent: LoadedPolicy,
+    grid: StyleGrid,
+    rows: list[dict[str, Any]],
+    response: list[dict[str, Any]],
+    switching: SwitchReport,
+    switch_episodes: int,
+) -> str:
+    known = [f"{agent.metadata[name]:,} {name}" for name in ("frames", "updates") if agent.metadata.get(name)]
+    columns = {name: "" for name in domain.grid} | dict(domain.columns)
+    text = f"# {domain.name}: requested and measured style\n\n"
+    text += f"Deterministic policy{' after ' + ', '.join(known) if known else ''}; {rows[0]['episodes']} episodes of "
+    text += f"{grid.steps} steps per style, seed {grid.seed}.\n\n![style grid](grid.png)\n\n"
+    text += markdown_table(rows, columns)
+    if response:
+        text += "\n## Response to the request\n\n"
+        numbers = ("slope", "rank_correlation", "mean_error")
+        text += markdown_table(response, {name: ".3f" if name in numbers else "" for name in response[0]})
+    times = switching.comply_seconds
+    median = f"{times.median():.2f} s" if len(times) else "never"
+    text += f"\n## Style switched at random every 100 steps ({switch_episodes} episodes)\n\n"
+    text += markdown_table([switching.metrics], dict.fromkeys(switching.metrics, ".3f"))
+    text += f"\nComplied before the next switch: {switching.complied:.0%} of {switching.switches} switches; "
+    return text + f"median time to comply {median}.\n"

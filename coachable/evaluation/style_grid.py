@@ -1,0 +1,157 @@
+"""The style grid: every combination of style values, several episodes each."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict.nn import TensorDictModuleBase
+
+from coachable.domain import Domain
+from coachable.evaluation.rollouts import record_episodes
+from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
+from coachable.styles import Setpoint, StyleSpace
+from coachable.transforms import coachable_env
+
+
+@dataclass(frozen=True)
+class StyleGrid:
+    """Metrics of each cell of the grid.
+
+    Attributes:
+        cells: the style of each cell, by parameter name.
+        episodes: name to (cells, episodes), one value per episode; NaN where an episode gives none.
+        seed: of the initial states.
+        steps: length of a full episode.
+    """
+
+    cells: list[dict[str, Any]]
+    episodes: dict[str, np.ndarray]
+    seed: int
+    steps: int
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row per cell: style, mean of each metric, and its 95 % bootstrap interval over episodes."""
+        rows = []
+        for index, cell in enumerate(self.cells):
+            row: dict[str, Any] = {**cell, "episodes": self.episodes["survived"].shape[1]}
+            for name, values in self.episodes.items():
+                low, high = bootstrap_interval(values[index])
+                column = measured_column(name, cell)
+                row |= {column: mean_of(values[index]), f"{column}_low": low, f"{column}_high": high}
+            rows.append(row)
+        return rows
+
+    def response(self, space: StyleSpace) -> list[dict[str, Any]]:
+        """How each measured set-point follows its request, for every combination of the other parameters.
+
+        Returns:
+            Rows with the other parameters' values, `slope` of the realised over the requested value (least squares over
+            episodes), `rank_correlation`, and `mean_error`.
+        """
+        rows = []
+        for parameter in space.parameters:
+            if not isinstance(parameter, Setpoint) or parameter.name not in self.episodes:
+                continue
+            others = [{k: v for k, v in cell.items() if k != parameter.name} for cell in self.cells]
+            for group in _distinct(others):
+                members = [i for i, other in enumerate(others) if other == group]
+                realised = self.episodes[parameter.name][members]
+                requested = np.array([self.cells[i][parameter.name] for i in members])
+                requested = np.broadcast_to(requested[:, None], realised.shape).ravel()
+                realised = realised.ravel()
+                valid = ~np.isnan(realised)
+                slope = np.polyfit(requested[valid], realised[valid], 1)[0] if valid.sum() > 1 else float("nan")
+                rows.append(
+                    {
+                        **group,
+                        "parameter": parameter.name,
+                        "slope": float(slope),
+                        "rank_correlation": rank_correlation(requested, realised),
+                        "mean_error": float(np.nanmean(np.abs(realised - requested))),
+                    }
+                )
+        return rows
+
+
+def evaluate_grid(
+    domain: Domain,
+    policy: TensorDictModuleBase,
+    space: StyleSpace,
+    *,
+    episodes: int = 20,
+    steps: int | None = None,
+    seed: int = 0,
+    grid: Mapping[str, Sequence[Any]] | None = None,
+    num_threads: int | None = None,
+    progress: bool = True,
+) -> StyleGrid:
+    """Run `episodes` episodes in every cell, all of them in one batch.
+
+    Args:
+        domain: what to run in.
+        policy: deterministic where asked; reads `observation` and `style`.
+        space: the policy's style space.
+        episodes: per cell.
+        steps: length of an episode; default: the domain's.
+        seed: of the initial states, the same in every cell.
+        grid: values per style parameter; default: the domain's.
+        num_threads: physics threads.
+        progress: show a bar.
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes per cell must be at least 1, got {episodes}")
+    steps = steps or domain.episode_steps
+    grid = domain.grid if grid is None else grid
+    cells = [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
+    theta = torch.stack([space.make(strict=True, **cell) for cell in cells]).repeat_interleave(episodes, 0)
+    env = coachable_env(
+        domain.make_env(num_envs=len(theta), num_threads=num_threads), space, domain.make_reward(space), seed=seed
+    )
+    label = f"{len(cells)} styles x {episodes} episodes" if progress else None
+    record = record_episodes(env, policy, theta, domain.measures, steps=steps, seed=seed, progress=label)
+    env.close()
+    values = {"survived": record.survived.float(), "steps": record.alive.sum(0).float()}
+    values |= {"task_return": record.task_return, **domain.measures.summarise(record.measures, record.alive)}
+    shaped = {name: value.reshape(len(cells), episodes).double().numpy() for name, value in values.items()}
+    return StyleGrid(cells, shaped, seed, steps)
+
+
+def measured_column(name: str, cell: Mapping[str, Any]) -> str:
+    """Column of a metric; a measured style parameter would otherwise share its name with the request."""
+    return f"measured_{name}" if name in cell else name
+
+
+def mean_of(values: np.ndarray) -> float:
+    """Mean of the numbers that are not NaN; NaN if there are none."""
+    return float(np.nanmean(values)) if not np.isnan(values).all() else float("nan")
+
+
+def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Write rows of equal keys as CSV."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
+
+
+def markdown_table(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> str:
+    """Rows as a Markdown table.
+
+    Args:
+        rows: values by column name.
+        columns: column name to format specification ("" prints as is).
+    """
+    lines = ["| " + " | ".join(columns) + " |", "|" + "--|" * len(columns)]
+    lines += ["| " + " | ".join(format(row[c], spec) for c, spec in columns.items()) + " |" for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def _distinct(items: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [item for i, item in enumerate(items) if item not in items[:i]]

@@ -1,0 +1,178 @@
+"""`coachable render`: a film of an agent whose style is switched while it acts."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw, ImageFont
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from tqdm import tqdm
+
+from coachable.domain import Domain, load_domain
+from coachable.keys import STYLE
+from coachable.styles import Choice, StyleSpace
+from coachable.training.weights import load_policy
+from coachable.transforms import coachable_env
+
+VIDEO_SUFFIXES = (".mp4", ".gif", ".png")
+_GIF_FPS = 20
+
+
+def render(
+    source: str | Path,
+    out: Path,
+    *,
+    styles: Sequence[dict[str, Any]] | None = None,
+    seconds_per_style: float = 4.0,
+    size: tuple[int, int] = (640, 480),
+    seed: int = 0,
+    progress: bool = True,
+) -> Path:
+    """Film one agent, its request and what it measures written into the picture.
+
+    Args:
+        source: checkpoint, run folder, weights file, or the name of a domain that ships with weights.
+        out: file to write: `.mp4`, `.gif`, or `.png` for a sheet with one picture per style.
+        styles: requests by parameter name, in order; default: every option of a choice, with the lower, middle and
+            upper value of the other parameters.
+        seconds_per_style: time between switches [s].
+        size: width and height [px].
+        seed: of the initial state.
+        progress: show a bar.
+
+    Returns:
+        `out`.
+
+    Raises:
+        ValueError: if the suffix of `out` is none of the above.
+        ImportError: for mp4 without PyAV; names the extra to install.
+    """
+    if out.suffix not in VIDEO_SUFFIXES:
+        raise ValueError(f"cannot write {out.name}: expected a file ending in one of {VIDEO_SUFFIXES}")
+    if out.suffix == ".mp4":
+        _import_av()
+    agent = load_policy(source)
+    domain = load_domain(agent.metadata["domain"])
+    requests = default_tour(agent.space) if styles is None else list(styles)
+    period = max(1, round(seconds_per_style / domain.control_step))
+    frames = _film(domain, agent.actor, agent.space, requests, period, size, seed)
+    total = len(requests) * period
+    bar = tqdm(frames, total=total, desc="drawing", unit="frame", disable=not progress, leave=False)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if out.suffix == ".png":
+        # The end of each style's time, when the agent has had the chance to comply.
+        _write_sheet([frame for i, frame in enumerate(bar) if (i + 1) % period == 0], out)
+    else:
+        write_video(bar, out, round(1 / domain.control_step))
+    return out
+
+
+def default_tour(space: StyleSpace) -> list[dict[str, Any]]:
+    """Requests that show every option of each choice, with low, middle and high values of the other parameters."""
+    choices = [p for p in space.parameters if isinstance(p, Choice)]
+    others = [p for p in space.parameters if not isinstance(p, Choice)]
+    tour = []
+    for options in itertools.product(*(p.options for p in choices)):
+        for level in (0.0, 0.5, 1.0):
+            values = {p.name: p.low + level * (p.high - p.low) for p in others}
+            tour.append({p.name: option for p, option in zip(choices, options, strict=True)} | values)
+    return tour
+
+
+def write_video(frames: Iterable[np.ndarray], out: Path, fps: int) -> None:
+    """Write frames (height, width, 3) uint8 as mp4 (H.264) or gif."""
+    if out.suffix == ".gif":
+        stride = max(1, fps // _GIF_FPS)
+        images = [Image.fromarray(frame) for frame in itertools.islice(frames, 0, None, stride)]
+        images[0].save(out, save_all=True, append_images=images[1:], duration=1000 * stride // fps, loop=0)
+        return
+    av = _import_av()
+    with av.open(str(out), "w") as container:
+        stream = container.add_stream("libx264", rate=fps, options={"preset": "veryfast", "crf": "23"})
+        stream.pix_fmt = "yuv420p"
+        for frame in frames:
+            stream.height, stream.width = frame.shape[:2]
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode())
+
+
+@torch.no_grad()
+def _film(
+    domain: Domain,
+    policy: Any,
+    space: StyleSpace,
+    requests: Sequence[dict[str, Any]],
+    period: int,
+    size: tuple[int, int],
+    seed: int,
+) -> Iterator[np.ndarray]:
+    env = coachable_env(domain.make_env(num_envs=1, num_threads=1), space, domain.make_reward(space), seed=seed)
+    renderer = domain.make_renderer(*size)
+    env.set_seed(seed)
+    thetas = [space.make(**request) for request in requests]
+    current = env.reset(TensorDict({STYLE: thetas[0][None]}, [1]))
+    falls = 0
+    try:
+        for request, theta in zip(requests, thetas, strict=True):
+            recent: list[dict[str, Tensor]] = []
+            for _ in range(period):
+                with set_exploration_type(ExplorationType.DETERMINISTIC):
+                    transition = env.step(policy(current.set(STYLE, theta[None])))
+                recent.append(domain.measures.step(transition))
+                yield _caption(renderer.draw(env), _caption_lines(domain, request, recent, falls))
+                current = step_mdp(transition)
+                if transition["next", "done"].any():
+                    falls += int(transition["next", "terminated"].sum())
+                    current = env.reset(TensorDict({STYLE: theta[None]}, [1]))
+    finally:
+        renderer.close()
+        env.close()
+
+
+def _caption_lines(
+    domain: Domain, request: dict[str, Any], recent: list[dict[str, Tensor]], falls: int
+) -> tuple[str, str]:
+    window = recent[-round(2.0 / domain.control_step) :]
+    record = {name: torch.stack([row[name] for row in window]) for name in window[0]}
+    measured = domain.measures.summarise(record, torch.ones(len(window), 1, dtype=torch.bool))
+    asked = ", ".join(f"{k} {v:.2f}" if isinstance(v, float) else f"{v}" for k, v in request.items())
+    shown = ", ".join(f"{k} {v.item():.2f}" for k, v in measured.items() if not bool(v.isnan().any()))
+    return f"asked: {asked}".replace("_", " "), f"last 2 s: {shown}; falls {falls}".replace("_", " ")
+
+
+def _caption(frame: np.ndarray, lines: tuple[str, str]) -> np.ndarray:
+    image = Image.fromarray(frame)
+    draw = ImageDraw.Draw(image)
+    width, height = image.size
+    draw.rectangle((0, height - 44, width, height), fill=(20, 20, 30))
+    large, small = ImageFont.load_default(16), ImageFont.load_default(12)
+    draw.text((8, height - 42), lines[0], font=large, fill=(255, 220, 120))
+    draw.text((8, height - 20), lines[1], font=small, fill=(220, 220, 220))
+    return np.asarray(image)
+
+
+def _write_sheet(frames: Sequence[np.ndarray], out: Path, columns: int = 3) -> None:
+    height, width = frames[0].shape[:2]
+    rows = -(-len(frames) // columns)
+    sheet = np.zeros((rows * height, columns * width, 3), dtype=np.uint8)
+    for index, frame in enumerate(frames):
+        row, column = divmod(index, columns)
+        sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = frame
+    Image.fromarray(sheet).save(out)
+
+
+def _import_av() -> Any:
+    try:
+        import av
+    except ImportError as error:
+        raise ImportError(
+            'writing mp4 needs PyAV: pip install "coachable[video]", or choose a .gif or .png file'
+        ) from error
+    return av

@@ -1,0 +1,199 @@
+"""`HumanoidEnv` as a TorchRL environment, and the properties that dm_control asks of every task."""
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
+
+from coachable.envs.humanoid import HumanoidEnv, humanoid_style_reward, humanoid_style_space
+from coachable.envs.humanoid.observation import OBSERVATION_GROUPS
+from coachable.transforms import coachable_env
+
+
+def make_env(num_envs=3, seed=0, **options):
+    return HumanoidEnv(num_envs=num_envs, seed=seed, num_threads=1, **options)
+
+
+def actions(env, steps, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(steps, env.num_envs, 21, generator=generator) * 2 - 1
+
+
+def roll(env, sequence):
+    """Observations of a rollout without resets in between."""
+    current, seen = env.reset(), []
+    for action in sequence:
+        current = env.step(current.set("action", action))["next"]
+        seen.append(current["observation"].clone())
+    return torch.stack(seen)
+
+
+def test_specs_hold():
+    check_env_specs(make_env(), seed=0)
+
+
+def test_observations_are_finite_and_none_is_constant():
+    env = make_env(num_envs=8)
+    seen = roll(env, actions(env, 60)).reshape(-1, 82)
+    assert torch.isfinite(seen).all()
+    assert (seen.std(0) > 0).all()
+    assert seen.abs().max() < 30  # scaled: joint speeds reach tens of rad/s
+
+
+def test_the_same_seed_gives_the_same_episodes_and_another_does_not():
+    runs = [roll(make_env(seed=seed), actions(make_env(), 20)) for seed in (1, 1, 2)]
+    assert torch.equal(runs[0], runs[1])
+    assert not torch.equal(runs[0][0], runs[2][0])
+
+
+def test_set_seed_restarts_the_stream():
+    env = make_env()
+    env.set_seed(5)
+    first = env.reset()["observation"]
+    env.set_seed(5)
+    assert torch.equal(env.reset()["observation"], first)
+    assert not torch.equal(env.reset()["observation"], first)
+
+
+def test_batched_step_equals_stepping_alone():
+    env = make_env(num_envs=4)
+    together = roll(env, actions(env, 30))
+    start = make_env(num_envs=4)
+    start.reset()
+    states = start.simulator_state()
+    for row in range(4):
+        alone = make_env(num_envs=1)
+        alone.reset()
+        state = {k: v[row : row + 1] if isinstance(v, torch.Tensor) else v for k, v in states.items()}
+        alone.load_simulator_state(state)
+        seen, current = [], TensorDict({}, [1])
+        for action in actions(env, 30):
+            current = alone.step(current.set("action", action[row : row + 1]))["next"]
+            seen.append(current["observation"].clone())
+        torch.testing.assert_close(torch.stack(seen)[:, 0], together[:, row], rtol=0, atol=0)
+
+
+def test_partial_reset_touches_nothing_else():
+    env = make_env()
+    roll(env, actions(env, 5))
+    before = {name: value.clone() for name, value in env.simulator_state().items() if isinstance(value, torch.Tensor)}
+    mask = torch.tensor([[False], [True], [False]])
+    env.reset(TensorDict({"_reset": mask}, [3]))
+    after = env.simulator_state()
+    for name, value in before.items():
+        assert torch.equal(after[name][[0, 2]], value[[0, 2]]), name
+    assert after["steps"].tolist() == [5, 0, 5]
+
+
+def test_outputs_do_not_share_memory_with_the_env():
+    env = make_env()
+    current = env.reset()
+    kept = current["observation"]
+    copy = kept.clone()
+    env.step(current.set("action", torch.zeros(3, 21)))
+    assert torch.equal(kept, copy)
+
+
+def test_episodes_start_upright_with_the_feet_on_the_ground_and_random_arms():
+    env = make_env(num_envs=64)
+    env.reset()
+    kinematics = env.simulation.kinematics()
+    np.testing.assert_allclose(kinematics.head_height, 1.4755, atol=1e-3)
+    np.testing.assert_allclose(kinematics.foot_clearance.min(axis=1), 0.0, atol=1e-9)
+    positions = env.simulation.positions
+    others = np.setdiff1d(np.arange(7, 28), env.simulation.model.arm_positions)
+    assert (positions[:, others] == 0).all()
+    assert (positions[:, env.simulation.model.arm_positions].std(axis=0) > 0.2).all()
+    heading = 2 * np.arctan2(positions[:, 6], positions[:, 3])
+    assert np.abs(heading).max() <= 0.3
+    assert set(env.gait.expected) == {0, 1}
+
+
+def test_a_fall_terminates_and_time_truncates():
+    env = make_env(num_envs=1)
+    current = env.reset()
+    for _ in range(200):
+        current = env.step(current.set("action", torch.zeros(1, 21)))["next"]
+        if current["done"].item():
+            break
+    assert current["terminated"].item()
+    assert not current["truncated"].item()
+    assert env.simulation.kinematics().head_height[0] < 1.1
+    short = make_env(num_envs=1, episode_steps=3)
+    current = short.reset()
+    for _ in range(3):
+        current = short.step(current.set("action", torch.zeros(1, 21)))["next"]
+    assert current["truncated"].item()
+    assert not current["terminated"].item()
+
+
+def test_exploding_physics_ends_the_episode_without_a_non_finite_number():
+    env = make_env()
+    current = env.reset()
+    env.simulation.velocities[1, 5] = 1e12
+    after = env.step(current.set("action", torch.zeros(3, 21)))["next"]
+    assert after["terminated"].flatten().tolist() == [False, True, False]
+    assert env.divergences == 1
+    assert torch.isfinite(after["style_features"]).all()
+    assert torch.isfinite(after["task_reward"]).all()
+
+
+def test_the_walker_sees_the_course_not_the_compass():
+    """Turning body and course together by any angle leaves every observation and reward as it was."""
+    base, turned = make_env(num_envs=2), make_env(num_envs=2)
+    angle = 1.1
+    for env in (base, turned):
+        env.set_seed(3)
+    turned.steer(angle)
+    first, second = base.reset(), turned.reset()
+    torch.testing.assert_close(first["observation"], second["observation"], rtol=0, atol=1e-5)
+    for action in actions(base, 10):
+        first = base.step(first.set("action", action))["next"]
+        second = turned.step(second.set("action", action))["next"]
+    for key in ("observation", "task_reward", "style_features"):
+        torch.testing.assert_close(first[key], second[key], rtol=0, atol=1e-3)
+
+
+def test_saved_state_continues_exactly():
+    env, other = make_env(), make_env(seed=9)
+    sequence = actions(env, 12)
+    roll(env, sequence[:6])
+    other.reset()
+    other.load_simulator_state(env.simulator_state())
+    for action in sequence[6:]:
+        a = env.step(TensorDict({"action": action}, [3]))["next"]
+        b = other.step(TensorDict({"action": action}, [3]))["next"]
+        for key in ("observation", "reward", "style_features", "done"):
+            assert torch.equal(a[key], b[key])
+    assert torch.equal(env.reset()["observation"], other.reset()["observation"])
+
+
+def test_state_of_another_size_is_refused():
+    with pytest.raises(ValueError, match="state of 3 envs given, this env has 2"):
+        make_env(num_envs=2).load_simulator_state(make_env(num_envs=3).simulator_state())
+
+
+def test_a_diverged_policy_is_named():
+    env = make_env()
+    with pytest.raises(ValueError, match="action contains NaN"):
+        env.step(env.reset().set("action", torch.full((3, 21), torch.nan)))
+
+
+@pytest.mark.parametrize("options", [{"num_envs": 0}, {"step_max": 0.0}])
+def test_bad_arguments_are_refused(options):
+    with pytest.raises(ValueError, match="must be"):
+        HumanoidEnv(**{"num_threads": 1, **options})
+
+
+def test_reward_is_task_plus_style_under_the_style_that_the_policy_saw():
+    space = humanoid_style_space()
+    reward = humanoid_style_reward(space)
+    env = coachable_env(make_env(num_envs=5), space, reward, seed=0)
+    data = env.rollout(40, break_when_any_done=False)
+    expected = data["next", "task_reward"] + reward(data["next", "style_features"], data["style"])
+    assert torch.equal(data["next", "reward"], expected)
+
+
+def test_observation_groups_add_up():
+    assert sum(width for _, width, _ in OBSERVATION_GROUPS) == 82
