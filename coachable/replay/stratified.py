@@ -65,7 +65,7 @@ def allot(batch_size: int, proportions: np.ndarray, available: np.ndarray) -> np
             break
     if sharing.any():
         floor = np.floor(quota).astype(np.int64)
-        remainder = np.where(sharing, quota - floor, -1.0)
+        remainder = np.where(sharing, np.round(quota - floor, 9), -1.0)
         extra = np.argsort(-remainder, kind="stable")[: left - int(floor[sharing].sum())]
         counts[sharing] = floor[sharing]
         counts[extra] += 1

@@ -14,7 +14,7 @@ from coachable.replay.events import EventPredicate, Route, checked_events, check
 from coachable.replay.n_step import NStep
 from coachable.replay.regions import Regions
 from coachable.replay.steps import Steps, flatten_time_major, read_steps
-from coachable.replay.windows import WindowHistory
+from coachable.replay.windows import Copies, WindowHistory
 
 __all__ = ["TableWriter"]
 
@@ -115,39 +115,40 @@ class TableWriter(Writer):
             return torch.zeros(0, dtype=torch.long)
         before = self.regions.written.copy()
         slot, serial = self.regions.allocate(steps.route)
-        past = None
-        slots, sources = [slot], [np.arange(len(steps))]
+        parts = [(slot, rows)]
         if self.history is not None:
+            parts += self._copies(self.history.update(steps, slot, serial), rows, before)
             self._fired[self.base_tables :] += steps.fired.sum(0)
-            copies = self.history.update(steps, slot, serial)
-            table = copies.table + self.base_tables
-            home = self.regions.table_of(np.maximum(copies.slot, 0))
-            # A step that its own table has dropped meanwhile can no longer be copied.
-            lost = (copies.row < 0) & (copies.serial + self.regions.capacities[home] < before[home])
-            if lost.any():
-                self._lost += np.bincount(table[lost], minlength=len(self.regions))
-                table, copies.row, copies.slot = table[~lost], copies.row[~lost], copies.slot[~lost]
-            target, _ = self.regions.allocate(table)
-            here = copies.row >= 0
-            slots.append(target[here])
-            sources.append(copies.row[here])
-            there = ~here & (target >= 0)
-            if there.any():
-                # Read before this batch overwrites anything.
-                past = target[there], self._stored(copies.slot[there])
-        slot, source = np.concatenate(slots), np.concatenate(sources)
-        valid = slot >= 0
-        if not valid.all():
-            slot, source = slot[valid], source[valid]
-        if len(slot) != len(rows) or not np.array_equal(source, np.arange(len(rows))):
-            rows = rows[self._index(source)]
-        written = self._put(slot, rows)
-        return written if past is None else torch.cat([written, self._put(*past)])
+        return torch.cat([self._put(*part) for part in parts])
+
+    def _copies(
+        self, copies: Copies, rows: TensorDictBase, before: np.ndarray
+    ) -> list[tuple[np.ndarray, TensorDictBase]]:
+        """Records to append to event tables, read before the batch overwrites anything."""
+        table = copies.table + self.base_tables
+        home = self.regions.table_of(np.maximum(copies.slot, 0))
+        # A step that its own table has dropped meanwhile can no longer be copied.
+        lost = (copies.row < 0) & (copies.serial + self.regions.capacities[home] < before[home])
+        self._lost += np.bincount(table[lost], minlength=len(self.regions))
+        target = np.full(len(table), -1)
+        target[~lost], _ = self.regions.allocate(table[~lost])
+        here, there = (target >= 0) & (copies.row >= 0), (target >= 0) & (copies.row < 0)
+        parts = []
+        if here.any():
+            parts.append((target[here], rows[self._index(copies.row[here])]))
+        if there.any():
+            parts.append((target[there], self._stored(copies.slot[there])))
+        return parts
 
     def _put(self, slot: np.ndarray, rows: TensorDictBase) -> Tensor:
+        kept = slot >= 0  # the others have already been replaced within this batch
+        if not kept.all():
+            rows, slot = rows[self._index(np.flatnonzero(kept))], slot[kept]
         index = self._index(slot)
+        # A run of slots is written several times faster as a slice.
+        run = slot[-1] - slot[0] + 1 == len(slot) and bool((np.diff(slot) == 1).all())
         storage = self._storage
-        storage.set(index, rows, set_cursor=False)  # type: ignore[arg-type]
+        storage.set(slice(int(slot[0]), int(slot[-1]) + 1) if run else index, rows, set_cursor=False)  # type: ignore[arg-type]
         # TorchRL takes the first `_len` slots for the filled ones; `_last_cursor` only keeps its checkpointer quiet.
         storage._len = self.regions.used_prefix
         if storage._last_cursor is None:

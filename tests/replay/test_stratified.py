@@ -5,7 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
@@ -38,6 +38,7 @@ def exact_allotment(batch: int, shares: list[int], available: list[bool]) -> lis
 
 
 @settings(max_examples=300, deadline=None)
+@example(batch=284, tables=[(17, True), (44, True), (7, True), (32, True), (48, True)])  # a tie that floats break
 @given(
     batch=st.integers(1, 512),
     tables=st.lists(st.tuples(st.integers(0, 50), st.booleans()), min_size=1, max_size=25),
