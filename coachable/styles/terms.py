@@ -5,6 +5,8 @@ or a nested tensordict), `style` a mapping from parameter name to its block of t
 
 Only elementwise operations appear here, in a fixed order. A reduction such as `Tensor.sum` may add in another order for
 another batch shape or memory layout, and the relabelled reward would differ in its last bits from the collected one.
+So do a few elementwise functions of PyTorch 2.13 on the CPU (measured): `sigmoid`, `cosh`, `atan2` and `pow` with a
+fractional exponent; `exp`, `log`, `tanh`, `sqrt`, `sin` and `cos` do not.
 """
 
 import operator

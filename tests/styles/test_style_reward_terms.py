@@ -76,6 +76,18 @@ def test_tolerance_has_finite_gradients(sigmoid, bounds):
     assert x.grad.isfinite().all()
 
 
+@pytest.mark.parametrize("sigmoid", SIGMOIDS)
+def test_tolerance_has_the_same_bits_in_every_layout(sigmoid):
+    """Vectorised and scalar kernels may differ in the last bit; what the terms use must not."""
+    x = torch.randn(1024, 7, generator=torch.Generator().manual_seed(0)) * 2
+    table = tolerance(x, -0.3, 0.4, 1.3, sigmoid)
+    assert tolerance(x[:, 3], -0.3, 0.4, 1.3, sigmoid).equal(table[:, 3])
+    assert tolerance(x.T.contiguous().T, -0.3, 0.4, 1.3, sigmoid).equal(table)
+    assert tolerance(x[:, None, 3].expand(-1, 5), -0.3, 0.4, 1.3, sigmoid)[:, 2].equal(table[:, 3])
+    alone = torch.stack([tolerance(value, -0.3, 0.4, 1.3, sigmoid) for value in x[:200, 3]])
+    assert alone.equal(table[:200, 3])
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
