@@ -1,10 +1,10 @@
 """Forward and backward of a residual network by hand, for one network or an ensemble of equal ones.
 
 The same numbers as `ResidualMLP` gives layer by layer, with less work: no autograd node per operation, weights that
-were cast to bfloat16 once per update instead of at every use, no gradient that nobody asked for. On CPUs only; see
-`ResidualMLP.forward` for when it is taken.
+were cast to bfloat16 once per update instead of at every use, gradients written to where the optimiser reads them, and
+no gradient that nobody asked for. The learner uses it during its updates, on CPUs.
 
-Numerics at bfloat16: products accumulate in float32, layer-norm statistics, heads, parameters and their gradients are
+Numerics at bfloat16: products accumulate in float32; layer-norm statistics, heads, parameters and their gradients are
 float32; activations between the layers are bfloat16.
 """
 
@@ -32,6 +32,11 @@ class Layer:
     eps: float
     norm: bool
 
+    @property
+    def tensors(self) -> int:
+        """Number of parameters: weight, bias, and the layer norm's scale and shift."""
+        return 4 if self.norm else 2
+
     def skip(self, x: Tensor, hidden: Tensor, *, inplace: bool) -> Tensor:
         """Return `hidden + fit(x)`; `hidden` may be overwritten if `inplace`."""
         n, m = self.in_features, self.out_features
@@ -57,114 +62,116 @@ class Layer:
         return self.side == "end" or self.narrowing == "keep_first"
 
 
-@dataclass
+@dataclass(frozen=True)
+class Member:
+    """Tensors of one network, none of which autograd knows.
+
+    Args:
+        parameters: Per layer weight `(o, i)`, bias `(o,)`, and with layer norm scale and shift `(o,)`; then weight and
+            bias of the head.
+        products: The same list in the dtype of the matrix products (only weights and biases of the layers are read).
+        grads: Where the parameters' gradients go, or empty if nobody wants them.
+    """
+
+    parameters: list[Tensor]
+    products: list[Tensor]
+    grads: list[Tensor]
+
+
 class Plan:
-    """What the hand-written network needs besides tensors that carry gradients.
+    """How to evaluate a residual network, or an ensemble of them, with the hand-written passes.
 
     Args:
         layers: The residual layers.
         head: Whether a linear head follows.
-        low: Weights and biases of the layers in the dtype of the products, `(K, ...)` for an ensemble; `None` to use
-            the parameters themselves.
+        members: The networks' tensors.
+        stacked: Whether the output has a leading dimension for the members.
     """
 
-    layers: tuple[Layer, ...]
-    head: bool
-    low: Sequence[Tensor] | None = None
+    def __init__(self, layers: Sequence[Layer], head: bool, members: Sequence[Member], stacked: bool) -> None:
+        self.layers = tuple(layers)
+        self.head = head
+        self.members = tuple(members)
+        self.stacked = stacked
+        # Stands for the parameters in autograd's graph, so that an output without other trained inputs has a gradient.
+        self.anchor = torch.zeros((), requires_grad=True) if members[0].grads else None
+        self.written = False
+
+    def begin(self) -> None:
+        """Forget the gradients: the next backward pass overwrites them, further ones add to them."""
+        self.written = False
+
+    def finish(self) -> None:
+        """Make the gradients zero if no backward pass came by."""
+        if not self.written:
+            for member in self.members:
+                for grad in member.grads:
+                    grad.zero_()
 
 
-def residual_network(plan: Plan, inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> Tensor:
-    """Evaluate the network on the concatenation of `inputs`.
+def residual_network(plan: Plan, inputs: Sequence[Tensor]) -> Tensor:
+    """Evaluate a network, or each member of an ensemble, on the concatenation of `inputs`.
 
     Args:
-        plan: Shapes and low-precision weights.
-        inputs: Tensors `(..., d_i)` whose widths add up to the first layer's; `(K, ..., d_i)` for an ensemble.
-        parameters: Per layer weight `(o, i)`, bias `(o,)`, and (with layer norm) scale and shift `(o,)`; then weight
-            and bias of the head. All with a leading K for an ensemble.
+        plan: The network.
+        inputs: Tensors `(..., d_i)` whose widths add up to the first layer's.
 
     Returns:
-        `(..., out)`, float32 with a head.
+        `(..., out)`, or `(K, ..., out)` for an ensemble; float32 with a head.
     """
-    return _Residual.apply(plan, len(inputs), *inputs, *parameters)  # pyright: ignore[reportReturnType]
+    return _Residual.apply(plan, plan.anchor if torch.is_grad_enabled() else None, *inputs)  # pyright: ignore[reportReturnType]
 
 
 class _Residual(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, plan: Plan, n_inputs: int, *tensors: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        inputs, parameters = tensors[:n_inputs], tensors[n_inputs:]
-        ensemble = parameters[0].shape[0] if parameters[0].ndim == 3 else 0
-        x, lead = _concatenate(inputs, ensemble, parameters[0].dtype if plan.low is None else plan.low[0].dtype)
+    def forward(ctx: Any, plan: Plan, anchor: Tensor | None, *inputs: Tensor) -> Tensor:  # pyright: ignore
+        lead = inputs[0].shape[:-1]
+        dtype = plan.members[0].products[0].dtype
+        x = torch.cat([t.to(dtype) for t in inputs], -1).flatten(0, -2)
         keep = any(ctx.needs_input_grad)
         outs, saved = [], []
-        for k in range(max(ensemble, 1)):
-            own, low = _member(plan, parameters, k if ensemble else None)
-            out, kept = _forward(plan, x[k] if x.ndim == 3 else x, own, low, keep)
+        for member in plan.members:
+            out, kept = _forward(plan, x, member, keep)
             outs.append(out)
             saved.append(kept)
         if keep:
-            ctx.plan, ctx.n_inputs, ctx.ensemble, ctx.saved, ctx.parameters = (
-                plan,
-                n_inputs,
-                ensemble,
-                saved,
-                parameters,
-            )
-            ctx.widths, ctx.lead = [t.shape[-1] for t in inputs], lead
-            ctx.input_dtypes = [t.dtype for t in inputs]
-        if ensemble:
-            return torch.stack(outs).reshape(ensemble, *lead, -1)
-        return outs[0].reshape(*lead, -1)
+            ctx.plan, ctx.saved, ctx.lead = plan, saved, lead
+            ctx.facts = [(t.shape[-1], t.dtype) for t in inputs]
+        if plan.stacked:
+            return torch.stack(outs).view(len(outs), *lead, -1)
+        return outs[0].view(*lead, -1)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         plan: Plan = ctx.plan
-        n, ensemble, parameters = ctx.n_inputs, ctx.ensemble, ctx.parameters
         if ctx.saved is None:
             raise RuntimeError("the residual network keeps its activations for one backward pass only")
-        needs = ctx.needs_input_grad[2:]
-        need_weights = any(needs[n:])
-        columns = _columns(ctx.widths, needs[:n])
-        weight_grads: list[Tensor] = [torch.empty_like(p) for p in parameters] if need_weights else []
-        input_grads: list[Tensor] = []
-        grad = grad.reshape(max(ensemble, 1), -1, grad.shape[-1])
-        for k in range(max(ensemble, 1)):
-            own, low = _member(plan, parameters, k if ensemble else None)
-            into = [g[k] for g in weight_grads] if ensemble else weight_grads
-            input_grads.append(_backward(plan, grad[k], ctx.saved[k], own, low, into, columns))
+        _, trained, *needs = ctx.needs_input_grad
+        columns = _columns([width for width, _ in ctx.facts], needs)
+        count = ctx.lead.numel()
+        grad = grad.reshape(len(plan.members), count, grad.shape[-1])
+        dx: Tensor | None = None
+        for k, member in enumerate(plan.members):
+            rows = None if trained else _active_rows(grad[k])
+            own = _backward(plan, grad[k], ctx.saved[k], member, trained, rows, columns)
+            if columns is None:
+                continue
+            if dx is None:
+                if rows is None:
+                    dx = own
+                    continue
+                dx = own.new_zeros(count, own.shape[1])
+            dx = dx.add_(own) if rows is None else dx.index_add_(0, rows, own)
         ctx.saved = None
-        grads: list[Tensor | None] = [None] * n
-        if columns is not None:
-            dx = torch.stack(input_grads) if ensemble else input_grads[0]
-            dx = dx.reshape(*((ensemble,) if ensemble else ()), *ctx.lead, -1)
-            start = 0
-            for i, width in enumerate(ctx.widths):
-                if columns.start <= start < columns.stop and needs[i]:
-                    grads[i] = dx[..., start - columns.start : start - columns.start + width].to(ctx.input_dtypes[i])
+        plan.written = plan.written or trained
+        grads: list[Tensor | None] = [None] * len(needs)
+        if columns is not None and dx is not None:
+            start = -columns.start
+            for i, (width, dtype) in enumerate(ctx.facts):
+                if needs[i]:
+                    grads[i] = dx[:, start : start + width].to(dtype).view(*ctx.lead, width)
                 start += width
-        return (None, None, *grads, *(weight_grads if need_weights else [None] * len(parameters)))
-
-
-def _member(plan: Plan, parameters: Sequence[Tensor], k: int | None) -> tuple[list[Tensor], list[Tensor]]:
-    """Parameters, and weights and biases for the products, of member `k` of an ensemble (or of the one network)."""
-    own = list(parameters) if k is None else [p[k] for p in parameters]
-    if plan.low is not None:
-        return own, list(plan.low) if k is None else [p[k] for p in plan.low]
-    low, i = [], 0
-    for layer in plan.layers:
-        low += own[i : i + 2]
-        i += 4 if layer.norm else 2
-    return own, low
-
-
-def _concatenate(inputs: Sequence[Tensor], ensemble: int, dtype: torch.dtype) -> tuple[Tensor, torch.Size]:
-    """Concatenate to `(rows, d)`, or `(K, rows, d)` if the members of an ensemble see different inputs."""
-    if not ensemble:
-        lead = inputs[0].shape[:-1]
-        return torch.cat([t.to(dtype) for t in inputs], -1).reshape(lead.numel(), -1), lead
-    lead = inputs[0].shape[1:-1]
-    if all(t.stride(0) == 0 for t in inputs):  # expanded: one input for all members
-        return torch.cat([t[0].to(dtype) for t in inputs], -1).reshape(lead.numel(), -1), lead
-    return torch.cat([t.to(dtype) for t in inputs], -1).reshape(ensemble, lead.numel(), -1), lead
+        return (None, torch.zeros(()) if trained else None, *grads)
 
 
 def _columns(widths: Sequence[int], needs: Sequence[bool]) -> slice | None:
@@ -177,23 +184,19 @@ def _columns(widths: Sequence[int], needs: Sequence[bool]) -> slice | None:
     return slice(min(wanted), max(wanted)) if wanted else None
 
 
-def _forward(
-    plan: Plan, x: Tensor, own: list[Tensor], low: list[Tensor], keep: bool
-) -> tuple[Tensor, list[tuple[Tensor, ...]]]:
+def _forward(plan: Plan, x: Tensor, member: Member, keep: bool) -> tuple[Tensor, list[tuple[Tensor, ...]]]:
     kept: list[tuple[Tensor, ...]] = []
-    i = j = 0
+    own, low, i = member.parameters, member.products, 0
     for layer in plan.layers:
-        z = torch.addmm(low[j + 1], x, low[j].t())
-        mean = rstd = z
+        z = torch.addmm(low[i + 1], x, low[i].t())
+        y, mean, rstd = z, z, z
         if layer.norm:
             y, mean, rstd = torch.native_layer_norm(z, (layer.out_features,), own[i + 2], own[i + 3], layer.eps)
-            i, j = i + 4, j + 2
-        else:
-            y, i, j = z, i + 2, j + 2
         _relu_(y)
         if keep:
             kept.append((x, z, mean, rstd, y))
         x = layer.skip(x, y, inplace=not keep)
+        i += layer.tensors
     if not plan.head:
         return x, kept
     hidden = x.to(own[i].dtype)
@@ -206,51 +209,53 @@ def _backward(
     plan: Plan,
     grad: Tensor,
     kept: list[tuple[Tensor, ...]],
-    own: list[Tensor],
-    low: list[Tensor],
-    into: list[Tensor],
+    member: Member,
+    trained: bool,
+    rows: Tensor | None,
     columns: slice | None,
 ) -> Tensor:
-    """Write the parameters' gradients into `into` (if any) and return the inputs' gradient for `columns`."""
-    rows = None if into else _active_rows(grad)
-    count = grad.shape[0]
+    """Write the parameters' gradients if `trained`, and return the inputs' gradient for `columns` of the `rows`."""
+    own, low, into, add = member.parameters, member.products, member.grads, plan.written
+    i = len(own)
     if rows is not None:
         grad = grad.index_select(0, rows)
-    i = len(own)
     if plan.head:
         i -= 2
-        if into:
-            (hidden,) = kept[-1]
-            torch.mm(grad.t(), hidden, out=into[i])
-            torch.sum(grad, 0, out=into[i + 1])
+        if trained:
+            _write(into[i], torch.mm(grad.t(), kept[-1][0]), add)
+            _write(into[i + 1], grad.sum(0), add)
         grad = torch.mm(grad, own[i])
     grad = grad.to(low[0].dtype)
-    j = 2 * len(plan.layers)
     for index in reversed(range(len(plan.layers))):
         layer = plan.layers[index]
+        i -= layer.tensors
         x, z, mean, rstd, y = kept[index]
         if rows is not None:
             y, z = y.index_select(0, rows), z.index_select(0, rows)
             mean, rstd = (mean.index_select(0, rows), rstd.index_select(0, rows)) if layer.norm else (z, z)
-        i, j = i - (4 if layer.norm else 2), j - 2
         dz = _relu_backward(grad, y)
         if layer.norm:
             dz, dscale, dshift = torch.ops.aten.native_layer_norm_backward(
-                dz, z, (layer.out_features,), mean, rstd, own[i + 2], own[i + 3], (True, bool(into), bool(into))
+                dz, z, (layer.out_features,), mean, rstd, own[i + 2], own[i + 3], (True, trained, trained)
             )
-            if into:
-                into[i + 2].copy_(dscale)
-                into[i + 3].copy_(dshift)
-        if into:
-            into[i].copy_(torch.mm(dz.t(), x))
-            into[i + 1].copy_(torch.sum(dz, 0))
+            if trained:
+                _write(into[i + 2], dscale, add)
+                _write(into[i + 3], dshift, add)
+        if trained:
+            _write(into[i], torch.mm(dz.t(), x), add)
+            _write(into[i + 1], dz.sum(0), add)
         if index:
-            grad = torch.addmm(layer.skip_adjoint(grad), dz, low[j])
+            grad = torch.addmm(layer.skip_adjoint(grad), dz, low[i])
         elif columns is not None:
-            grad = torch.addmm(layer.skip_adjoint(grad)[:, columns], dz, low[j][:, columns])
-    if rows is None or columns is None:
-        return grad
-    return torch.zeros(count, grad.shape[1], dtype=grad.dtype).index_copy_(0, rows, grad)
+            grad = layer.skip_adjoint(grad)[:, columns] + torch.mm(dz, low[i][:, columns])
+    return grad
+
+
+def _write(into: Tensor, value: Tensor, add: bool) -> None:
+    if add:
+        into.add_(value)
+    else:
+        into.copy_(value)
 
 
 def _relu_(x: Tensor) -> None:
@@ -279,8 +284,6 @@ def _active_rows(grad: Tensor) -> Tensor | None:
 
     The policy's loss follows the smaller of the critics' values, so each critic receives about half of the rows.
     """
-    if grad.device.type != "cpu":
-        return None  # counting would wait for the device
     count = grad.shape[0]
     active = (grad != 0).any(-1)
     wanted = -(-int(active.sum()) // _ROWS) * _ROWS

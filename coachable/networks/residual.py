@@ -158,7 +158,7 @@ class ResidualMLP(nn.Module):
         Without a head this returns the last layer's features.
         """
         if self._plan is not None:
-            return residual_network(self._plan, inputs, self.ordered_parameters())
+            return residual_network(self._plan, inputs)
         x = inputs[0] if len(inputs) == 1 else torch.cat(inputs, -1)
         hidden = self.blocks(x)
         if self.head is None:
@@ -166,9 +166,9 @@ class ResidualMLP(nn.Module):
         with torch.autocast(x.device.type, enabled=False):
             return self.head(hidden.to(self.head.weight.dtype))
 
-    def plan(self) -> Plan:
-        """Describe this network for :func:`~coachable.networks.fused.residual_network`."""
-        layers = tuple(
+    def layers(self) -> tuple[Layer, ...]:
+        """Shapes of the layers, for :mod:`coachable.networks.fused`."""
+        return tuple(
             Layer(
                 in_features=block.linear.in_features,
                 out_features=block.linear.out_features,
@@ -180,25 +180,13 @@ class ResidualMLP(nn.Module):
             for block in self.blocks
             if isinstance(block, ResidualBlock)
         )
-        return Plan(layers, head=self.head is not None)
 
     def use_plan(self, plan: Plan | None) -> None:
         """Evaluate with the hand-written passes from now on, or layer by layer again (`None`).
 
-        The learner does so during its updates only: a plan with bfloat16 weights is stale once the parameters change.
+        With a plan, gradients go where the plan says and not into the parameters' `.grad`.
         """
         self._plan = plan
-
-    def ordered_parameters(self) -> list[Tensor]:
-        """Parameters in the order of :func:`~coachable.networks.fused.residual_network`."""
-        tensors: list[Tensor] = []
-        for block in self.blocks:
-            tensors += [block.linear.weight, block.linear.bias]  # pyright: ignore
-            if block.norm is not None:
-                tensors += [block.norm.weight, block.norm.bias]  # pyright: ignore
-        if self.head is not None:
-            tensors += [self.head.weight, self.head.bias]
-        return tensors
 
 
 def _sides(padding: Padding | Sequence[Side], layers: int) -> tuple[Side, ...]:

@@ -7,16 +7,20 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
-from coachable.networks.ensemble import CriticEnsemble, Shadow, residual_networks
+from coachable.networks.ensemble import CriticEnsemble, Triple, make_plan, planned_copy, residual_networks
+from coachable.networks.flat import FlatBuffers
 
 
 class Acceleration:
-    """Hand-written forward and backward of a loss's policy and critics, in one precision.
+    """Hand-written passes for a loss's policy and critics.
 
-    The critics are taken over for good (their parameters live in the loss, their modules are ours); the policy only
-    inside :meth:`active`, since a collector may share it.
+    Gradients go to the parameters' `.grad`, which are parts of one buffer each for the policy and the critics. Outside
+    of :meth:`active` the loss is as it was.
 
     Args:
         loss_module: A loss for which :meth:`supports` holds.
@@ -25,48 +29,112 @@ class Acceleration:
 
     def __init__(self, loss_module: LossModule, dtype: torch.dtype | None) -> None:
         loss: Any = loss_module
-        self._critics = CriticEnsemble(
-            loss.qvalue_network, loss.qvalue_network_params, loss.target_qvalue_network_params, dtype
-        )
-        loss._vmap_qnetworkN0 = self._critics
-        self._loss, self._dtype = loss, dtype
-        self.bind()
+        self._loss = loss
+        actor, critic = loss.actor_network, loss.qvalue_network
+        actor_names = [name for name, _ in actor.named_parameters()]
+        critic_names = [name for name, _ in critic.named_parameters()]
+        actor_params = _leaves(loss.actor_network_params, actor_names)
+        critic_params = _leaves(loss.qvalue_network_params, critic_names)
+        self.actor = FlatBuffers(actor_params, dtype, trained=True)
+        self.critic = FlatBuffers(critic_params, dtype, trained=True)
+        self._trained = [*zip(actor_params, self.actor.grads, strict=True)]
+        self._trained += zip(critic_params, self.critic.grads, strict=True)
+        self.target = FlatBuffers(_leaves(loss.target_qvalue_network_params, critic_names), dtype, trained=False)
+        members = self.critic.tensors[0].shape[0]
+
+        self._policies = residual_networks(actor)
+        self._actor_plans = {
+            name: make_plan(network, name, _triples(self.actor, actor_names), 0, trained=True)
+            for name, network in self._policies.items()
+        }
+
+        def critics(flat: FlatBuffers, trained: bool) -> TensorDictModule:
+            tensors = _triples(flat, critic_names)
+            networks = residual_networks(critic).items()
+            plans = {name: make_plan(net, name, tensors, members, trained=trained) for name, net in networks}
+            module = planned_copy(critic, plans)
+            assert isinstance(module, TensorDictModule)
+            if trained:
+                self._critic_plans = plans
+            return module
+
+        self.trained_critics = critics(self.critic, True).module
+        self.frozen_critics = critics(self.critic, False).module
+        self.target_critics = critics(self.target, False).module
+        self._ensemble = CriticEnsemble(critic, self._choose, members)
 
     @staticmethod
     def supports(loss_module: LossModule) -> bool:
         """Whether all networks are residual ones, on a CPU, and the critics are evaluated in SACLoss's way."""
         loss: Any = loss_module
-        device = next(loss_module.parameters()).device
+        critic = getattr(loss, "qvalue_network", None)
+        trained = {name.split(".")[0] for name, p in loss_module.named_parameters() if p.requires_grad}
         return (
-            device.type == "cpu"
-            and hasattr(loss, "_vmap_qnetworkN0")
-            and getattr(loss, "value_network", None) is None
-            and CriticEnsemble.supports(loss.qvalue_network)
-            and residual_networks(loss.actor_network) is not None
+            hasattr(loss, "_vmap_qnetworkN0")
+            and trained <= {"actor_network_params", "qvalue_network_params", "log_alpha"}
+            and all(p.device.type == "cpu" for p in loss_module.parameters())
+            and isinstance(critic, TensorDictModule)
+            and isinstance(critic.module, nn.Module)
+            and bool(residual_networks(critic))
+            and bool(residual_networks(loss.actor_network))
+            and any(name.startswith("target_qvalue_network_params") for name, _ in loss_module.named_buffers())
         )
 
-    def bind(self) -> None:
-        """Take hold of the loss's tensors (again, after they were replaced rather than overwritten)."""
-        self._critics.bind()
-        self._policies = residual_networks(self._loss.actor_network) or []
-        self._shadow = Shadow(self._policies, self._dtype)
+    def _choose(self, params: TensorDictBase) -> nn.Module:
+        loss = self._loss
+        if params is loss.qvalue_network_params:
+            return self.trained_critics
+        if params is loss.target_qvalue_network_params:
+            return self.target_critics
+        first: Tensor = next(iter(params.values(True, True)))  # pyright: ignore[reportAssignmentType]
+        own: Tensor = next(iter(loss.qvalue_network_params.values(True, True)))
+        if first.data_ptr() == own.data_ptr() and not first.requires_grad:
+            return self.frozen_critics
+        raise RuntimeError(
+            f"{type(loss).__name__} evaluates its critics with parameters that are neither its own nor its targets': "
+            "pass fused=False to the learner"
+        )
 
     @contextmanager
     def active(self) -> Iterator[None]:
-        """Renew all low-precision weights and evaluate the policy with them inside the block."""
-        self._critics.refresh()
-        self._shadow.refresh()
-        for network, plan in zip(self._policies, self._shadow.plans, strict=True):
-            network.use_plan(plan)
+        """Evaluate policy and critics with the hand-written passes inside the block."""
+        loss = self._loss
+        ordinary = loss._vmap_qnetworkN0
+        for flat in (self.actor, self.critic, self.target):
+            flat.refresh()
+        for plan in (*self._actor_plans.values(), *self._critic_plans.values()):
+            plan.begin()
+        for parameter, grad in self._trained:
+            parameter.grad = grad
+        loss._vmap_qnetworkN0 = self._ensemble
+        for name, network in self._policies.items():
+            network.use_plan(self._actor_plans[name])
         try:
             yield
         finally:
-            for network in self._policies:
+            loss._vmap_qnetworkN0 = ordinary
+            for network in self._policies.values():
                 network.use_plan(None)
 
+    def gradient(self, name: str) -> Tensor:
+        """Gradient of the `"actor"` or the `"critic"` as one vector, after the backward pass."""
+        for plan in (self._actor_plans if name == "actor" else self._critic_plans).values():
+            plan.finish()
+        return (self.actor if name == "actor" else self.critic).grad
+
     def refresh(self, name: str) -> None:
-        """Renew the low-precision weights of the `"actor"` or the `"critic"` after its optimiser's step."""
-        if name == "actor":
-            self._shadow.refresh()
-        elif name == "critic":
-            self._critics.refresh(target=False)
+        """Renew the rounded weights of the `"actor"` or the `"critic"` after its optimiser's step."""
+        (self.actor if name == "actor" else self.critic).refresh()
+
+    def move_targets(self, tau: float) -> None:
+        """Polyak averaging of the target networks."""
+        torch._foreach_lerp_(self.target.tensors, self.critic.tensors, tau)
+
+
+def _leaves(params: TensorDictBase, names: list[str]) -> list[Tensor]:
+    return [params.get(tuple(name.split("."))) for name in names]  # pyright: ignore[reportReturnType]
+
+
+def _triples(flat: FlatBuffers, names: list[str]) -> dict[str, Triple]:
+    grads = flat.grads or [None] * len(names)
+    return dict(zip(names, zip(flat.tensors, flat.low, grads, strict=True), strict=True))

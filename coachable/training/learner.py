@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal, get_args
 
@@ -83,28 +83,25 @@ class Learner:
         self.max_grad_norm = max_grad_norm
         self.check_every = check_every
         self.updates = 0
-        groups = _parameter_groups(loss_module)
-        self._actor, self._critic, self._alpha = groups
-        device = self._actor[0].device
+        self.tau = tau
+        params = _parameter_groups(loss_module)
+        device = params["actor"][0].device
         self.precision = resolve_precision(precision, device)
         self._device_type = device.type
-
-        def adam(params: Iterable[nn.Parameter], lr: float) -> torch.optim.Adam:
-            return torch.optim.Adam(params, lr=lr, eps=adam_eps, fused=device.type in ("cpu", "cuda"))
-
-        self.optimizers: dict[str, torch.optim.Optimizer] = {
-            "actor": adam(self._actor, actor_lr),
-            "critic": adam(self._critic, critic_lr),
-        }
-        if self._alpha:
-            self.optimizers["alpha"] = adam(self._alpha, alpha_lr)
         self.target_updater = SoftUpdate(loss_module, tau=tau)
-        self._forward: Callable[..., Any] = loss_module.forward
-        self._actor_loss: Callable[..., Any] = loss_module.actor_loss
-        self._critic_loss: Callable[..., Any] = _critic_loss_of(loss_module)
         self._acceleration: Acceleration | None = None
         if fused and not compile and Acceleration.supports(loss_module):
             self._acceleration = Acceleration(loss_module, torch.bfloat16 if self.precision == "bf16" else None)
+        self._params = params
+        rates = {"actor": actor_lr, "critic": critic_lr, "alpha": alpha_lr}
+        self.optimizers: dict[str, torch.optim.Optimizer] = {
+            name: torch.optim.Adam(group, lr=rates[name], eps=adam_eps, fused=device.type in ("cpu", "cuda"))
+            for name, group in params.items()
+            if group
+        }
+        self._forward: Callable[..., Any] = loss_module.forward
+        self._actor_loss: Callable[..., Any] = loss_module.actor_loss
+        self._critic_loss: Callable[..., Any] = _critic_loss_of(loss_module)
         if compile:
             self._forward = torch.compile(self._forward)
             self._actor_loss = torch.compile(self._actor_loss)
@@ -128,7 +125,10 @@ class Learner:
         """
         with self._networks():
             metrics = self._simultaneous(batch) if self.update_order == "simultaneous" else self._sequential(batch)
-        self.target_updater.step()
+        if self._acceleration is None:
+            self.target_updater.step()
+        else:
+            self._acceleration.move_targets(self.tau)
         self.updates += 1
         # A NaN parameter can hide behind a rectifier in the losses, but not in the gradients.
         total = sum(metrics[key] for key in ("loss_actor", "loss_qvalue", "grad_norm_actor", "grad_norm_critic"))
@@ -160,8 +160,6 @@ class Learner:
         self.loss_module.load_state_dict(state["loss_module"])
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
-        if self._acceleration is not None:
-            self._acceleration.bind()
         self.updates = int(state["updates"])
         self._non_finite.zero_()
 
@@ -173,13 +171,20 @@ class Learner:
             return nullcontext()
         return torch.autocast(self._device_type, dtype=torch.bfloat16)
 
-    def _step(self, name: str, parameters: list[nn.Parameter]) -> Tensor:
-        norm = torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
-        if self.max_grad_norm is not None:
-            torch.nn.utils.clip_grads_with_norm_(parameters, self.max_grad_norm, norm)
-        self.optimizers[name].step()
-        self.optimizers[name].zero_grad(set_to_none=True)
-        if self._acceleration is not None and self.update_order != "simultaneous":
+    def _step(self, name: str) -> Tensor:
+        """Clip, step, and return the norm of the gradient before clipping."""
+        params, optimizer = self._params[name], self.optimizers[name]
+        accelerated = self._acceleration is not None and name != "alpha"
+        if accelerated:
+            norm = torch.linalg.vector_norm(self._acceleration.gradient(name))
+        else:
+            norm = torch.nn.utils.get_total_norm([p.grad for p in params if p.grad is not None])
+        if self.max_grad_norm is not None and name != "alpha":
+            torch.nn.utils.clip_grads_with_norm_(params, self.max_grad_norm, norm)
+        optimizer.step()
+        if not accelerated:
+            optimizer.zero_grad(set_to_none=True)
+        elif self.update_order != "simultaneous":
             self._acceleration.refresh(name)
         return norm
 
@@ -187,14 +192,14 @@ class Learner:
         with self._autocast():
             losses = self._forward(batch)
         total = losses["loss_actor"] + losses["loss_qvalue"]
-        if self._alpha:
+        if self._params["alpha"]:
             total = total + losses["loss_alpha"]
         total.backward()
         metrics = {key: losses[key].detach() for key in ("loss_actor", "loss_qvalue", "alpha", "entropy")}
-        metrics["grad_norm_actor"] = self._step("actor", self._actor)
-        metrics["grad_norm_critic"] = self._step("critic", self._critic)
-        if self._alpha:
-            self._step("alpha", self._alpha)
+        metrics["grad_norm_actor"] = self._step("actor")
+        metrics["grad_norm_critic"] = self._step("critic")
+        if self._params["alpha"]:
+            self._step("alpha")
         metrics["td_error"] = batch.get("td_error").mean()
         return metrics
 
@@ -205,7 +210,7 @@ class Learner:
             loss_qvalue, extra = self._critic_loss(batch)
         loss_qvalue.backward()
         metrics["loss_qvalue"] = loss_qvalue.detach()
-        metrics["grad_norm_critic"] = self._step("critic", self._critic)
+        metrics["grad_norm_critic"] = self._step("critic")
         batch.set("td_error", extra["td_error"])
         metrics["td_error"] = extra["td_error"].mean()
         if not policy_first:
@@ -216,35 +221,30 @@ class Learner:
         with self._autocast():
             loss_actor, extra = self._actor_loss(batch)
         loss_actor.backward()
-        metrics = {"loss_actor": loss_actor.detach(), "grad_norm_actor": self._step("actor", self._actor)}
+        metrics = {"loss_actor": loss_actor.detach(), "grad_norm_actor": self._step("actor")}
         if "log_prob" in extra:
             log_prob = extra["log_prob"]
             metrics["entropy"] = -log_prob.mean()
             metrics["alpha"] = self.loss_module.log_alpha.detach().exp()
-            if self._alpha:
+            if self._params["alpha"]:
                 self.loss_module.alpha_loss(log_prob).mean().backward()
-                self._step("alpha", self._alpha)
+                self._step("alpha")
         return metrics
 
 
-def _parameter_groups(
-    loss_module: LossModule,
-) -> tuple[list[nn.Parameter], list[nn.Parameter], list[nn.Parameter]]:
+def _parameter_groups(loss_module: LossModule) -> dict[str, list[nn.Parameter]]:
     """Split the trainable parameters into the policy's, the critics' and the temperature."""
-    actor: list[nn.Parameter] = []
-    critic: list[nn.Parameter] = []
-    alpha: list[nn.Parameter] = []
+    groups: dict[str, list[nn.Parameter]] = {"actor": [], "critic": [], "alpha": []}
     for name, parameter in loss_module.named_parameters():
-        if not parameter.requires_grad:
-            continue
-        group = actor if name.startswith("actor_network_params") else alpha if name == "log_alpha" else critic
-        group.append(parameter)
-    if not actor or not critic:
+        if parameter.requires_grad:
+            kind = "actor" if name.startswith("actor_network_params") else "alpha" if name == "log_alpha" else "critic"
+            groups[kind].append(parameter)
+    if not groups["actor"] or not groups["critic"]:
+        missing = "critics" if groups["actor"] else "a policy (actor_network_params)"
         raise ValueError(
-            f"{type(loss_module).__name__} has no trainable parameters "
-            f"{'under actor_network_params' if not actor else 'of critics'}: the learner needs a policy and critics"
+            f"{type(loss_module).__name__} has no trainable parameters of {missing}: the learner needs both"
         )
-    return actor, critic, alpha
+    return groups
 
 
 def _critic_loss_of(loss_module: LossModule) -> Callable[..., Any]:

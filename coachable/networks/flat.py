@@ -1,0 +1,41 @@
+"""Gradients and rounded copies of a network's parameters, each kind in one contiguous buffer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+_ALIGN = 32  # elements: one cache line of 64 bytes at bfloat16, so that products see aligned matrices
+
+
+class FlatBuffers:
+    """What the hand-written passes keep besides the parameters, which stay where they are.
+
+    Args:
+        tensors: Float tensors on one device, trained parameters or not.
+        low_dtype: Dtype of the rounded copies; `None` to use the tensors themselves.
+        trained: Whether there are gradients.
+    """
+
+    def __init__(self, tensors: Sequence[Tensor], low_dtype: torch.dtype | None, trained: bool) -> None:
+        self.tensors = [tensor.detach() for tensor in tensors]
+        self.low = self.tensors if low_dtype is None else self._views(low_dtype)[1]
+        self.grad, self.grads = self._views(self.tensors[0].dtype) if trained else (torch.zeros(0), [])
+        self._rounds = low_dtype is not None
+
+    def refresh(self) -> None:
+        """Renew the rounded copies."""
+        if self._rounds:
+            torch._foreach_copy_(self.low, self.tensors)
+
+    def _views(self, dtype: torch.dtype) -> tuple[Tensor, list[Tensor]]:
+        """A buffer of zeros, and its parts in the shapes of the tensors."""
+        starts, total = [], 0
+        for tensor in self.tensors:
+            starts.append(total)
+            total += -(-tensor.numel() // _ALIGN) * _ALIGN
+        buffer = torch.zeros(total, dtype=dtype, device=self.tensors[0].device)
+        parts = zip(starts, self.tensors, strict=True)
+        return buffer, [buffer[start : start + t.numel()].view(t.shape) for start, t in parts]
