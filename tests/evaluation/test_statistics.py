@@ -1,0 +1,32 @@
+import numpy as np
+import pytest
+
+from coachable.evaluation.statistics import bootstrap_interval, interquartile_mean, rank_correlation
+
+
+def test_interquartile_mean_drops_a_quarter_at_each_end():
+    assert interquartile_mean(np.array([100.0, 1.0, 2.0, -50.0])) == 1.5
+    np.testing.assert_allclose(interquartile_mean(np.arange(16.0).reshape(2, 8)), [3.5, 11.5])
+
+
+def test_bootstrap_interval_of_a_mean_matches_the_normal_one():
+    values = np.random.default_rng(0).normal(3.0, 2.0, 400)
+    low, high = bootstrap_interval(values)
+    error = 1.96 * values.std() / 20
+    assert low == pytest.approx(values.mean() - error, abs=0.15 * error)
+    assert high == pytest.approx(values.mean() + error, abs=0.15 * error)
+
+
+def test_bootstrap_interval_leaves_nan_out():
+    assert bootstrap_interval(np.array([1.0, np.nan, 1.0])) == (1.0, 1.0)
+    assert np.isnan(bootstrap_interval(np.array([np.nan]))).all()
+
+
+def test_rank_correlation():
+    x = np.array([1.0, 2.0, 3.0, 4.0])
+    assert rank_correlation(x, np.exp(x)) == pytest.approx(1.0)
+    assert rank_correlation(x, -(x**3)) == pytest.approx(-1.0)
+    # Ranks 1, 2.5, 2.5, 4 against 1..4: covariance 4.5, variances 4.5 and 5.
+    assert rank_correlation(x, np.array([0.0, 5.0, 5.0, 9.0])) == pytest.approx(4.5 / np.sqrt(4.5 * 5))
+    assert np.isnan(rank_correlation(x, np.ones(4)))
+    assert rank_correlation(np.array([1.0, 2.0, np.nan]), np.array([3.0, 4.0, 0.0])) == pytest.approx(1.0)

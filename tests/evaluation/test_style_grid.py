@@ -1,0 +1,162 @@
+"""The grid, the switching test and their files, on an env whose outcome is known: its action is its measured style."""
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from coachable.domain import Domain, load_domain
+from coachable.evaluation.rollouts import record_episodes
+from coachable.evaluation.style_grid import evaluate_grid, markdown_table, write_csv
+from coachable.evaluation.switching import evaluate_switching
+from coachable.styles import Choice, Setpoint, StyleReward, StyleSpace, Term
+from coachable.transforms import coachable_env
+
+SPACE = StyleSpace([Choice("hat", ("red", "blue")), Setpoint("speed", 0.0, 2.0, unit="m/s")], name="toy")
+
+
+class ToyEnv(EnvBase):
+    """`style_features` is the action. Ends after 5 steps where the action exceeds 1.5."""
+
+    def __init__(self, num_envs, num_threads=None):
+        super().__init__(batch_size=[num_envs])
+        n = num_envs
+        one = Unbounded(shape=(n, 1))
+        self.observation_spec = Composite(observation=one, task_reward=one, style_features=one, shape=(n,))
+        self.action_spec = Bounded(0, 2, shape=(n, 1))
+        self.reward_spec = one.clone()
+        flags = {name: Binary(n=1, shape=(n, 1), dtype=torch.bool) for name in ("done", "terminated", "truncated")}
+        self.done_spec = Composite(flags, shape=(n,))
+        self.steps = 0
+
+    def _set_seed(self, seed):
+        pass
+
+    def _outputs(self, value, terminated):
+        return TensorDict(
+            {
+                "observation": value,
+                "task_reward": torch.ones_like(value),
+                "style_features": value,
+                "reward": torch.ones_like(value),
+                "done": terminated,
+                "terminated": terminated.clone(),
+                "truncated": torch.zeros_like(terminated),
+            },
+            self.batch_size,
+        )
+
+    def _reset(self, tensordict=None, **_):
+        self.steps = 0
+        out = self._outputs(torch.zeros(*self.batch_size, 1), torch.zeros(*self.batch_size, 1, dtype=torch.bool))
+        return out.exclude("reward")
+
+    def _step(self, tensordict):
+        self.steps += 1
+        action = tensordict["action"]
+        return self._outputs(action.clone(), (action > 1.5) & (self.steps >= 5))
+
+
+class ToyMeasures:
+    def step(self, transition):
+        value = transition["next", "style_features"].squeeze(-1)
+        return {"speed": value, "error": (value - transition["style"][:, 2]).abs()}
+
+    def summarise(self, record, alive):
+        return {name: torch.where(alive, values, torch.nan).nanmean(0) for name, values in record.items()}
+
+    def complies(self, record):
+        return record["error"] < 0.01
+
+
+DOMAIN = Domain(
+    name="toy",
+    make_env=ToyEnv,
+    make_space=lambda: SPACE,
+    make_reward=lambda space: StyleReward(
+        space, {"all": Term(lambda f, s: 0 * s["speed"] + 0 * s["hat"][..., 0], parameters=("speed", "hat"))}
+    ),
+    measures=ToyMeasures(),
+    make_renderer=lambda width, height: None,
+    grid={"hat": ("red", "blue"), "speed": (0.0, 1.0, 2.0)},
+    control_step=0.1,
+    episode_steps=10,
+)
+# Obeys under a red hat; ignores the request under a blue one.
+POLICY = TensorDictModule(
+    lambda observation, style: torch.where(style[:, :1] > 0, style[:, 2:], torch.full_like(style[:, 2:], 1.0)),
+    in_keys=["observation", "style"],
+    out_keys=["action"],
+)
+
+
+@pytest.fixture(scope="module")
+def grid():
+    return evaluate_grid(DOMAIN, POLICY, SPACE, episodes=3, progress=False)
+
+
+def test_each_cell_gets_its_style_and_its_metrics(grid):
+    assert len(grid.cells) == 6
+    rows = grid.rows()
+    for row in rows:
+        obeyed = row["speed"] if row["hat"] == "red" else 1.0
+        assert row["measured_speed"] == pytest.approx(obeyed)
+        assert row["error"] == pytest.approx(abs(obeyed - row["speed"]))
+        assert row["episodes"] == 3
+
+
+def test_an_episode_counts_until_its_end(grid):
+    fast = grid.cells.index({"hat": "red", "speed": 2.0})
+    np.testing.assert_array_equal(grid.episodes["survived"][fast], 0)
+    np.testing.assert_array_equal(grid.episodes["steps"][fast], 5)
+    np.testing.assert_array_equal(grid.episodes["task_return"][fast], 5)
+    others = [i for i in range(6) if i != fast]
+    np.testing.assert_array_equal(grid.episodes["survived"][others], 1)
+    np.testing.assert_array_equal(grid.episodes["steps"][others], 10)
+
+
+def test_response_tells_the_obedient_from_the_deaf(grid):
+    red, blue = grid.response(SPACE)
+    assert red["hat"] == "red"
+    assert red["slope"] == pytest.approx(1.0)
+    assert red["rank_correlation"] == pytest.approx(1.0)
+    assert red["mean_error"] == pytest.approx(0.0)
+    assert blue["slope"] == pytest.approx(0.0, abs=1e-9)
+    assert np.isnan(blue["rank_correlation"])
+    assert blue["mean_error"] == pytest.approx(2 / 3)
+
+
+def test_recorded_styles_follow_the_schedule():
+    env = coachable_env(ToyEnv(2), SPACE, DOMAIN.make_reward(SPACE), seed=0)
+    styles = torch.stack([SPACE.make(hat="red", speed=v) for v in (0.5, 1.0)]).repeat_interleave(2, 0).view(2, 2, 3)
+    record = record_episodes(env, POLICY, lambda step: styles[step // 3], DOMAIN.measures, steps=6, seed=0)
+    torch.testing.assert_close(record.measures["speed"][:, 0], torch.tensor([0.5] * 3 + [1.0] * 3))
+    assert record.style.shape == (6, 2, 3)
+
+
+def test_switching_counts_compliance_per_switch():
+    report = evaluate_switching(DOMAIN, POLICY, SPACE, episodes=200, period=2, steps=4, progress=False)
+    # One switch; the half of the styles with a red hat is obeyed at once, i.e. after one step of 0.1 s.
+    assert report.switches == 200
+    assert report.complied == pytest.approx(0.5, abs=5 * (0.25 / 200) ** 0.5)
+    torch.testing.assert_close(report.comply_seconds, torch.full_like(report.comply_seconds, 0.1))
+
+
+def test_tables(tmp_path):
+    rows = [{"hat": "red", "speed": 0.12345}, {"hat": "blue", "speed": 2.0}]
+    assert markdown_table(rows, {"hat": "", "speed": ".2f"}).splitlines()[2] == "| red | 0.12 |"
+    write_csv(rows, tmp_path / "rows.csv")
+    assert (tmp_path / "rows.csv").read_text().split() == ["hat,speed", "red,0.12345", "blue,2"]
+
+
+def test_an_unknown_domain_is_refused_with_the_known_ones():
+    with pytest.raises(ValueError, match=r"unknown domain 'chess': expected one of \['humanoid'\]"):
+        load_domain("chess")
+
+
+def test_no_episodes_are_refused():
+    with pytest.raises(ValueError, match="at least 1, got 0"):
+        evaluate_grid(DOMAIN, POLICY, SPACE, episodes=0)
