@@ -1,4 +1,4 @@
-"""The contestants of `simulator.py`: control steps of the humanoid. Protocol and processes as in `learner_workers.py`."""
+"""The contestants of `simulator.py`: control steps of the humanoid. Processes as in `learner_workers.py`."""
 
 import json
 import os
@@ -60,9 +60,9 @@ def coachable_env_steps(threads):
 def dm_control():
     """dm_control's own Python environment: its observations and reward."""
     import numpy as np
+    from dm_control import suite
 
     import coachable  # noqa: F401
-    from dm_control import suite
 
     env = suite.load("humanoid", "walk", task_kwargs={"random": 0})
     random = np.random.default_rng(0)

@@ -152,7 +152,7 @@ class GaitTracker:
 
         Returns:
             (N, 11): one-hot of the expected foot 2, smallest and largest angle of each knee since the step began 4
-            [rad], start vectors of the step and of the stride 4 [m], time since the last strike / step_max 1 (at most 2).
+            [rad], start vectors of the step and of the stride 4 [m], time since the last strike / step_max 1, up to 2.
         """
         onehot = np.eye(2)[self.expected]
         timer = np.minimum(self.clock * CONTROL_STEP / self.step_max, 2.0)

@@ -96,7 +96,7 @@ def humanoid_style_reward(
     length_margin: float = 0.05,
     wide_margin: float = 0.25,
     wide_share: float = 0.5,
-    timeout_penalty: float = 0.2,
+    timeout_penalty: float = 0.1,
 ) -> StyleReward:
     """Style part of the reward: lambda_pose * r_pose + lambda_gait * r_gait (Appendix C, DMC Humanoid).
 
@@ -106,7 +106,8 @@ def humanoid_style_reward(
         gait_scale: lambda_gait.
         length_margin: margin of the step-length tolerance [m] (paper).
         wide_margin: margin of a second, wide tolerance [m] that gives a gradient to steps far from the request.
-        wide_share: share of the wide tolerance in the length score; 0 is the paper's reward.
+        wide_share: share of the wide tolerance in the length score, which stride and knees do not gate; 0 is the
+            paper's reward.
         timeout_penalty: v_m, taken off in every control step in which the step is timed out.
     """
     bounds = torch.from_numpy(np.deg2rad(pose_bounds_deg()))
@@ -129,8 +130,6 @@ def humanoid_style_reward(
         """
         length, target = features[..., LENGTH], style["step_length"]
         narrow = tolerance(length, target, target, margin=length_margin, sigmoid="long_tail")
-        wide = tolerance(length, target, target, margin=wide_margin, sigmoid="long_tail")
-        closeness = (1 - wide_share) * narrow + wide_share * wide
         even = tolerance(
             features[..., STRIDE_FRACTION],
             *STRIDE_FRACTION_BOUNDS,
@@ -142,8 +141,11 @@ def humanoid_style_reward(
         knees = knees * tolerance(
             features[..., KNEE_MAX], -math.inf, knee_high, margin=knee_margin, sigmoid="long_tail"
         )
+        # The wide part leads from no steps at all to steps of about the right length, so it asks for nothing else.
+        wide = tolerance(length, target, target, margin=wide_margin, sigmoid="long_tail")
+        score = (1 - wide_share) * narrow * even * knees + wide_share * wide
         control_steps = features[..., DURATION] / CONTROL_STEP
-        earned = features[..., COMPLETED] * control_steps * closeness * even * knees
+        earned = features[..., COMPLETED] * control_steps * score
         return earned - timeout_penalty * features[..., TIMED_OUT]
 
     return StyleReward(
