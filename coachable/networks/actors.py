@@ -9,10 +9,11 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Bounded
-from torchrl.modules import ProbabilisticActor, TanhNormal
+from torchrl.modules import ProbabilisticActor
 
 from coachable.keys import STYLE
 from coachable.networks.residual import ResidualMLP
+from coachable.networks.tanh_normal import TanhGaussian
 
 
 class StyleEncoding(Protocol):
@@ -107,5 +108,5 @@ def make_gaussian_actor(
         module,
         in_keys=["loc", "scale"],
         spec=Bounded(-1.0, 1.0, (action_dim,), dtype=torch.float32) if action_spec is None else action_spec,
-        distribution_class=TanhNormal,
+        distribution_class=TanhGaussian,
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule, SoftUpdate
 
 from coachable.training.acceleration import Acceleration
+from coachable.training.lean_sac import LeanSAC
 from coachable.training.precision import Precision, resolve_precision
 
 UpdateOrder = Literal["simultaneous", "policy_first", "critic_first"]
@@ -19,6 +20,12 @@ UpdateOrder = Literal["simultaneous", "policy_first", "critic_first"]
 
 class NonFiniteLossError(RuntimeError):
     """A loss became infinite or NaN."""
+
+
+class _Losses(NamedTuple):
+    both: Callable[..., Any]
+    actor: Callable[..., Any]
+    critic: Callable[..., Any]
 
 
 class Learner:
@@ -90,8 +97,11 @@ class Learner:
         self._device_type = device.type
         self.target_updater = SoftUpdate(loss_module, tau=tau)
         self._acceleration: Acceleration | None = None
+        self._lean: LeanSAC | None = None
         if fused and not compile and Acceleration.supports(loss_module):
             self._acceleration = Acceleration(loss_module, torch.bfloat16 if self.precision == "bf16" else None)
+            if LeanSAC.supports(loss_module):
+                self._lean = LeanSAC(loss_module, self._acceleration)
         self._params = params
         rates = {"actor": actor_lr, "critic": critic_lr, "alpha": alpha_lr}
         self.optimizers: dict[str, torch.optim.Optimizer] = {
@@ -99,13 +109,9 @@ class Learner:
             for name, group in params.items()
             if group
         }
-        self._forward: Callable[..., Any] = loss_module.forward
-        self._actor_loss: Callable[..., Any] = loss_module.actor_loss
-        self._critic_loss: Callable[..., Any] = _critic_loss_of(loss_module)
+        self._losses = _Losses(loss_module.forward, loss_module.actor_loss, _critic_loss_of(loss_module))
         if compile:
-            self._forward = torch.compile(self._forward)
-            self._actor_loss = torch.compile(self._actor_loss)
-            self._critic_loss = torch.compile(self._critic_loss)
+            self._losses = _Losses(*map(torch.compile, self._losses))
         self._non_finite = torch.zeros((), dtype=torch.bool, device=device)
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -123,8 +129,12 @@ class Learner:
         Raises:
             NonFiniteLossError: If a loss was infinite or NaN since the last check (see `check_every`).
         """
+        losses = self._losses
+        if self._lean is not None and self._lean.serves(batch):
+            losses = _Losses(self._lean.forward, self._lean.actor_loss, self._lean.critic_loss)
+        update = self._simultaneous if self.update_order == "simultaneous" else self._sequential
         with self._networks():
-            metrics = self._simultaneous(batch) if self.update_order == "simultaneous" else self._sequential(batch)
+            metrics = update(batch, losses)
         if self._acceleration is None:
             self.target_updater.step()
         else:
@@ -188,9 +198,9 @@ class Learner:
             self._acceleration.refresh(name)
         return norm
 
-    def _simultaneous(self, batch: TensorDictBase) -> dict[str, Tensor]:
+    def _simultaneous(self, batch: TensorDictBase, functions: _Losses) -> dict[str, Tensor]:
         with self._autocast():
-            losses = self._forward(batch)
+            losses = functions.both(batch)
         total = losses["loss_actor"] + losses["loss_qvalue"]
         if self._params["alpha"]:
             total = total + losses["loss_alpha"]
@@ -203,23 +213,23 @@ class Learner:
         metrics["td_error"] = batch.get("td_error").mean()
         return metrics
 
-    def _sequential(self, batch: TensorDictBase) -> dict[str, Tensor]:
+    def _sequential(self, batch: TensorDictBase, functions: _Losses) -> dict[str, Tensor]:
         policy_first = self.update_order == "policy_first"
-        metrics = self._update_actor(batch) if policy_first else {}
+        metrics = self._update_actor(batch, functions) if policy_first else {}
         with self._autocast():
-            loss_qvalue, extra = self._critic_loss(batch)
+            loss_qvalue, extra = functions.critic(batch)
         loss_qvalue.backward()
         metrics["loss_qvalue"] = loss_qvalue.detach()
         metrics["grad_norm_critic"] = self._step("critic")
         batch.set("td_error", extra["td_error"])
         metrics["td_error"] = extra["td_error"].mean()
         if not policy_first:
-            metrics |= self._update_actor(batch)
+            metrics |= self._update_actor(batch, functions)
         return metrics
 
-    def _update_actor(self, batch: TensorDictBase) -> dict[str, Tensor]:
+    def _update_actor(self, batch: TensorDictBase, functions: _Losses) -> dict[str, Tensor]:
         with self._autocast():
-            loss_actor, extra = self._actor_loss(batch)
+            loss_actor, extra = functions.actor(batch)
         loss_actor.backward()
         metrics = {"loss_actor": loss_actor.detach(), "grad_norm_actor": self._step("actor")}
         if "log_prob" in extra:
