@@ -90,6 +90,8 @@ class ActorCriticLoss(SACLoss):
             use_prioritized_weights=use_prioritized_weights,
             scalar_output_mode="exclude",
         )
+        # In float64, as gamma: numbers of no dimension do not widen float32 tensors, and float64 losses see the rounding.
+        self.log_alpha = torch.tensor(math.log(alpha), dtype=torch.float64, device=cast(Tensor, self.log_alpha).device)
         self._policy = policy  # no submodule: the parameters are those of actor_network_params
         networks = (actor_network, *critics)
         self._dropouts = [m for net in networks for m in net.modules() if isinstance(m, nn.modules.dropout._DropoutNd)]
@@ -211,6 +213,9 @@ class ActorCriticLoss(SACLoss):
                 f"{value_type}, {sorted(hyperparams)}; for n-step targets store n-step rewards with steps_to_next_obs"
             )
         super().make_value_estimator(ValueEstimators.TD0, **hyperparams)
+        if "gamma" in hyperparams:
+            exact = torch.as_tensor(hyperparams["gamma"], dtype=torch.float64)
+            self.value_estimator.gamma = exact.to(self._gamma.device)
         return self
 
     # Pieces.

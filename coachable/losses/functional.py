@@ -38,7 +38,7 @@ def bootstrap_target(
         >>> bootstrap_target(torch.ones(2), value, terminated, 0.9).tolist()
         [10.0, 1.0]
     """
-    discount = gamma if steps is None else gamma**steps
+    discount = gamma if steps is None else torch.as_tensor(gamma**steps).to(next_value.dtype)
     if next_value.ndim > reward.ndim:
         reward, terminated = reward.unsqueeze(-1), terminated.unsqueeze(-1)
         discount = discount.unsqueeze(-1) if isinstance(discount, Tensor) and discount.ndim else discount
