@@ -20,7 +20,7 @@ from coachable.envs.humanoid import humanoid_style_reward, humanoid_style_space
 from coachable.training.checkpoint import CheckpointStore, check_writable
 from coachable.training.collection import evaluate_policy
 from coachable.training.episodes import EpisodeSums
-from coachable.training.hardware import detect, estimate_update_seconds, share_threads
+from coachable.training.hardware import detect, estimate_update_seconds, pick_device, share_threads
 from coachable.training.logging import MetricsLog, Progress, wandb_logger
 from coachable.training.loop import REPLAY_KEYS, Train
 from coachable.training.replay_files import replay_bytes
@@ -38,9 +38,7 @@ def build(config: dict[str, Any]) -> Train:
     threads = share_threads(**config["threads"])
     torch.set_num_threads(threads.learner)
     seed_everything(config["seed"])
-    device = torch.device(
-        config["device"] if config["device"] != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
-    )
+    device = pick_device(config["device"])
 
     # Styles and environment
     space = humanoid_style_space()
@@ -118,7 +116,8 @@ def build(config: dict[str, Any]) -> Train:
 def announce(config: dict[str, Any], train: Train) -> None:
     """Says what was chosen and about how long it will take."""
     parameters = sum(p.numel() for p in train.learner.loss_module.actor_network_params.parameters())
-    seconds = estimate_update_seconds(parameters, config["train"]["batch_size"], train.learner.precision == "bf16")
+    bf16 = train.learner.precision == "bf16"
+    seconds = estimate_update_seconds(parameters, config["train"]["batch_size"], bf16, pick_device(config["device"]))
     remaining = config["train"]["total_frames"] - train.frames
     updates = remaining * (config["train"]["utd_ratio"] or 0)
     hours = max(updates * seconds, remaining / (config["train"]["throttle"] or float("inf"))) / 3600

@@ -76,7 +76,10 @@ def make_collector(
     if policy_device is not None and torch.device(policy_device).type != "cpu":
         common |= {"policy_device": policy_device, "env_device": "cpu", "storing_device": "cpu"}
     if backend == "direct":
-        return Collector(make_env(seed), policy, use_buffers=False, trust_policy=True, **common)
+        collector = Collector(make_env(seed), policy, use_buffers=False, trust_policy=True, **common)
+        if next(collector.policy.parameters()) is not next(policy.parameters()):  # the loop relies on shared weights
+            raise RuntimeError(f"the collector copied the policy: build it on {policy_device}, where it is to run")
+        return collector
     if backend in ("process", "ray"):
         factories = [_SeededFactory(make_env, seed + i) for i in range(num_collectors)]
         return Collector(factories, policy, backend=backend, num_collectors=num_collectors, sync=sync, **common)

@@ -8,7 +8,7 @@ import torch
 
 from coachable.training.precision import supports_bf16
 
-__all__ = ["Hardware", "Threads", "choose_preset", "detect", "estimate_update_seconds", "share_threads"]
+__all__ = ["Hardware", "Threads", "choose_preset", "detect", "estimate_update_seconds", "pick_device", "share_threads"]
 
 _MAX_LEARNER_THREADS = 8  # 512-wide layers do not fill more cores; the barriers cost more than they bring
 
@@ -66,6 +66,28 @@ def detect() -> Hardware:
 def choose_preset(hardware: Hardware) -> str:
     """Picks the preset for a machine: `gpu` where CUDA works, else `cpu`."""
     return "gpu" if hardware.gpu else "cpu"
+
+
+def pick_device(name: str = "auto") -> torch.device:
+    """Turns a configured device into one with an index.
+
+    Args:
+        name: "auto" (CUDA where there is one), "cpu", "cuda" or "cuda:1".
+
+    Raises:
+        ValueError: if CUDA is asked for and there is none.
+
+    Example:
+        >>> pick_device("cpu")
+        device(type='cpu')
+    """
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else torch.device(name)
+    if device.type != "cuda":
+        return device
+    if not torch.cuda.is_available():
+        raise ValueError(f"device={name} but torch finds no CUDA device here: set device=cpu, or choose preset=cpu")
+    # TorchRL takes "cuda" and "cuda:0" for different devices, and would copy the policy from one to the other.
+    return torch.device("cuda", torch.cuda.current_device() if device.index is None else device.index)
 
 
 def share_threads(

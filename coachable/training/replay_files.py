@@ -18,7 +18,7 @@ _CHUNK = 65_536  # records per copy: bounds the extra memory
 
 
 def write_replay(replay: ReplayBuffer, folder: Path) -> None:
-    """Writes the filled part of a buffer over a `LazyTensorStorage`, with its cursors.
+    """Writes the filled part of a buffer over a `LazyTensorStorage`, with the state of its writer, sampler, transforms.
 
     Args:
         replay: the buffer.
@@ -44,8 +44,8 @@ def write_replay(replay: ReplayBuffer, folder: Path) -> None:
                     _numpy(value[start : start + _CHUNK]).tofile(stream)
                 stream.flush()
                 os.fsync(stream.fileno())
-    state = {"writer": replay.writer.state_dict(), "sampler": replay.sampler.state_dict()}
-    with (folder / "cursors.pt").open("wb") as stream:
+    state = {name: value for name, value in replay.state_dict().items() if name != "_storage"}
+    with (folder / "state.pt").open("wb") as stream:
         torch.save(state, stream)
         stream.flush()
         os.fsync(stream.fileno())
@@ -82,9 +82,10 @@ def read_replay(replay: ReplayBuffer, folder: Path) -> int:
         for key, array in arrays.items():
             chunk.set(key, torch.from_numpy(np.array(array[start:stop])))
         storage.set(torch.arange(start, stop), chunk)
-    cursors = torch.load(folder / "cursors.pt", weights_only=True)
-    replay.writer.load_state_dict(cursors["writer"])
-    replay.sampler.load_state_dict(cursors["sampler"])
+    if index["filled"]:
+        state = torch.load(folder / "state.pt", weights_only=True)
+        # The records are in place already: the storage gets its own state.
+        replay.load_state_dict({**state, "_storage": storage.state_dict()})
     return index["filled"]
 
 

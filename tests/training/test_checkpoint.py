@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
+from coachable.replay import EventTableBuffer, KeyEvents
 from coachable.styles import Setpoint, StyleSpace
 from coachable.training.checkpoint import CheckpointError, CheckpointStore, check_writable, find_checkpoint, read_state
 from coachable.training.replay_files import read_replay, write_replay
@@ -269,3 +270,33 @@ def test_weights_name_no_place_on_the_machine_that_trained(make_train, tmp_path)
     weights = export_weights(tmp_path / "run", tmp_path / "weights.pt")
     assert str(tmp_path).encode() not in weights.read_bytes()
     assert read_state(weights)["config"]["run_dir"] is None
+
+
+def test_replay_files_restore_event_tables(tmp_path):
+    """Tables, their cursors, the running windows and the buffer's own generator."""
+
+    def make():
+        return EventTableBuffer(
+            {"default": 30, "hit": 6},
+            events=KeyEvents(["hit"]),
+            event_horizon=3,
+            num_envs=1,
+            batch_size=8,
+            generator=torch.Generator().manual_seed(5),
+        )
+
+    def steps(start, stop):
+        time = torch.arange(start, stop)
+        done = torch.zeros(len(time), 1, dtype=torch.bool)
+        return TensorDict({"t": time, "next": {"done": done, "events": (time % 7 == 0)[:, None]}}, [len(time)])
+
+    replay, again = make(), make()
+    replay.extend(steps(0, 50))
+    replay.sample()
+    write_replay(replay, tmp_path / "replay")
+    read_replay(again, tmp_path / "replay")
+    for buffer in (replay, again):
+        buffer.extend(steps(50, 57))  # an event whose window began before the files were written
+    for name in ("default", "hit"):
+        assert torch.equal(replay.table(name)["t"], again.table(name)["t"])
+    assert torch.equal(replay.sample()["t"], again.sample()["t"])

