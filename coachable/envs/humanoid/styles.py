@@ -95,7 +95,8 @@ def humanoid_style_reward(
     gait_scale: float = 1.0,
     length_margin: float = 0.05,
     wide_margin: float = 0.25,
-    wide_share: float = 0.5,
+    far_margin: float = 1.0,
+    guide_share: float = 0.6,
     timeout_penalty: float = 0.1,
 ) -> StyleReward:
     """Style part of the reward: lambda_pose * r_pose + lambda_gait * r_gait (Appendix C, DMC Humanoid).
@@ -105,9 +106,11 @@ def humanoid_style_reward(
         pose_scale: lambda_pose.
         gait_scale: lambda_gait.
         length_margin: margin of the step-length tolerance [m] (paper).
-        wide_margin: margin of a second, wide tolerance [m] that gives a gradient to steps far from the request.
-        wide_share: share of the wide tolerance in the length score, which stride and knees do not gate; 0 is the
-            paper's reward.
+        wide_margin: margin of a second, wide tolerance [m] that leads to about the right length.
+        far_margin: margin of a third, linear one [m] that leads out of galloping, where one foot always lands behind
+            the other and a long tail is flat.
+        guide_share: share of these two, in equal parts, in the length score. Stride and knees do not gate them; 0 is
+            the paper's reward.
         timeout_penalty: v_m, taken off in every control step in which the step is timed out.
     """
     bounds = torch.from_numpy(np.deg2rad(pose_bounds_deg()))
@@ -141,9 +144,10 @@ def humanoid_style_reward(
         knees = knees * tolerance(
             features[..., KNEE_MAX], -math.inf, knee_high, margin=knee_margin, sigmoid="long_tail"
         )
-        # The wide part leads from no steps at all to steps of about the right length, so it asks for nothing else.
+        # The guide leads from no steps at all to steps of about the right length, so it asks for nothing else.
         wide = tolerance(length, target, target, margin=wide_margin, sigmoid="long_tail")
-        score = (1 - wide_share) * narrow * even * knees + wide_share * wide
+        far = tolerance(length, target, target, margin=far_margin, sigmoid="linear", value_at_margin=0.0)
+        score = (1 - guide_share) * narrow * even * knees + guide_share * 0.5 * (wide + far)
         control_steps = features[..., DURATION] / CONTROL_STEP
         earned = features[..., COMPLETED] * control_steps * score
         return earned - timeout_penalty * features[..., TIMED_OUT]

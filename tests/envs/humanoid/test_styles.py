@@ -1,5 +1,6 @@
 """Poses by forward kinematics, and the style terms by hand."""
 
+import itertools
 import math
 
 import numpy as np
@@ -105,19 +106,24 @@ def test_gait_term_pays_an_exact_step_for_the_control_steps_it_took():
 
 
 def test_gait_term_at_a_margin_of_five_centimetres():
-    narrow, wide = 0.1, 1 / (1 + 9 * (0.05 / 0.25) ** 2)
-    assert terms(a_step(0.45))["gait"] == pytest.approx(20 * (narrow + wide) / 2, rel=1e-5)
-    paper = humanoid_style_reward(SPACE, wide_share=0.0)
+    narrow, wide, far = 0.1, 1 / (1 + 9 * (0.05 / 0.25) ** 2), 1 - 0.05
+    assert terms(a_step(0.45))["gait"] == pytest.approx(20 * (0.4 * narrow + 0.3 * wide + 0.3 * far), rel=1e-5)
+    paper = humanoid_style_reward(SPACE, guide_share=0.0)
     theta = SPACE.make(pose="t_pose", step_length=0.5)[None]
     assert paper.terms_of(a_step(0.45), theta)["gait"].item() == pytest.approx(20 * narrow, rel=1e-5)
 
 
-def test_uneven_strides_and_bent_or_overstretched_knees_cost_the_narrow_half():
+def test_uneven_strides_and_bent_or_overstretched_knees_cost_the_papers_part():
     full = terms(a_step(0.5))["gait"]
     assert terms(a_step(0.5, fraction=2 / 3))["gait"] == pytest.approx(full)
-    assert terms(a_step(0.5, fraction=5 / 6))["gait"] == pytest.approx(0.5 * full, rel=1e-5)
-    assert terms(a_step(0.5, knee_min=math.radians(-155)))["gait"] == pytest.approx(0.55 * full, rel=1e-4)
-    assert terms(a_step(0.5, knee_max=math.radians(10)))["gait"] == pytest.approx(0.55 * full, rel=1e-4)
+    assert terms(a_step(0.5, fraction=5 / 6))["gait"] == pytest.approx(0.6 * full, rel=1e-5)
+    assert terms(a_step(0.5, knee_min=math.radians(-155)))["gait"] == pytest.approx(0.64 * full, rel=1e-4)
+    assert terms(a_step(0.5, knee_max=math.radians(10)))["gait"] == pytest.approx(0.64 * full, rel=1e-4)
+
+
+def test_a_foot_that_lands_behind_gains_by_landing_less_far_behind():
+    scores = [terms(a_step(length, fraction=0.0))["gait"] for length in (-0.5, -0.3, -0.1, 0.1)]
+    assert all(b - a > 0.5 for a, b in itertools.pairwise(scores))
 
 
 def test_no_step_earns_nothing_and_a_time_out_costs():
