@@ -91,7 +91,7 @@ def humanoid_style_space() -> StyleSpace:
 def humanoid_style_reward(
     space: StyleSpace,
     *,
-    pose_scale: float = 0.5,
+    pose_scale: float = 1.0,
     gait_scale: float = 1.0,
     length_margin: float = 0.05,
     wide_margin: float = 0.25,
