@@ -1,9 +1,8 @@
-"""The contestants of `simulator.py`: control steps of the humanoid. Processes as in `learner_workers.py`."""
+"""The contestants of `simulator.py`. A unit of work is one control step of 64 humanoids."""
 
-import json
-import os
 import sys
-import time
+
+from contest import serve
 
 ROWS = 64
 SUBSTEPS = 5
@@ -133,20 +132,5 @@ WORKERS = {
 PEERS = ("envpool",)
 
 
-def main(name: str) -> None:
-    out = os.fdopen(os.dup(1), "w")  # packages that print on import must not disturb the protocol
-    os.dup2(2, 1)
-    run = WORKERS[name]()
-    run(2)
-    out.write("ready\n")
-    out.flush()
-    for line in sys.stdin:
-        n = int(line)
-        cpu, wall = time.process_time(), time.perf_counter()
-        run(n)
-        out.write(json.dumps({"cpu": time.process_time() - cpu, "wall": time.perf_counter() - wall}) + "\n")
-        out.flush()
-
-
 if __name__ == "__main__":
-    main(sys.argv[1])
+    serve(WORKERS, sys.argv[1], warmup=2)
