@@ -16,6 +16,7 @@ from coachable.envs.humanoid.model import NUM_ACTIONS, NUM_POSITIONS
 from coachable.envs.humanoid.observation import (
     OBSERVATION_SCALE,
     OBSERVATION_SIZE,
+    cosine_to_course,
     orientation_to_course,
     rotate_to_course,
     suite_observation,
@@ -141,7 +142,9 @@ class HumanoidEnv(EnvBase):
         feet = rotate_to_course(kinematics.feet, self.course)
         report = self.gait.update(feet, kinematics.foot_clearance, self._knees())
         forward_speed = rotate_to_course(kinematics.com_velocity, self.course)[:, 0]
-        task_reward = move_reward(forward_speed, kinematics.head_height, controls)
+        upright = kinematics.torso_axes[:, 2, 2]
+        facing = cosine_to_course(kinematics.pelvis_quaternion, self.course)
+        task_reward = move_reward(forward_speed, kinematics.head_height, upright, facing, controls)
         arms = self.simulation.positions[:, self.simulation.model.arm_positions]
         terminated = torch.from_numpy((kinematics.head_height < FALL_HEIGHT) | diverged)[:, None]
         truncated = torch.from_numpy(self.steps >= self.episode_steps)[:, None] & ~terminated

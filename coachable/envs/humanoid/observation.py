@@ -52,6 +52,12 @@ def orientation_to_course(quaternion: np.ndarray, course: np.ndarray) -> np.ndar
     return np.where(relative[:, :1] < 0, -relative, relative)
 
 
+def cosine_to_course(quaternion: np.ndarray, course: np.ndarray) -> np.ndarray:
+    """Cosine (N,) between the forward axis of bodies of the given orientations (N, 4) and the course."""
+    _, _, y, z = orientation_to_course(quaternion, course).T
+    return 1.0 - 2.0 * (y * y + z * z)
+
+
 def suite_observation(
     positions: np.ndarray, velocities: np.ndarray, kinematics: Kinematics, course: np.ndarray
 ) -> np.ndarray:

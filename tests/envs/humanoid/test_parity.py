@@ -81,7 +81,8 @@ def test_suite_reward_follows_from_our_features(reference):
             kinematics.torso_axes[row, 2, 2], bounds=(0.9, np.inf), sigmoid="linear", margin=1.9, value_at_margin=0
         )
         controls = physics.control()[None]
-        standing = move_reward(np.array([1.0]), kinematics.head_height[[row]], controls)[0]  # full speed: other factors
+        one = np.ones(1)  # full speed, upright and facing the course: what remains are head height and controls
+        standing = move_reward(one, kinematics.head_height[[row]], one, one, controls)[0]
         move = (5 * tolerance(speed, bounds=(1, np.inf), margin=1, value_at_margin=0, sigmoid="linear") + 1) / 6
         assert standing * upright * move == pytest.approx(expected.reward, abs=1e-6)
 
