@@ -225,7 +225,7 @@ def check_writable(directory: Path | str, required_bytes: int = 0) -> None:
     free = shutil.disk_usage(directory).free
     if free < required_bytes:
         raise CheckpointError(
-            f"{directory} has {free / 1e9:.2f} GB free, checkpoints need about {required_bytes / 1e9:.2f} GB. Choose "
+            f"{directory} has {free / 1e6:,.0f} MB free, checkpoints need about {required_bytes / 1e6:,.0f} MB. Choose "
             "another folder with run_dir=PATH, or leave the replay buffer out with checkpoint.replay=false"
         )
 

@@ -1,7 +1,11 @@
 """Collecting: TorchRL's collector with a state that a training can be resumed from, and a short evaluation."""
 
+import multiprocessing
+import signal
+import threading
 import warnings
 from collections.abc import Callable, Iterable
+from importlib.util import find_spec
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -64,24 +68,31 @@ def make_collector(
 
     Raises:
         ValueError: for an unknown backend.
+        ImportError: for Ray, where it is not installed.
     """
     common: dict[str, Any] = {
         "frames_per_batch": frames_per_batch,
         "total_frames": -1,  # the loop decides when to stop
         # rounded up to whole iterations, which TorchRL does too, but with a warning
-        "init_random_frames": -(-init_random_frames // frames_per_batch) * frames_per_batch or None,
+        "init_random_frames": -(-init_random_frames // frames_per_batch) * frames_per_batch or -1,
         "exploration_type": ExplorationType.RANDOM,
-        "auto_register_policy_transforms": False,  # ours need none
     }
     if policy_device is not None and torch.device(policy_device).type != "cpu":
         common |= {"policy_device": policy_device, "env_device": "cpu", "storing_device": "cpu"}
+    plain = {"auto_register_policy_transforms": False}  # ours need none
     if backend == "direct":
-        collector = Collector(make_env(seed), policy, use_buffers=False, trust_policy=True, **common)
+        collector = Collector(make_env(seed), policy, use_buffers=False, trust_policy=True, **common, **plain)
         if next(collector.policy.parameters()) is not next(policy.parameters()):  # the loop relies on shared weights
             raise RuntimeError(f"the collector copied the policy: build it on {policy_device}, where it is to run")
         return collector
     if backend in ("process", "ray"):
         factories = [_SeededFactory(make_env, seed + i) for i in range(num_collectors)]
+        if backend == "ray":
+            if find_spec("ray") is None:
+                raise ImportError("collector=ray needs Ray: pip install ray, or choose collector=process")
+            common["collector_kwargs"] = plain
+        else:
+            common |= plain
         return Collector(factories, policy, backend=backend, num_collectors=num_collectors, sync=sync, **common)
     raise ValueError(f"collector backend must be direct, process or ray, got {backend!r}")
 
@@ -94,6 +105,9 @@ class _SeededFactory:
         self.seed = seed
 
     def __call__(self) -> EnvBase:
+        if multiprocessing.parent_process() is not None and threading.current_thread() is threading.main_thread():
+            # Ctrl-C reaches the whole process group: the training process decides when its workers end.
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
         return self.make_env(self.seed)
 
 

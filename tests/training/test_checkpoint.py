@@ -183,7 +183,7 @@ def test_unwritable_and_full_folders_are_named_before_the_start(tmp_path):
     file.write_text("in the way")
     with pytest.raises(CheckpointError, match=r"cannot write to .*Choose another folder with run_dir=PATH"):
         check_writable(file / "run")
-    with pytest.raises(CheckpointError, match=r"GB free, checkpoints need about 1000000000\.00 GB"):
+    with pytest.raises(CheckpointError, match=r"MB free, checkpoints need about 1,000,000,000,000 MB"):
         check_writable(tmp_path, required_bytes=10**18)
     check_writable(tmp_path / "new")
     assert list((tmp_path / "new").iterdir()) == []
