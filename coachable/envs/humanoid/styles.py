@@ -26,7 +26,10 @@ _SHOULDER_CENTRES_DEG = {
 _ELBOW_BOUNDS_DEG = (-90.0, -70.0)
 POSES = tuple(_SHOULDER_CENTRES_DEG)
 POSE_MARGIN_DEG = 30.0
+_POSE_GUIDE_MARGIN_DEG = 120.0
 
+LENGTH_MARGIN = 0.05  # [m] (paper)
+_NEAR_MARGIN, _FAR_MARGIN = 0.25, 0.5  # [m], of the gait's guide
 STRIDE_FRACTION_BOUNDS = (1 / 3, 2 / 3)
 _STRIDE_FRACTION_MARGIN = 1 / 6
 KNEE_RANGE_DEG = (-145.0, 0.0)
@@ -92,68 +95,72 @@ def humanoid_style_reward(
     space: StyleSpace,
     *,
     pose_scale: float = 1.0,
+    pose_guide_scale: float = 1.0,
     gait_scale: float = 1.0,
-    length_margin: float = 0.05,
-    wide_margin: float = 0.25,
-    far_margin: float = 1.0,
-    guide_share: float = 0.6,
+    gait_guide_scale: float = 1.5,
     timeout_penalty: float = 0.1,
 ) -> StyleReward:
-    """Style part of the reward: lambda_pose * r_pose + lambda_gait * r_gait (Appendix C, DMC Humanoid).
+    """Style part of the reward: lambda_pose * r_pose + lambda_gait * r_gait (Appendix C, DMC Humanoid), and two guides.
+
+    The paper's tolerances are narrow: a shoulder that is 90 degrees off, or a step that is 0.2 m off, earns next to
+    nothing more for being less far off. The guides reward the same quantities over their whole range and lead there;
+    with scales of 0 the reward is the paper's.
 
     Args:
         space: the humanoid's style space.
         pose_scale: lambda_pose.
+        pose_guide_scale: of the pose's guide.
         gait_scale: lambda_gait.
-        length_margin: margin of the step-length tolerance [m] (paper).
-        wide_margin: margin of a second, wide tolerance [m] that leads to about the right length.
-        far_margin: margin of a third, linear one [m] that leads out of galloping, where one foot always lands behind
-            the other and a long tail is flat.
-        guide_share: share of these two, in equal parts, in the length score. Stride and knees do not gate them; 0 is
-            the paper's reward.
-        timeout_penalty: v_m, taken off in every control step in which the step is timed out.
+        gait_guide_scale: of the gait's guide.
+        timeout_penalty: v_m, taken off r_gait in every control step in which the step is timed out.
     """
     bounds = torch.from_numpy(np.deg2rad(pose_bounds_deg()))
-    knee_low, knee_high = (math.radians(angle) for angle in KNEE_RANGE_DEG)
-    knee_margin = math.radians(_KNEE_MARGIN_DEG)
 
-    pose = ChoiceTolerance(
-        "pose",
-        slice(0, NUM_ARM_JOINTS),
-        lower=bounds[..., 0],
-        upper=bounds[..., 1],
-        margin=math.radians(POSE_MARGIN_DEG),
-        sigmoid="long_tail",
-    )
+    def arms(margin_deg: float, sigmoid: str, value_at_margin: float) -> ChoiceTolerance:
+        """Mean over the six arm joints of their closeness to the requested bounds."""
+        joints, margin = slice(0, NUM_ARM_JOINTS), math.radians(margin_deg)
+        return ChoiceTolerance("pose", joints, bounds[..., 0], bounds[..., 1], margin, sigmoid, value_at_margin)
 
     def gait(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
-        """Closeness of a completed step to the requested length, paid for the control steps that it took.
-
-        The scaling by duration makes the reward per unit of time independent of the cadence.
-        """
         length, target = features[..., LENGTH], style["step_length"]
-        narrow = tolerance(length, target, target, margin=length_margin, sigmoid="long_tail")
-        even = tolerance(
+        score = tolerance(length, target, target, LENGTH_MARGIN, "long_tail")
+        score = score * tolerance(
             features[..., STRIDE_FRACTION],
             *STRIDE_FRACTION_BOUNDS,
             margin=_STRIDE_FRACTION_MARGIN,
             sigmoid="linear",
             value_at_margin=0.0,
         )
-        knees = tolerance(features[..., KNEE_MIN], knee_low, math.inf, margin=knee_margin, sigmoid="long_tail")
-        knees = knees * tolerance(
-            features[..., KNEE_MAX], -math.inf, knee_high, margin=knee_margin, sigmoid="long_tail"
-        )
-        # The guide leads from no steps at all to steps of about the right length, so it asks for nothing else.
-        wide = tolerance(length, target, target, margin=wide_margin, sigmoid="long_tail")
-        far = tolerance(length, target, target, margin=far_margin, sigmoid="linear", value_at_margin=0.0)
-        score = (1 - guide_share) * narrow * even * knees + guide_share * 0.5 * (wide + far)
-        control_steps = features[..., DURATION] / CONTROL_STEP
-        earned = features[..., COMPLETED] * control_steps * score
-        return earned - timeout_penalty * features[..., TIMED_OUT]
+        knee_low, knee_high = (math.radians(angle) for angle in KNEE_RANGE_DEG)
+        knee_margin = math.radians(_KNEE_MARGIN_DEG)
+        score = score * tolerance(features[..., KNEE_MIN], knee_low, math.inf, knee_margin, "long_tail")
+        score = score * tolerance(features[..., KNEE_MAX], -math.inf, knee_high, knee_margin, "long_tail")
+        return _per_control_step(features, score) - timeout_penalty * features[..., TIMED_OUT]
+
+    def gait_guide(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
+        error = (features[..., LENGTH] - style["step_length"]).abs()
+        near = tolerance(error, margin=_NEAR_MARGIN, sigmoid="long_tail")
+        # Below zero too: otherwise a gallop, one foot always behind the other, loses nothing.
+        far = (1 - error / _FAR_MARGIN).clamp(min=-1.0)
+        return _per_control_step(features, 0.5 * (near + far))
 
     return StyleReward(
         space,
-        {"pose": pose, "gait": Term(gait, parameters=("step_length",))},
-        scales={"pose": pose_scale, "gait": gait_scale},
+        {
+            "pose": arms(POSE_MARGIN_DEG, "long_tail", 0.1),
+            "pose_guide": arms(_POSE_GUIDE_MARGIN_DEG, "linear", 0.0),
+            "gait": Term(gait, parameters=("step_length",)),
+            "gait_guide": Term(gait_guide, parameters=("step_length",)),
+        },
+        scales={
+            "pose": pose_scale,
+            "pose_guide": pose_guide_scale,
+            "gait": gait_scale,
+            "gait_guide": gait_guide_scale,
+        },
     )
+
+
+def _per_control_step(features: Tensor, score: Tensor) -> Tensor:
+    """Pays a completed step's score once for each control step that it took, whatever the cadence."""
+    return features[..., COMPLETED] * (features[..., DURATION] / CONTROL_STEP) * score

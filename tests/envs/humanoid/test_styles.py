@@ -98,40 +98,44 @@ def test_pose_term_is_one_within_bounds_and_a_tenth_at_the_margin():
     assert terms(row)["pose"] == 1.0
     row[0, 0] += math.radians(15 + 30)  # half width and margin of one joint of six
     assert terms(row)["pose"] == pytest.approx((5 + 0.1) / 6, abs=1e-6)
+    assert terms(row)["pose_guide"] == pytest.approx((5 + 1 - 30 / 120) / 6, abs=1e-6)
 
 
-def test_gait_term_pays_an_exact_step_for_the_control_steps_it_took():
-    assert terms(a_step(0.5, duration=0.5))["gait"] == pytest.approx(0.5 / CONTROL_STEP)
-    assert terms(a_step(0.5, duration=0.25))["gait"] == pytest.approx(0.25 / CONTROL_STEP)
+def test_gait_terms_pay_an_exact_step_for_the_control_steps_it_took():
+    for duration in (0.25, 0.5):
+        paid = terms(a_step(0.5, duration=duration))
+        assert paid["gait"] == pytest.approx(duration / CONTROL_STEP)
+        assert paid["gait_guide"] == pytest.approx(duration / CONTROL_STEP)
 
 
-def test_gait_term_at_a_margin_of_five_centimetres():
-    narrow, wide, far = 0.1, 1 / (1 + 9 * (0.05 / 0.25) ** 2), 1 - 0.05
-    assert terms(a_step(0.45))["gait"] == pytest.approx(20 * (0.4 * narrow + 0.3 * wide + 0.3 * far), rel=1e-5)
-    paper = humanoid_style_reward(SPACE, guide_share=0.0)
-    theta = SPACE.make(pose="t_pose", step_length=0.5)[None]
-    assert paper.terms_of(a_step(0.45), theta)["gait"].item() == pytest.approx(20 * narrow, rel=1e-5)
+def test_gait_terms_at_the_papers_margin_of_five_centimetres():
+    paid = terms(a_step(0.45))
+    assert paid["gait"] == pytest.approx(20 * 0.1, rel=1e-5)
+    near, far = 1 / (1 + 9 * (0.05 / 0.25) ** 2), 1 - 0.05 / 0.5
+    assert paid["gait_guide"] == pytest.approx(20 * 0.5 * (near + far), rel=1e-5)
 
 
-def test_uneven_strides_and_bent_or_overstretched_knees_cost_the_papers_part():
-    full = terms(a_step(0.5))["gait"]
-    assert terms(a_step(0.5, fraction=2 / 3))["gait"] == pytest.approx(full)
-    assert terms(a_step(0.5, fraction=5 / 6))["gait"] == pytest.approx(0.6 * full, rel=1e-5)
-    assert terms(a_step(0.5, knee_min=math.radians(-155)))["gait"] == pytest.approx(0.64 * full, rel=1e-4)
-    assert terms(a_step(0.5, knee_max=math.radians(10)))["gait"] == pytest.approx(0.64 * full, rel=1e-4)
+def test_uneven_strides_and_bent_or_overstretched_knees_cost():
+    assert terms(a_step(0.5, fraction=2 / 3))["gait"] == pytest.approx(20)
+    assert terms(a_step(0.5, fraction=5 / 6))["gait"] == pytest.approx(0, abs=1e-5)
+    assert terms(a_step(0.5, knee_min=math.radians(-155)))["gait"] == pytest.approx(2, rel=1e-4)
+    assert terms(a_step(0.5, knee_max=math.radians(10)))["gait"] == pytest.approx(2, rel=1e-4)
 
 
 def test_a_foot_that_lands_behind_gains_by_landing_less_far_behind():
-    scores = [terms(a_step(length, fraction=0.0))["gait"] for length in (-0.5, -0.3, -0.1, 0.1)]
-    assert all(b - a > 0.5 for a, b in itertools.pairwise(scores))
+    scores = [terms(a_step(length, fraction=0.0))["gait_guide"] for length in (-0.4, -0.2, 0.0, 0.2)]
+    assert all(b - a > 1 for a, b in itertools.pairwise(scores))
+    assert scores[0] < 0
 
 
 def test_no_step_earns_nothing_and_a_time_out_costs():
-    assert terms(features())["gait"] == 0.0
+    assert terms(features())["gait"] == terms(features())["gait_guide"] == 0.0
     assert terms(features({TIMED_OUT: 1}))["gait"] == pytest.approx(-0.1)
 
 
-def test_reward_sums_the_scaled_terms():
-    reward = humanoid_style_reward(SPACE, pose_scale=0.5, gait_scale=2.0)
+def test_reward_sums_the_scaled_terms_and_is_the_papers_without_guides():
     theta = SPACE.make(pose="t_pose", step_length=0.5)[None]
-    assert reward(a_step(0.5), theta).item() == pytest.approx(0.5 * 1.0 + 2.0 * 20.0)
+    reward = humanoid_style_reward(SPACE, pose_scale=0.5, gait_scale=2.0, pose_guide_scale=3.0, gait_guide_scale=0.1)
+    assert reward(a_step(0.5), theta).item() == pytest.approx(0.5 + 3.0 + 2.0 * 20.0 + 0.1 * 20.0)
+    paper = humanoid_style_reward(SPACE, pose_guide_scale=0.0, gait_guide_scale=0.0)
+    assert paper(a_step(0.45), theta).item() == pytest.approx(1.0 + 20 * 0.1, rel=1e-5)
