@@ -102,7 +102,6 @@ def test_hydras_options_pass_through():
     assert _compose("+note=mine")["note"] == "mine"
 
 
-@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # torch tensors in numpy.array
 def test_resumed_runs_equal_uninterrupted_ones(tmp_path):
     """Bit for bit on one thread, the physics of the running episodes included."""
     _run(tmp_path / "whole", "train.total_frames=120")
