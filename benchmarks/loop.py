@@ -4,7 +4,7 @@
     python benchmarks/loop.py preset=cpu           any overrides of the recipe
 
 Runs `recipes/humanoid_sac.py` without evaluation and checkpoints for a number of rounds after the warm-up, and prints
-the share of wall time that went into physics (`mujoco.rollout`), into updates and into all the rest, and the peak memory
+the share of wall time that went into physics (`mujoco.rollout`), into updates and all the rest, and the peak memory
 once the replay buffer is full.
 """
 
