@@ -103,7 +103,8 @@ def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
     for group, choice in chosen.items():
         if choice not in GROUPS[group]:
             raise SystemExit(f"error: {group}={choice} does not exist.{_choices(choice, GROUPS[group])}")
-    if chosen.get("preset", "auto") == "auto":
+    swept = any(o.key_or_group == "preset" and o.is_sweep_override() for o in overrides)
+    if chosen.get("preset", "auto") == "auto" and not swept:
         chosen["preset"] = choose_preset(detect())
         arguments = [a for a in arguments if not a.startswith("preset=")] + [f"preset={chosen['preset']}"]
     elif any(o.key_or_group == "resume" and o.value() for o in overrides):

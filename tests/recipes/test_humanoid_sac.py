@@ -100,6 +100,8 @@ def test_hydras_options_pass_through():
     arguments = checked_arguments("humanoid_sac", ["--cfg", "job", "preset=cpu", "train.total_frames=1e6"])
     assert arguments == ["--cfg", "job", "preset=cpu", "train.total_frames=1e6"]
     assert _compose("+note=mine")["note"] == "mine"
+    sweep = ["--multirun", "preset=smoke,cpu", "seed=0,1"]
+    assert checked_arguments("humanoid_sac", sweep) == sweep
 
 
 def test_resumed_runs_equal_uninterrupted_ones(tmp_path):
