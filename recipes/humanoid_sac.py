@@ -17,6 +17,7 @@ from hydra.utils import instantiate
 from recipe_config import run_recipe, save_config
 
 from coachable.envs.humanoid import humanoid_style_reward, humanoid_style_space
+from coachable.envs.humanoid.symmetry import humanoid_mirror_maps
 from coachable.training.checkpoint import CheckpointStore, check_writable
 from coachable.training.collection import evaluate_policy
 from coachable.training.episodes import EpisodeSums
@@ -26,7 +27,7 @@ from coachable.training.loop import REPLAY_KEYS, Train
 from coachable.training.replay_files import replay_bytes
 from coachable.training.rng import seed_everything
 from coachable.training.weights import agent_state, initialise_from
-from coachable.transforms import CoachableEnv, TaskImpersonation, coachable_env
+from coachable.transforms import CoachableEnv, MirrorSymmetry, TaskImpersonation, coachable_env
 
 
 def build(config: dict[str, Any]) -> Train:
@@ -67,6 +68,8 @@ def build(config: dict[str, Any]) -> Train:
 
     # Replay and collector
     replay = make(config["replay"])()
+    if config["mirror"]:
+        replay.append_transform(MirrorSymmetry(humanoid_mirror_maps(), config["mirror"], seed=config["seed"]))
     if config["impersonation"]["n"]:
         replay.append_transform(TaskImpersonation(style_reward, seed=config["seed"], **config["impersonation"]))
     if config["checkpoint"]["replay"]:  # two at a time: the old one is removed when the new one is complete

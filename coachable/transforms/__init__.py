@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from coachable.transforms.mirror import MirrorMap, MirrorSymmetry
     from coachable.transforms.style_reward import StyleRewardTransform
     from coachable.transforms.style_sampler import CoachableEnv, StyleSampler, coachable_env
     from coachable.transforms.task_impersonation import TaskImpersonation
@@ -11,13 +12,15 @@ if TYPE_CHECKING:
 # Resolved on first use, so that one transform does not load the others.
 _MODULE_OF = {
     "CoachableEnv": "coachable.transforms.style_sampler",
+    "MirrorMap": "coachable.transforms.mirror",
+    "MirrorSymmetry": "coachable.transforms.mirror",
     "StyleRewardTransform": "coachable.transforms.style_reward",
     "StyleSampler": "coachable.transforms.style_sampler",
     "TaskImpersonation": "coachable.transforms.task_impersonation",
     "coachable_env": "coachable.transforms.style_sampler",
 }
 
-__all__ = ["CoachableEnv", "StyleRewardTransform", "StyleSampler", "TaskImpersonation", "coachable_env"]
+__all__ = ["CoachableEnv", "MirrorMap", "MirrorSymmetry", "StyleRewardTransform", "StyleSampler", "TaskImpersonation", "coachable_env"]
 
 
 def __getattr__(name: str) -> object:
