@@ -20,7 +20,15 @@ _MODULE_OF = {
     "coachable_env": "coachable.transforms.style_sampler",
 }
 
-__all__ = ["CoachableEnv", "MirrorMap", "MirrorSymmetry", "StyleRewardTransform", "StyleSampler", "TaskImpersonation", "coachable_env"]
+__all__ = [
+    "CoachableEnv",
+    "MirrorMap",
+    "MirrorSymmetry",
+    "StyleRewardTransform",
+    "StyleSampler",
+    "TaskImpersonation",
+    "coachable_env",
+]
 
 
 def __getattr__(name: str) -> object:
