@@ -90,7 +90,7 @@ class ActorCriticLoss(SACLoss):
             use_prioritized_weights=use_prioritized_weights,
             scalar_output_mode="exclude",
         )
-        # In float64, as gamma: numbers of no dimension do not widen float32 tensors, and float64 losses see the rounding.
+        # In float64, as gamma: float64 losses see the rounding, and a 0-dim number does not widen float32 tensors.
         self.log_alpha = torch.tensor(math.log(alpha), dtype=torch.float64, device=cast(Tensor, self.log_alpha).device)
         self._policy = policy  # no submodule: the parameters are those of actor_network_params
         networks = (actor_network, *critics)
