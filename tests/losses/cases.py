@@ -115,10 +115,11 @@ class ConstantPolicy(nn.Module):
 
     def __init__(self, parameters: dict[str, Tensor]) -> None:
         super().__init__()
+        self.names = list(parameters)  # nn.ParameterDict sorts
         self.emitted = nn.ParameterDict(parameters)
 
     def forward(self, observation: Tensor) -> tuple[Tensor, ...]:
-        return tuple(p.expand(*observation.shape[:-1], -1) for p in self.emitted.values())
+        return tuple(p.expand(*observation.shape[:-1], -1) for p in (self.emitted[n] for n in self.names))
 
 
 def constant_actor(heads: ActionHeads, **parameters: Tensor) -> ProbabilisticActor:
@@ -184,4 +185,4 @@ def gradients(loss: LossModule, prefix: str) -> list[Tensor]:
 
 def critic_loss(loss: LossModule, batch: TensorDict) -> tuple[Tensor, dict[str, Tensor]]:
     """The critic part, whatever it is called."""
-    return getattr(loss, "qvalue_loss", None or loss.qvalue_v2_loss)(batch)
+    return getattr(loss, "qvalue_loss" if hasattr(loss, "qvalue_loss") else "qvalue_v2_loss")(batch)

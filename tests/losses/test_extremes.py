@@ -26,7 +26,7 @@ AXES = {"saturated": (60.0, 0.1353), "wide": (-3.0, 7.389), "huge": (1e4, 1e3), 
 @pytest.mark.parametrize(
     ("case", "heads"), [pytest.param(c, HEADS[h], id=f"{c.name}-{h}") for c in OURS for h in c.heads]
 )
-@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     preferences=st.sampled_from(list(PREFERENCES)),
     axes=st.sampled_from(list(AXES)),
