@@ -1,4 +1,4 @@
-"""Forward and backward of a residual network by hand, for one network or an ensemble of equal ones.
+"""Residual networks with forward and backward by hand, for one network or an ensemble of equal ones.
 
 The same numbers as `ResidualMLP` gives layer by layer, with less work: no autograd node per operation, weights that
 were cast to bfloat16 once per update instead of at every use, gradients written to where the optimiser reads them, and
@@ -11,71 +11,19 @@ float32; activations between the layers are bfloat16.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
+from coachable.networks.native import load_kernels
+from coachable.networks.passes import Layer, Member, TorchPasses
+from coachable.networks.workspace import Workspace
+
+__all__ = ["Layer", "Member", "Plan", "residual_network"]
+
+_KERNEL_THREADS = 4  # the kernels run on one thread; beside many, the parallel operations of torch are faster
 _ROWS = 32  # granularity of the row-sparse backward: few distinct sizes keep oneDNN's cache of kernels small
-
-
-@dataclass(frozen=True)
-class Layer:
-    """Shape facts of one residual layer."""
-
-    in_features: int
-    out_features: int
-    side: str
-    narrowing: str
-    eps: float
-    norm: bool
-
-    @property
-    def tensors(self) -> int:
-        """Number of parameters: weight, bias, and the layer norm's scale and shift."""
-        return 4 if self.norm else 2
-
-    def skip(self, x: Tensor, hidden: Tensor, *, inplace: bool) -> Tensor:
-        """Return `hidden + fit(x)`; `hidden` may be overwritten if `inplace`."""
-        n, m = self.in_features, self.out_features
-        if n < m:
-            out = hidden if inplace else hidden.clone()
-            (out[:, :n] if self.side == "end" else out[:, m - n :]).add_(x)
-            return out
-        if n > m:
-            x = x[:, :m] if self._keeps_first else x[:, n - m :]
-        return hidden.add_(x) if inplace else hidden + x
-
-    def skip_adjoint(self, grad: Tensor) -> Tensor:
-        """Gradient of `fit(x)` with respect to x."""
-        n, m = self.in_features, self.out_features
-        if n < m:
-            return grad[:, :n] if self.side == "end" else grad[:, m - n :]
-        if n > m:
-            return F.pad(grad, (0, n - m) if self._keeps_first else (n - m, 0))
-        return grad
-
-    @property
-    def _keeps_first(self) -> bool:
-        return self.side == "end" or self.narrowing == "keep_first"
-
-
-@dataclass(frozen=True)
-class Member:
-    """Tensors of one network, none of which autograd knows.
-
-    Args:
-        parameters: Per layer weight `(o, i)`, bias `(o,)`, and with layer norm scale and shift `(o,)`; then weight and
-            bias of the head.
-        products: The same list in the dtype of the matrix products (only weights and biases of the layers are read).
-        grads: Where the parameters' gradients go, or empty if nobody wants them.
-    """
-
-    parameters: list[Tensor]
-    products: list[Tensor]
-    grads: list[Tensor]
 
 
 class Plan:
@@ -96,6 +44,12 @@ class Plan:
         # Stands for the parameters in autograd's graph, so that an output without other trained inputs has a gradient.
         self.anchor = torch.zeros((), requires_grad=True) if members[0].grads else None
         self.written = False
+        self._spaces: dict[tuple[int, ...], list[Workspace]] = {}
+
+    @property
+    def out_features(self) -> int:
+        """Width of the output."""
+        return self.members[0].parameters[-1].shape[0] if self.head else self.layers[-1].out_features
 
     def begin(self) -> None:
         """Forget the gradients: the next backward pass overwrites them, further ones add to them."""
@@ -107,6 +61,29 @@ class Plan:
             for member in self.members:
                 for grad in member.grads:
                     grad.zero_()
+
+    def acquire(self, widths: Sequence[int], rows: int, keep: bool) -> Workspace | TorchPasses:
+        """Means of one evaluation: prepared memory for the compiled kernels, or torch's operations without them.
+
+        Args:
+            widths: Widths of the inputs.
+            rows: Number of rows.
+            keep: Whether a backward pass will follow.
+        """
+        kernels = load_kernels() if self._suits_kernels() else None
+        if kernels is None:
+            return TorchPasses(self.layers, self.members, keep)
+        free = self._spaces.setdefault((rows, keep, *widths), [])
+        return free.pop() if free else Workspace(kernels, self.layers, self.members, widths, rows, keep)
+
+    def release(self, passes: Workspace | TorchPasses) -> None:
+        """Give prepared memory back after its last use."""
+        if isinstance(passes, Workspace):
+            self._spaces[passes.rows, passes.keep, *passes.widths].append(passes)
+
+    def _suits_kernels(self) -> bool:
+        bf16 = self.members[0].products[0].dtype == torch.bfloat16
+        return bf16 and all(layer.norm for layer in self.layers) and torch.get_num_threads() <= _KERNEL_THREADS
 
 
 def residual_network(plan: Plan, inputs: Sequence[Tensor]) -> Tensor:
@@ -125,35 +102,32 @@ def residual_network(plan: Plan, inputs: Sequence[Tensor]) -> Tensor:
 class _Residual(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, plan: Plan, anchor: Tensor | None, *inputs: Tensor) -> Tensor:  # pyright: ignore
-        lead = inputs[0].shape[:-1]
-        dtype = plan.members[0].products[0].dtype
-        x = torch.cat([t.to(dtype) for t in inputs], -1).flatten(0, -2)
-        keep = any(ctx.needs_input_grad)
-        outs, saved = [], []
-        for member in plan.members:
-            out, kept = _forward(plan, x, member, keep)
-            outs.append(out)
-            saved.append(kept)
+        lead, widths = inputs[0].shape[:-1], [t.shape[-1] for t in inputs]
+        rows, keep = lead.numel(), any(ctx.needs_input_grad)
+        passes = plan.acquire(widths, rows, keep)
+        own = plan.members[0]
+        dtype = own.parameters[-1].dtype if plan.head else own.products[0].dtype
+        out = torch.empty(len(plan.members), rows, plan.out_features, dtype=dtype, device=inputs[0].device)
+        passes.forward([t.reshape(rows, -1) for t in inputs], out.unbind())
         if keep:
-            ctx.plan, ctx.saved, ctx.lead = plan, saved, lead
-            ctx.facts = [(t.shape[-1], t.dtype) for t in inputs]
-        if plan.stacked:
-            return torch.stack(outs).view(len(outs), *lead, -1)
-        return outs[0].view(*lead, -1)
+            ctx.plan, ctx.passes, ctx.lead = plan, passes, lead
+            ctx.widths, ctx.dtypes = widths, [t.dtype for t in inputs]
+        else:
+            plan.release(passes)
+        return out.view((len(plan.members), *lead, -1) if plan.stacked else (*lead, -1))
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        plan: Plan = ctx.plan
-        if ctx.saved is None:
+        plan, passes, count = ctx.plan, ctx.passes, ctx.lead.numel()
+        if passes is None:
             raise RuntimeError("the residual network keeps its activations for one backward pass only")
         _, trained, *needs = ctx.needs_input_grad
-        columns = _columns([width for width, _ in ctx.facts], needs)
-        count = ctx.lead.numel()
+        columns = _columns(ctx.widths, needs)
         grad = grad.reshape(len(plan.members), count, grad.shape[-1])
         dx: Tensor | None = None
-        for k, member in enumerate(plan.members):
+        for k in range(len(plan.members)):
             rows = None if trained else _active_rows(grad[k])
-            own = _backward(plan, grad[k], ctx.saved[k], member, trained, rows, columns)
+            own = passes.backward(k, grad[k], trained, plan.written, rows, columns)
             if columns is None:
                 continue
             if dx is None:
@@ -162,12 +136,13 @@ class _Residual(torch.autograd.Function):
                     continue
                 dx = own.new_zeros(count, own.shape[1])
             dx = dx.add_(own) if rows is None else dx.index_add_(0, rows, own)
-        ctx.saved = None
+        ctx.passes = None
+        plan.release(passes)
         plan.written = plan.written or trained
         grads: list[Tensor | None] = [None] * len(needs)
         if columns is not None and dx is not None:
             start = -columns.start
-            for i, (width, dtype) in enumerate(ctx.facts):
+            for i, (width, dtype) in enumerate(zip(ctx.widths, ctx.dtypes, strict=True)):
                 if needs[i]:
                     grads[i] = dx[:, start : start + width].to(dtype).view(*ctx.lead, width)
                 start += width
@@ -182,101 +157,6 @@ def _columns(widths: Sequence[int], needs: Sequence[bool]) -> slice | None:
             wanted += [start, start + width]
         start += width
     return slice(min(wanted), max(wanted)) if wanted else None
-
-
-def _forward(plan: Plan, x: Tensor, member: Member, keep: bool) -> tuple[Tensor, list[tuple[Tensor, ...]]]:
-    kept: list[tuple[Tensor, ...]] = []
-    own, low, i = member.parameters, member.products, 0
-    for layer in plan.layers:
-        z = torch.addmm(low[i + 1], x, low[i].t())
-        y, mean, rstd = z, z, z
-        if layer.norm:
-            y, mean, rstd = torch.native_layer_norm(z, (layer.out_features,), own[i + 2], own[i + 3], layer.eps)
-        _relu_(y)
-        if keep:
-            kept.append((x, z, mean, rstd, y))
-        x = layer.skip(x, y, inplace=not keep)
-        i += layer.tensors
-    if not plan.head:
-        return x, kept
-    hidden = x.to(own[i].dtype)
-    if keep:
-        kept.append((hidden,))
-    return torch.addmm(own[i + 1], hidden, own[i].t()), kept
-
-
-def _backward(
-    plan: Plan,
-    grad: Tensor,
-    kept: list[tuple[Tensor, ...]],
-    member: Member,
-    trained: bool,
-    rows: Tensor | None,
-    columns: slice | None,
-) -> Tensor:
-    """Write the parameters' gradients if `trained`, and return the inputs' gradient for `columns` of the `rows`."""
-    own, low, into, add = member.parameters, member.products, member.grads, plan.written
-    i = len(own)
-    if rows is not None:
-        grad = grad.index_select(0, rows)
-    if plan.head:
-        i -= 2
-        if trained:
-            _write(into[i], torch.mm(grad.t(), kept[-1][0]), add)
-            _write(into[i + 1], grad.sum(0), add)
-        grad = torch.mm(grad, own[i])
-    grad = grad.to(low[0].dtype)
-    for index in reversed(range(len(plan.layers))):
-        layer = plan.layers[index]
-        i -= layer.tensors
-        x, z, mean, rstd, y = kept[index]
-        if rows is not None:
-            y, z = y.index_select(0, rows), z.index_select(0, rows)
-            mean, rstd = (mean.index_select(0, rows), rstd.index_select(0, rows)) if layer.norm else (z, z)
-        dz = _relu_backward(grad, y)
-        if layer.norm:
-            dz, dscale, dshift = torch.ops.aten.native_layer_norm_backward(
-                dz, z, (layer.out_features,), mean, rstd, own[i + 2], own[i + 3], (True, trained, trained)
-            )
-            if trained:
-                _write(into[i + 2], dscale, add)
-                _write(into[i + 3], dshift, add)
-        if trained:
-            _write(into[i], torch.mm(dz.t(), x), add)
-            _write(into[i + 1], dz.sum(0), add)
-        if index:
-            grad = torch.addmm(layer.skip_adjoint(grad), dz, low[i])
-        elif columns is not None:
-            grad = layer.skip_adjoint(grad)[:, columns] + torch.mm(dz, low[i][:, columns])
-    return grad
-
-
-def _write(into: Tensor, value: Tensor, add: bool) -> None:
-    if add:
-        into.add_(value)
-    else:
-        into.copy_(value)
-
-
-def _relu_(x: Tensor) -> None:
-    """Rectify in place.
-
-    On a CPU bfloat16 is rectified as the 16-bit integer of the same bits (negative numbers are negative integers),
-    which is six times as fast. A NaN whose sign bit is set becomes 0; it still shows in the gradients, and there the
-    learner looks.
-    """
-    if x.dtype == torch.bfloat16 and x.device.type == "cpu":
-        x.view(torch.int16).clamp_min_(0)
-    else:
-        x.relu_()
-
-
-def _relu_backward(grad: Tensor, y: Tensor) -> Tensor:
-    """`grad` where the rectified `y` is positive, else 0."""
-    if y.dtype == torch.bfloat16 and y.device.type == "cpu":
-        bits = torch.ops.aten.threshold_backward(grad.view(torch.int16), y.view(torch.int16), 0)
-        return bits.view(torch.bfloat16)
-    return torch.ops.aten.threshold_backward(grad, y, 0)
 
 
 def _active_rows(grad: Tensor) -> Tensor | None:

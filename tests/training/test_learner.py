@@ -1,62 +1,11 @@
+import copy
+
 import pytest
 import torch
-from tensordict import TensorDict
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from coachable.networks import make_critic, make_gaussian_actor
 from coachable.training import Learner, NonFiniteLossError, resolve_precision
-
-OBS, ACT = 7, 3
-
-
-class ScaledStyle:
-    dim = 2
-
-    def encode(self, theta):
-        return theta / 2
-
-
-def make_loss(seed=0, width=32, fixed_alpha=True, **kwargs):
-    torch.manual_seed(seed)
-    space, widths = ScaledStyle(), (width, width)
-    critics = [make_critic(OBS, ACT, space, widths) for _ in range(2)]
-    loss = SACLoss(
-        make_gaussian_actor(OBS, ACT, space, widths),
-        critics,
-        loss_function="l2",
-        fixed_alpha=fixed_alpha,
-        alpha_init=0.01,
-        action_spec=None,
-        **kwargs,
-    )
-    loss.make_value_estimator(gamma=0.99)
-    return loss
-
-
-def make_batch(*shape, seed=1):
-    gen = torch.Generator().manual_seed(seed)
-
-    def normal(n):
-        return torch.randn(*shape, n, generator=gen)
-
-    style = normal(2)
-    terminated = torch.rand(*shape, 1, generator=gen) < 0.1
-    return TensorDict(
-        {
-            "observation": normal(OBS),
-            "style": style,
-            "action": torch.tanh(normal(ACT)),
-            "next": {
-                "observation": normal(OBS),
-                "style": style,
-                "reward": normal(1),
-                "done": terminated,
-                "terminated": terminated,
-                "truncated": torch.zeros_like(terminated),
-            },
-        },
-        shape,
-    )
+from tests.sac_problem import make_batch, make_loss
 
 
 def params_of(loss):
@@ -195,7 +144,7 @@ def test_resumed_equals_uninterrupted(order):
     run(one, range(6))
     two = Learner(make_loss(), update_order=order)
     run(two, range(3))
-    state = torch.utils.data.default_convert(two.state_dict())
+    state = copy.deepcopy(two.state_dict())
     three = Learner(make_loss(seed=9), update_order=order)
     three.load_state_dict(state)
     assert three.updates == 3
@@ -244,3 +193,72 @@ def test_bad_options_raise():
     with pytest.raises(ValueError, match="max_grad_norm"):
         Learner(loss, max_grad_norm=-1.0)
     assert resolve_precision("bf16") == "bf16"
+
+
+@pytest.mark.parametrize("order", ["simultaneous", "policy_first", "critic_first"])
+def test_accelerated_and_plain_learner_agree(order):
+    """Ten updates with hand-written passes end where TorchRL's own evaluation ends."""
+    ends = []
+    for fused in (True, False):
+        loss = make_loss()
+        learner = Learner(loss, precision="fp32", update_order=order, fused=fused, actor_lr=1e-3, critic_lr=1e-3)
+        assert (learner._acceleration is not None) is fused
+        for seed in range(10):
+            torch.manual_seed(seed)
+            learner.update(make_batch(32, seed=seed))
+        ends.append(params_of(loss))
+    for name in ends[0]:
+        torch.testing.assert_close(
+            ends[0][name], ends[1][name], rtol=2e-3, atol=2e-4, msg=lambda m, n=name: f"{n}: {m}"
+        )
+
+
+def test_loss_is_as_it_was_outside_of_updates():
+    loss = make_loss()
+    learner = Learner(loss, precision="bf16")
+    learner.update(make_batch(16))
+    torch.manual_seed(3)
+    with_learner = loss(make_batch(16))
+    fresh = make_loss(seed=4)
+    SoftUpdate(fresh, tau=0.005)
+    fresh.load_state_dict(loss.state_dict())
+    torch.manual_seed(3)
+    without = fresh(make_batch(16))
+    for key in ("loss_actor", "loss_qvalue", "entropy"):
+        torch.testing.assert_close(with_learner[key], without[key], rtol=0, atol=0)
+
+
+def test_loading_parameters_into_the_loss_takes_effect():
+    """Rounded copies must not outlive the parameters they were made from."""
+    loss, other = make_loss(), make_loss(seed=7)
+    learner = Learner(loss, precision="bf16", actor_lr=0.0, critic_lr=0.0)
+    learner.update(make_batch(16))
+    loss.load_state_dict(other.state_dict())
+    torch.manual_seed(3)
+    got = learner.update(make_batch(16))
+    torch.manual_seed(3)
+    expected = Learner(other, precision="bf16").update(make_batch(16))
+    torch.testing.assert_close(got["loss_qvalue"], expected["loss_qvalue"])
+    torch.testing.assert_close(got["loss_actor"], expected["loss_actor"])
+
+
+def test_state_moves_between_accelerated_and_plain_learners():
+    one = Learner(make_loss(), precision="fp32")
+    one.update(make_batch(16))
+    two = Learner(make_loss(seed=3), precision="fp32", fused=False)
+    two.load_state_dict(copy.deepcopy(one.state_dict()))
+    for learner in (one, two):
+        torch.manual_seed(3)
+        learner.update(make_batch(16, seed=8))
+    theirs = params_of(two.loss_module)
+    for name, value in params_of(one.loss_module).items():
+        torch.testing.assert_close(value, theirs[name], rtol=1e-4, atol=1e-6)
+
+
+def test_two_learners_may_share_a_loss_one_after_the_other():
+    loss = make_loss()
+    for order in ("simultaneous", "policy_first"):
+        learner = Learner(loss, update_order=order, precision="bf16")
+        before = params_of(loss)
+        learner.update(make_batch(16))
+        assert all((params_of(loss)[k] != before[k]).any() for k in before)

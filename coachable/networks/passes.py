@@ -1,0 +1,188 @@
+"""Forward and backward of residual layers by hand, in torch's operations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Layer:
+    """Shape facts of one residual layer."""
+
+    in_features: int
+    out_features: int
+    side: str
+    narrowing: str
+    eps: float
+    norm: bool
+
+    @property
+    def tensors(self) -> int:
+        """Number of parameters: weight, bias, and the layer norm's scale and shift."""
+        return 4 if self.norm else 2
+
+    @property
+    def skip_columns(self) -> tuple[int, int, int]:
+        """Where `fit` reads in the input, where it adds to the output, and how many columns."""
+        n, m = self.in_features, self.out_features
+        if n <= m:
+            return 0, 0 if self.side == "end" else m - n, n
+        return 0 if self.side == "end" or self.narrowing == "keep_first" else n - m, 0, m
+
+    def skip(self, x: Tensor, hidden: Tensor, *, inplace: bool) -> Tensor:
+        """Return `hidden + fit(x)`; `hidden` may be overwritten if `inplace`."""
+        start, to, width = self.skip_columns
+        if width == self.out_features:
+            x = x[:, start : start + width]
+            return hidden.add_(x) if inplace else hidden + x
+        out = hidden if inplace else hidden.clone()
+        out[:, to : to + width].add_(x)
+        return out
+
+    def skip_adjoint(self, grad: Tensor) -> Tensor:
+        """Gradient of `fit(x)` with respect to x."""
+        start, to, width = self.skip_columns
+        missing = self.in_features - width
+        return F.pad(grad, (start, missing - start)) if missing else grad[:, to : to + width]
+
+
+@dataclass(frozen=True)
+class Member:
+    """Tensors of one network, none of which autograd knows.
+
+    Args:
+        parameters: Per layer weight `(o, i)`, bias `(o,)`, and with layer norm scale and shift `(o,)`; then weight and
+            bias of the head.
+        products: The same list in the dtype of the matrix products (only weights and biases of the layers are read).
+        grads: Where the parameters' gradients go, or empty if nobody wants them.
+    """
+
+    parameters: list[Tensor]
+    products: list[Tensor]
+    grads: list[Tensor]
+
+
+class TorchPasses:
+    """One evaluation of the members of a plan, and its backward pass.
+
+    Args:
+        layers: The residual layers.
+        members: The networks' tensors.
+        keep: Whether a backward pass will follow.
+    """
+
+    def __init__(self, layers: Sequence[Layer], members: Sequence[Member], keep: bool) -> None:
+        self._layers, self._members, self._keep = layers, members, keep
+        self._kept: list[list[tuple[Tensor, ...]]] = []
+
+    def forward(self, inputs: Sequence[Tensor], out: Sequence[Tensor]) -> None:
+        """Evaluate the members on `inputs` `(rows, d_i)` into `out`, each `(rows, o)`."""
+        dtype = self._members[0].products[0].dtype
+        x = torch.cat([t.to(dtype) for t in inputs], -1)
+        self._kept = [self._forward(x, member, into) for member, into in zip(self._members, out, strict=True)]
+
+    def backward(
+        self, k: int, grad: Tensor, trained: bool, add: bool, rows: Tensor | None, columns: slice | None
+    ) -> Tensor:
+        """Backward pass of member `k`.
+
+        Args:
+            k: Which member.
+            grad: Gradient of its output, `(all rows, o)`.
+            trained: Whether to write its parameters' gradients.
+            add: Add them to those present instead of replacing them.
+            rows: Rows to work on, `None` for all.
+            columns: Columns of the concatenated inputs whose gradient is wanted, `None` for none.
+
+        Returns:
+            Gradient of the inputs, `(rows, columns)`; meaningless without `columns`.
+        """
+        member, kept = self._members[k], self._kept[k]
+        own, low, into = member.parameters, member.products, member.grads
+        i = len(own)
+        if rows is not None:
+            grad = grad.index_select(0, rows)
+        if len(kept) > len(self._layers):
+            i -= 2
+            if trained:
+                _write(into[i], torch.mm(grad.t(), kept[-1][0]), add)
+                _write(into[i + 1], grad.sum(0), add)
+            grad = torch.mm(grad, own[i])
+        grad = grad.to(low[0].dtype)
+        for index in reversed(range(len(self._layers))):
+            layer = self._layers[index]
+            i -= layer.tensors
+            x, z, mean, rstd, y = kept[index]
+            if rows is not None:
+                y, z = y.index_select(0, rows), z.index_select(0, rows)
+                mean, rstd = (mean.index_select(0, rows), rstd.index_select(0, rows)) if layer.norm else (z, z)
+            dz = _relu_backward(grad, y)
+            if layer.norm:
+                dz, dscale, dshift = torch.ops.aten.native_layer_norm_backward(
+                    dz, z, (layer.out_features,), mean, rstd, own[i + 2], own[i + 3], (True, trained, trained)
+                )
+                if trained:
+                    _write(into[i + 2], dscale, add)
+                    _write(into[i + 3], dshift, add)
+            if trained:
+                _write(into[i], torch.mm(dz.t(), x), add)
+                _write(into[i + 1], dz.sum(0), add)
+            if index:
+                grad = torch.addmm(layer.skip_adjoint(grad), dz, low[i])
+            elif columns is not None:
+                grad = layer.skip_adjoint(grad)[:, columns] + torch.mm(dz, low[i][:, columns])
+        return grad
+
+    def _forward(self, x: Tensor, member: Member, into: Tensor) -> list[tuple[Tensor, ...]]:
+        kept: list[tuple[Tensor, ...]] = []
+        own, low, i = member.parameters, member.products, 0
+        for layer in self._layers:
+            z = torch.addmm(low[i + 1], x, low[i].t())
+            y, mean, rstd = z, z, z
+            if layer.norm:
+                y, mean, rstd = torch.native_layer_norm(z, (layer.out_features,), own[i + 2], own[i + 3], layer.eps)
+            _relu_(y)
+            if self._keep:
+                kept.append((x, z, mean, rstd, y))
+            x = layer.skip(x, y, inplace=not self._keep)
+            i += layer.tensors
+        if i == len(own):
+            into.copy_(x)
+            return kept
+        hidden = x.to(own[i].dtype)
+        kept.append((hidden,))
+        torch.addmm(own[i + 1], hidden, own[i].t(), out=into)
+        return kept
+
+
+def _write(into: Tensor, value: Tensor, add: bool) -> None:
+    if add:
+        into.add_(value)
+    else:
+        into.copy_(value)
+
+
+def _relu_(x: Tensor) -> None:
+    """Rectify in place.
+
+    On a CPU bfloat16 is rectified as the 16-bit integer of the same bits (negative numbers are negative integers),
+    which is six times as fast. A NaN whose sign bit is set becomes 0; it still shows in the gradients, and there the
+    learner looks.
+    """
+    if x.dtype == torch.bfloat16 and x.device.type == "cpu":
+        x.view(torch.int16).clamp_min_(0)
+    else:
+        x.relu_()
+
+
+def _relu_backward(grad: Tensor, y: Tensor) -> Tensor:
+    """`grad` where the rectified `y` is positive, else 0."""
+    if y.dtype == torch.bfloat16 and y.device.type == "cpu":
+        bits = torch.ops.aten.threshold_backward(grad.view(torch.int16), y.view(torch.int16), 0)
+        return bits.view(torch.bfloat16)
+    return torch.ops.aten.threshold_backward(grad, y, 0)

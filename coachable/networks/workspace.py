@@ -1,0 +1,172 @@
+"""The hand-written passes of residual networks on prepared memory, with the kernels of `kernels.c`.
+
+Between two products of matrices that fill the cache, every Python call is a cold one; so all views, addresses and
+buffers that do not change from update to update are made once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from coachable.networks.native import Kernels
+from coachable.networks.passes import Layer, Member
+
+_BF16 = torch.bfloat16
+
+
+class Workspace:
+    """Buffers and prepared calls for one batch size of a plan.
+
+    Args:
+        kernels: The compiled kernels.
+        layers: The residual layers, all with layer norm.
+        members: The networks' tensors, products in bfloat16.
+        widths: Widths of the inputs.
+        rows: Number of rows of a batch.
+        keep: Whether a backward pass will follow.
+    """
+
+    def __init__(
+        self,
+        kernels: Kernels,
+        layers: Sequence[Layer],
+        members: Sequence[Member],
+        widths: Sequence[int],
+        rows: int,
+        keep: bool,
+    ) -> None:
+        self.rows, self.keep, self.widths = rows, keep, tuple(widths)
+        widest = max(layer.out_features for layer in layers)
+        self._scratch = torch.empty(2 * widest)
+        self._input = torch.empty(rows, sum(widths), dtype=_BF16)
+        self._slots = self._input.split(list(widths), -1)
+        if keep:
+            self._flow = [torch.empty(rows, widest, dtype=_BF16) for _ in range(2)]
+            self._dz = torch.empty(rows, widest, dtype=_BF16)
+            self._dw = torch.empty(max(layer.in_features for layer in layers) * widest, dtype=_BF16)
+        shared = None if keep else self._buffers(layers)
+        self._members = [
+            _MemberSpace(self, kernels, layers, member, shared or self._buffers(layers)) for member in members
+        ]
+
+    def _buffers(self, layers: Sequence[Layer]) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
+        """Product, output, mean and reciprocal deviation of each layer; little memory if nothing is kept."""
+
+        def buffer(layer: Layer) -> Tensor:
+            return torch.empty(self.rows, layer.out_features, dtype=_BF16)
+
+        if self.keep or len({layer.out_features for layer in layers}) > 1:
+            return [(buffer(n), buffer(n), torch.empty(self.rows), torch.empty(self.rows)) for n in layers]
+        z, outs, statistic = buffer(layers[0]), (buffer(layers[0]), buffer(layers[0])), torch.empty(self.rows)
+        return [(z, outs[i % 2], statistic, statistic) for i in range(len(layers))]
+
+    def forward(self, inputs: Sequence[Tensor], out: Sequence[Tensor]) -> None:
+        """Evaluate the members on `inputs` `(rows, d_i)` into `out`, each `(rows, o)`."""
+        for slot, value in zip(self._slots, inputs, strict=True):
+            slot.copy_(value)
+        for member, into in zip(self._members, out, strict=True):
+            member.forward(into)
+
+    def backward(
+        self, k: int, grad: Tensor, trained: bool, add: bool, rows: Tensor | None, columns: slice | None
+    ) -> Tensor:
+        """Backward pass of member `k`, see `TorchPasses.backward`."""
+        return self._members[k].backward(grad, trained, add, rows, columns)
+
+
+class _MemberSpace:
+    def __init__(
+        self,
+        space: Workspace,
+        kernels: Kernels,
+        layers: Sequence[Layer],
+        member: Member,
+        buffers: Sequence[tuple[Tensor, Tensor, Tensor, Tensor]],
+    ) -> None:
+        self._space, self._layers = space, layers
+        self._layer_forward, self._layer_backward = kernels.layer_forward, kernels.layer_backward
+        # Addresses do not keep tensors alive.
+        self._own, self._low, self._buffers, self._grads = member.parameters, member.products, buffers, member.grads
+        self._forward_steps: list[tuple[Tensor, Tensor, Tensor, tuple[Any, ...]]] = []
+        self._backward_steps: list[tuple[Any, ...]] = []
+        x, i, rows = space._input, 0, space.rows
+        scratch = space._scratch.data_ptr()
+        for index, layer in enumerate(layers):
+            z, out, mean, rstd = buffers[index]
+            bias, gamma, beta = (t.data_ptr() for t in self._own[i + 1 : i + 4])
+            start, to, width = layer.skip_columns
+            statistics = (mean.data_ptr(), rstd.data_ptr())
+            arguments = (z.data_ptr(), bias, gamma, beta, x.data_ptr(), x.shape[1], start, to, width, layer.eps)
+            arguments += (rows, layer.out_features, out.data_ptr(), *statistics, scratch)
+            self._forward_steps.append((x, self._low[i].t(), z, arguments))
+            if space.keep:
+                n, m = layer.in_features, layer.out_features
+                # The gradient alternates between two buffers: the last layer's arrives in the first.
+                flow = len(layers) - 1 - index
+                here = space._flow[flow % 2].view(-1)[: rows * m].view(rows, m)
+                below = space._flow[(flow + 1) % 2].view(-1)[: rows * n].view(rows, n) if index else None
+                dz = space._dz.view(-1)[: rows * m].view(rows, m)
+                grads = self._grads[i : i + 4]
+                targets = [g.data_ptr() for g in (grads[2], grads[3], grads[1])] if grads else [None] * 3
+                first = (here.data_ptr(), z.data_ptr(), bias, gamma, beta, *statistics)
+                last = (m, dz.data_ptr(), *targets, scratch)
+                dw = space._dw[: m * n].view(m, n)
+                weight = grads[0] if grads else None
+                self._backward_steps.append((layer, x, here, below, dz, dz.t(), dw, weight, self._low[i], first, last))
+            x, i = out, i + 4
+        self._features = x
+        self._head = (self._own[i], self._own[i].t(), self._own[i + 1]) if i < len(self._own) else None
+        self._head_grads = self._grads[i:]
+        self._hidden = torch.empty(x.shape) if self._head is not None else None
+
+    def forward(self, out: Tensor) -> None:
+        kernel = self._layer_forward
+        for x, weight, z, arguments in self._forward_steps:
+            torch.mm(x, weight, out=z)
+            kernel(*arguments)
+        if self._head is None or self._hidden is None:
+            out.copy_(self._features)
+        else:
+            self._hidden.copy_(self._features)
+            torch.addmm(self._head[2], self._hidden, self._head[1], out=out)
+
+    def backward(self, grad: Tensor, trained: bool, add: bool, rows: Tensor | None, columns: slice | None) -> Tensor:
+        if rows is not None:
+            grad = grad.index_select(0, rows)
+        count = grad.shape[0]
+        if self._head is not None:
+            if trained:
+                assert self._hidden is not None
+                weight, bias = self._head_grads
+                if add:
+                    weight.addmm_(grad.t(), self._hidden)
+                    bias.add_(grad.sum(0))
+                else:
+                    torch.mm(grad.t(), self._hidden, out=weight)
+                    torch.sum(grad, 0, out=bias)
+            grad = torch.mm(grad, self._head[0])
+        kernel = self._layer_backward
+        address = None if rows is None else rows.data_ptr()
+        for index in reversed(range(len(self._layers))):
+            layer, x, here, below, dz, dz_t, dw, into, weight, first, last = self._backward_steps[index]
+            if index == len(self._layers) - 1:
+                here[:count].copy_(grad)
+            kernel(*first, address, count, trained, add, *last)
+            if trained:
+                torch.mm(dz_t, x, out=dw)
+                if add:
+                    into.add_(dw)
+                else:
+                    into.copy_(dw)
+            if rows is not None:
+                dz, here = dz[:count], here[:count]
+            if below is not None:
+                below = below if rows is None else below[:count]
+                torch.addmm(layer.skip_adjoint(here), dz, weight, out=below)
+            elif columns is not None:
+                return layer.skip_adjoint(here)[:, columns] + torch.mm(dz, weight[:, columns])
+        return grad
