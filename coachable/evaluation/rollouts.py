@@ -70,7 +70,7 @@ def record_episodes(
     rows: list[dict[str, Tensor]] = []
     styles, lives = [], []
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        for step in tqdm(range(steps), desc=progress, disable=progress is None, leave=False):
+        for step in tqdm(range(steps), desc=progress, disable=True if progress is None else None, leave=False):
             theta = schedule(step)
             transition = env.step(policy(current.set(STYLE, theta)))
             after = transition.get("next")

@@ -62,13 +62,14 @@ def render(
     domain = load_domain(agent.metadata["domain"])
     requests = default_tour(agent.space) if styles is None else list(styles)
     period = max(1, round(seconds_per_style / domain.control_step))
-    frames = _film(domain, agent.actor, agent.space, requests, period, size, seed)
-    total = len(requests) * period
-    bar = tqdm(frames, total=total, desc="drawing", unit="frame", disable=not progress, leave=False)
+    sheet = out.suffix == ".png"
+    # A sheet shows the end of each style's time, when the agent has had the chance to comply.
+    frames = _film(domain, agent.actor, agent.space, requests, period, size, seed, every=period if sheet else 1)
+    total = len(requests) * (1 if sheet else period)
+    bar = tqdm(frames, total=total, desc="drawing", unit="frame", disable=None if progress else True, leave=False)
     out.parent.mkdir(parents=True, exist_ok=True)
-    if out.suffix == ".png":
-        # The end of each style's time, when the agent has had the chance to comply.
-        _write_sheet([frame for i, frame in enumerate(bar) if (i + 1) % period == 0], out)
+    if sheet:
+        _write_sheet(list(bar), out)
     else:
         write_video(bar, out, round(1 / domain.control_step))
     return out
@@ -97,8 +98,9 @@ def write_video(frames: Iterable[np.ndarray], out: Path, fps: int) -> None:
     with av.open(str(out), "w") as container:
         stream = container.add_stream("libx264", rate=fps, options={"preset": "veryfast", "crf": "23"})
         stream.pix_fmt = "yuv420p"
-        for frame in frames:
-            stream.height, stream.width = frame.shape[:2]
+        for index, frame in enumerate(frames):
+            if index == 0:
+                stream.height, stream.width = frame.shape[:2]
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
         container.mux(stream.encode())
 
@@ -112,7 +114,9 @@ def _film(
     period: int,
     size: tuple[int, int],
     seed: int,
+    every: int,
 ) -> Iterator[np.ndarray]:
+    """Frames of each request's `period` steps, of every `every`-th step."""
     env = coachable_env(domain.make_env(num_envs=1, num_threads=1), space, domain.make_reward(space), seed=seed)
     renderer = domain.make_renderer(*size)
     env.set_seed(seed)
@@ -122,11 +126,12 @@ def _film(
     try:
         for request, theta in zip(requests, thetas, strict=True):
             recent: list[dict[str, Tensor]] = []
-            for _ in range(period):
+            for step in range(1, period + 1):
                 with set_exploration_type(ExplorationType.DETERMINISTIC):
                     transition = env.step(policy(current.set(STYLE, theta[None])))
                 recent.append(domain.measures.step(transition))
-                yield _caption(renderer.draw(env), _caption_lines(domain, request, recent, falls))
+                if step % every == 0:
+                    yield _caption(renderer.draw(env), _caption_lines(domain, request, recent, falls))
                 current = step_mdp(transition)
                 if transition["next", "done"].any():
                     falls += int(transition["next", "terminated"].sum())
