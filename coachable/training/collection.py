@@ -79,7 +79,7 @@ def make_collector(
     }
     if policy_device is not None and torch.device(policy_device).type != "cpu":
         common |= {"policy_device": policy_device, "env_device": "cpu", "storing_device": "cpu"}
-    plain = {"auto_register_policy_transforms": False}  # ours need none
+    plain: dict[str, Any] = {"auto_register_policy_transforms": False}  # ours need none
     if backend == "direct":
         collector = Collector(make_env(seed), policy, use_buffers=False, trust_policy=True, **common, **plain)
         if next(collector.policy.parameters()) is not next(policy.parameters()):  # the loop relies on shared weights
