@@ -72,7 +72,7 @@ class GaussianPolicy(nn.Module):
             out = self.trunk(observation, self.space.encode(style))
         loc, raw = out.chunk(2, -1)
         low, high = self.log_scale_range
-        return loc, torch.exp(low + 0.5 * (high - low) * (torch.tanh(raw) + 1.0))
+        return loc, torch.exp(torch.tanh(raw) * (0.5 * (high - low)) + 0.5 * (high + low))
 
 
 def make_gaussian_actor(
@@ -102,11 +102,11 @@ def make_gaussian_actor(
         A `ProbabilisticActor` reading `observation` and `style`, writing `loc`, `scale` and `action`.
     """
     policy = GaussianPolicy(obs_dim, action_dim, space, widths, log_scale_range=log_scale_range, **trunk)
-    in_keys = [observation_key] if space is None else [observation_key, STYLE]
-    module = TensorDictModule(policy, in_keys=in_keys, out_keys=["loc", "scale"])
+    in_keys: list[Any] = [observation_key] if space is None else [observation_key, STYLE]
+    module = TensorDictModule(policy, in_keys=in_keys, out_keys=["loc", "scale"])  # pyright: ignore[reportArgumentType]
     return ProbabilisticActor(
         module,
         in_keys=["loc", "scale"],
-        spec=Bounded(-1.0, 1.0, (action_dim,), dtype=torch.float32) if action_spec is None else action_spec,
+        spec=Bounded(-1.0, 1.0, torch.Size([action_dim]), dtype=torch.float32) if action_spec is None else action_spec,
         distribution_class=TanhGaussian,
     )

@@ -130,12 +130,9 @@ class _Residual(torch.autograd.Function):
             own = passes.backward(k, grad[k], trained, plan.written, rows, columns)
             if columns is None:
                 continue
-            if dx is None:
-                if rows is None:
-                    dx = own
-                    continue
-                dx = own.new_zeros(count, own.shape[1])
-            dx = dx.add_(own) if rows is None else dx.index_add_(0, rows, own)
+            if rows is not None:
+                own = own.new_zeros(count, own.shape[1]).index_copy_(0, rows, own)
+            dx = own if dx is None else dx.add_(own)
         ctx.passes = None
         plan.release(passes)
         plan.written = plan.written or trained

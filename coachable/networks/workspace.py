@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from coachable.networks.memory import Arena
 from coachable.networks.native import Kernels
 from coachable.networks.passes import Layer, Member
 
@@ -40,14 +41,15 @@ class Workspace:
         keep: bool,
     ) -> None:
         self.rows, self.keep, self.widths = rows, keep, tuple(widths)
+        self._arena = Arena()
         widest = max(layer.out_features for layer in layers)
-        self._scratch = torch.empty(2 * widest)
-        self._input = torch.empty(rows, sum(widths), dtype=_BF16)
+        self._scratch = self._arena.empty(2 * widest)
+        self._input = self._arena.empty(rows, sum(widths), dtype=_BF16)
         self._slots = self._input.split(list(widths), -1)
         if keep:
-            self._flow = [torch.empty(rows, widest, dtype=_BF16) for _ in range(2)]
-            self._dz = torch.empty(rows, widest, dtype=_BF16)
-            self._dw = torch.empty(max(layer.in_features for layer in layers) * widest, dtype=_BF16)
+            self._flow = [self._arena.empty(rows, widest, dtype=_BF16) for _ in range(2)]
+            self._dz = self._arena.empty(rows, widest, dtype=_BF16)
+            self._dw = self._arena.empty(max(layer.in_features for layer in layers) * widest, dtype=_BF16)
         shared = None if keep else self._buffers(layers)
         self._members = [
             _MemberSpace(self, kernels, layers, member, shared or self._buffers(layers)) for member in members
@@ -57,11 +59,11 @@ class Workspace:
         """Product, output, mean and reciprocal deviation of each layer; little memory if nothing is kept."""
 
         def buffer(layer: Layer) -> Tensor:
-            return torch.empty(self.rows, layer.out_features, dtype=_BF16)
+            return self._arena.empty(self.rows, layer.out_features, dtype=_BF16)
 
         if self.keep or len({layer.out_features for layer in layers}) > 1:
-            return [(buffer(n), buffer(n), torch.empty(self.rows), torch.empty(self.rows)) for n in layers]
-        z, outs, statistic = buffer(layers[0]), (buffer(layers[0]), buffer(layers[0])), torch.empty(self.rows)
+            return [(buffer(n), buffer(n), self._arena.empty(self.rows), self._arena.empty(self.rows)) for n in layers]
+        z, outs, statistic = buffer(layers[0]), (buffer(layers[0]), buffer(layers[0])), self._arena.empty(self.rows)
         return [(z, outs[i % 2], statistic, statistic) for i in range(len(layers))]
 
     def forward(self, inputs: Sequence[Tensor], out: Sequence[Tensor]) -> None:
@@ -121,7 +123,7 @@ class _MemberSpace:
         self._features = x
         self._head = (self._own[i], self._own[i].t(), self._own[i + 1]) if i < len(self._own) else None
         self._head_grads = self._grads[i:]
-        self._hidden = torch.empty(x.shape) if self._head is not None else None
+        self._hidden = space._arena.empty(*x.shape) if self._head is not None else None
 
     def forward(self, out: Tensor) -> None:
         kernel = self._layer_forward

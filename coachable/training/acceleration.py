@@ -14,6 +14,7 @@ from torchrl.objectives import LossModule
 
 from coachable.networks.ensemble import CriticEnsemble, Triple, make_plan, planned_copy, residual_networks
 from coachable.networks.flat import FlatBuffers
+from coachable.networks.fused import Plan
 
 
 class Acceleration:
@@ -48,19 +49,15 @@ class Acceleration:
             for name, network in self._policies.items()
         }
 
-        def critics(flat: FlatBuffers, trained: bool) -> TensorDictModule:
+        def plans(flat: FlatBuffers, trained: bool) -> dict[str, Plan]:
             tensors = _triples(flat, critic_names)
             networks = residual_networks(critic).items()
-            plans = {name: make_plan(net, name, tensors, members, trained=trained) for name, net in networks}
-            module = planned_copy(critic, plans)
-            assert isinstance(module, TensorDictModule)
-            if trained:
-                self._critic_plans = plans
-            return module
+            return {name: make_plan(net, name, tensors, members, trained=trained) for name, net in networks}
 
-        self.trained_critics = critics(self.critic, True).module
-        self.frozen_critics = critics(self.critic, False).module
-        self.target_critics = critics(self.target, False).module
+        self._critic_plans = plans(self.critic, True)
+        self.trained_critics = _critics(critic, self._critic_plans)
+        self.frozen_critics = _critics(critic, plans(self.critic, False))
+        self.target_critics = _critics(critic, plans(self.target, False))
         self._ensemble = CriticEnsemble(critic, self._choose, members)
 
     @staticmethod
@@ -129,6 +126,11 @@ class Acceleration:
     def move_targets(self, tau: float) -> None:
         """Polyak averaging of the target networks."""
         torch._foreach_lerp_(self.target.tensors, self.critic.tensors, tau)
+
+
+def _critics(critic: TensorDictModule, plans: dict[str, Plan]) -> nn.Module:
+    module: Any = planned_copy(critic, plans)
+    return module.module
 
 
 def _leaves(params: TensorDictBase, names: list[str]) -> list[Tensor]:

@@ -38,9 +38,9 @@ class LeanSAC:
     def supports(loss_module: LossModule) -> bool:
         """Whether this is `SACLoss` itself, with the mean reduction and a policy of `make_gaussian_actor`."""
         loss: Any = loss_module
-        if type(loss) is not SACLoss or loss._version != 2 or loss.skip_done_states or loss.reduction != "mean":
+        if type(loss_module) is not SACLoss or loss._version != 2 or loss.skip_done_states or loss.reduction != "mean":
             return False
-        parts = list(loss.actor_network.module)
+        parts: list[Any] = list(loss.actor_network.module)
         return (
             len(parts) == 2
             and isinstance(parts[0], TensorDictModule)

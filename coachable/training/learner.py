@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal, NamedTuple, get_args
@@ -11,6 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import LossModule, SoftUpdate
 
+from coachable.networks.memory import Arena
 from coachable.training.acceleration import Acceleration
 from coachable.training.lean_sac import LeanSAC
 from coachable.training.precision import Precision, resolve_precision
@@ -109,10 +111,14 @@ class Learner:
             for name, group in params.items()
             if group
         }
-        self._losses = _Losses(loss_module.forward, loss_module.actor_loss, _critic_loss_of(loss_module))
+        if device.type == "cpu":
+            for optimizer in self.optimizers.values():
+                _move_moments(optimizer)
+        loss: Any = loss_module
+        self._losses = _Losses(loss.forward, loss.actor_loss, _critic_loss_of(loss))
         if compile:
             self._losses = _Losses(*map(torch.compile, self._losses))
-        self._non_finite = torch.zeros((), dtype=torch.bool, device=device)
+        self._watch = torch.zeros((), device=device)
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Make one update.
@@ -140,9 +146,10 @@ class Learner:
         else:
             self._acceleration.move_targets(self.tau)
         self.updates += 1
-        # A NaN parameter can hide behind a rectifier in the losses, but not in the gradients.
-        total = sum(metrics[key] for key in ("loss_actor", "loss_qvalue", "grad_norm_actor", "grad_norm_critic"))
-        self._non_finite.logical_or_(torch.isfinite(total).logical_not_())
+        # A sum over updates stays NaN or infinite once a part was. The norms are in it because a NaN parameter can hide
+        # behind a rectifier in the losses, but not in the gradients.
+        for key in ("loss_actor", "loss_qvalue", "grad_norm_actor", "grad_norm_critic"):
+            self._watch.add_(metrics[key])
         if self.check_every and self.updates % self.check_every == 0:
             self.check_finite()
         if "entropy" in metrics and "alpha" in metrics:
@@ -150,12 +157,13 @@ class Learner:
         return metrics
 
     def check_finite(self) -> None:
-        """Raise if any loss since the start was not finite (this reads one flag from the device)."""
-        if bool(self._non_finite):
+        """Raise if a loss or gradient since the last check was not finite (this reads one number from the device)."""
+        if not math.isfinite(float(self._watch)):
             raise NonFiniteLossError(
                 f"a loss was NaN or infinite at or before update {self.updates}. Look for non-finite observations or "
                 "rewards in the replay buffer, a learning rate that is too large, or set max_grad_norm."
             )
+        self._watch.zero_()
 
     def state_dict(self) -> dict[str, Any]:
         """Parameters, targets, optimiser moments and the update counter."""
@@ -170,13 +178,15 @@ class Learner:
         self.loss_module.load_state_dict(state["loss_module"])
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
+            if self._device_type == "cpu":
+                _move_moments(optimizer)
         self.updates = int(state["updates"])
-        self._non_finite.zero_()
+        self._watch.zero_()
 
     def _networks(self) -> AbstractContextManager[None]:
         return nullcontext() if self._acceleration is None else self._acceleration.active()
 
-    def _autocast(self) -> AbstractContextManager[None]:
+    def _autocast(self) -> AbstractContextManager[Any]:
         if self.precision == "fp32" or self._acceleration is not None:
             return nullcontext()
         return torch.autocast(self._device_type, dtype=torch.bfloat16)
@@ -184,18 +194,18 @@ class Learner:
     def _step(self, name: str) -> Tensor:
         """Clip, step, and return the norm of the gradient before clipping."""
         params, optimizer = self._params[name], self.optimizers[name]
-        accelerated = self._acceleration is not None and name != "alpha"
-        if accelerated:
-            norm = torch.linalg.vector_norm(self._acceleration.gradient(name))
+        acceleration = self._acceleration if name != "alpha" else None
+        if acceleration is not None:
+            norm = torch.linalg.vector_norm(acceleration.gradient(name))
         else:
             norm = torch.nn.utils.get_total_norm([p.grad for p in params if p.grad is not None])
         if self.max_grad_norm is not None and name != "alpha":
             torch.nn.utils.clip_grads_with_norm_(params, self.max_grad_norm, norm)
         optimizer.step()
-        if not accelerated:
+        if acceleration is None:
             optimizer.zero_grad(set_to_none=True)
         elif self.update_order != "simultaneous":
-            self._acceleration.refresh(name)
+            acceleration.refresh(name)
         return norm
 
     def _simultaneous(self, batch: TensorDictBase, functions: _Losses) -> dict[str, Tensor]:
@@ -232,12 +242,13 @@ class Learner:
             loss_actor, extra = functions.actor(batch)
         loss_actor.backward()
         metrics = {"loss_actor": loss_actor.detach(), "grad_norm_actor": self._step("actor")}
+        loss: Any = self.loss_module
         if "log_prob" in extra:
             log_prob = extra["log_prob"]
             metrics["entropy"] = -log_prob.mean()
-            metrics["alpha"] = self.loss_module.log_alpha.detach().exp()
+            metrics["alpha"] = loss.log_alpha.detach().exp()
             if self._params["alpha"]:
-                self.loss_module.alpha_loss(log_prob).mean().backward()
+                loss.alpha_loss(log_prob).mean().backward()
                 self._step("alpha")
         return metrics
 
@@ -255,6 +266,18 @@ def _parameter_groups(loss_module: LossModule) -> dict[str, list[nn.Parameter]]:
             f"{type(loss_module).__name__} has no trainable parameters of {missing}: the learner needs both"
         )
     return groups
+
+
+def _move_moments(optimizer: torch.optim.Optimizer) -> None:
+    """Place Adam's moments on huge pages, zeros if there are none yet."""
+    arena = Arena()
+    for group in optimizer.param_groups:
+        for p in group["params"]:
+            state = optimizer.state[p]
+            state.setdefault("step", torch.zeros(()))
+            for name in ("exp_avg", "exp_avg_sq"):
+                moment = arena.zeros(*p.shape, dtype=p.dtype)
+                state[name] = moment.copy_(state[name]) if name in state else moment
 
 
 def _critic_loss_of(loss_module: LossModule) -> Callable[..., Any]:

@@ -262,3 +262,25 @@ def test_two_learners_may_share_a_loss_one_after_the_other():
         before = params_of(loss)
         learner.update(make_batch(16))
         assert all((params_of(loss)[k] != before[k]).any() for k in before)
+
+
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+def test_both_precisions_learn_to_follow_the_style(precision):
+    """A bandit, reward -|a - style / 2|: after 300 updates the policy's action follows the style."""
+    loss = make_loss(width=64)
+    learner = Learner(loss, precision=precision, actor_lr=2e-3, critic_lr=4e-3)
+    gen = torch.Generator().manual_seed(0)
+    for _ in range(300):
+        batch = make_batch(128, seed=int(torch.randint(1 << 30, (), generator=gen)))
+        batch["style"] = batch["next", "style"] = torch.rand(128, 2, generator=gen) * 2 - 1
+        batch["action"] = torch.rand(128, 3, generator=gen) * 2 - 1
+        distance = (batch["action"][:, :2] - 0.5 * batch["style"]).abs().sum(-1, keepdim=True)
+        batch["next", "reward"] = -distance
+        batch["next", "terminated"] = torch.ones(128, 1, dtype=torch.bool)
+        learner.update(batch)
+    test = make_batch(500, seed=5)
+    test["style"] = torch.rand(500, 2, generator=gen) * 2 - 1
+    with torch.no_grad():
+        loc, _ = loss.actor_network[0].module(test["observation"], test["style"])
+    error = (torch.tanh(loc)[:, :2] - 0.5 * test["style"]).abs().mean()
+    assert error < 0.15, f"mean distance {error:.3f}; 0.33 without regard to the style"
