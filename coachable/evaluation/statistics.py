@@ -56,7 +56,7 @@ def rank_correlation(x: np.ndarray, y: np.ndarray) -> float:
     ranks = [_ranks(values[keep]) for values in (x, y)]
     if len(ranks[0]) < 2 or min(np.ptp(r) for r in ranks) == 0:
         return float("nan")
-    return float(np.corrcoef(*ranks)[0, 1])
+    return float(np.corrcoef(ranks[0], ranks[1])[0, 1])
 
 
 def _ranks(values: np.ndarray) -> np.ndarray:

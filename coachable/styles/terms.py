@@ -33,7 +33,10 @@ FeatureKey: TypeAlias = int | slice | str | tuple[Any, ...]
 class StyleTerm(Protocol):
     """Anything callable as `(features, style) -> (...,)` that names the parameters it reads."""
 
-    parameters: tuple[str, ...]
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the style parameters that it reads."""
+        ...
 
     def __call__(self, features: Features, style: Style) -> Tensor:
         """Reward of the term, `(...,)`, before its scale."""

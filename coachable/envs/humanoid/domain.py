@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 from torchrl.envs import EnvBase
 
@@ -22,7 +24,7 @@ class _EnvRenderer:
     def draw(self, env: EnvBase, row: int = 0) -> np.ndarray:
         """Image of the humanoid's current state."""
         while not isinstance(env, HumanoidEnv):
-            env = env.base_env
+            env = cast(EnvBase, env.base_env)
         return self._renderer.draw(env.simulation.positions[row], float(env.course[row]))
 
     def close(self) -> None:

@@ -69,7 +69,7 @@ class HumanoidEnv(EnvBase):
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
         if step_max <= 0:
             raise ValueError(f"step_max must be positive seconds, got {step_max}")
-        super().__init__(device="cpu", batch_size=[num_envs])
+        super().__init__(device="cpu", batch_size=torch.Size((num_envs,)))
         if num_threads is None:
             num_threads = min(len(os.sched_getaffinity(0)), num_envs)
         self.num_envs = num_envs
@@ -92,20 +92,22 @@ class HumanoidEnv(EnvBase):
     # -- TorchRL ---------------------------------------------------------------------------------------------------
 
     def _make_specs(self) -> None:
-        n = self.num_envs
-        self.action_spec = Bounded(-1.0, 1.0, shape=(n, NUM_ACTIONS), dtype=torch.float32)
+        def rows(width: int) -> torch.Size:
+            return torch.Size((self.num_envs, width))
+
+        self.action_spec = Bounded(-1.0, 1.0, shape=rows(NUM_ACTIONS), dtype=torch.float32)
         self.observation_spec = Composite(
             {
-                "observation": Unbounded(shape=(n, OBSERVATION_SIZE), dtype=torch.float32),
-                TASK_REWARD: Unbounded(shape=(n, 1), dtype=torch.float32),
-                STYLE_FEATURES: Unbounded(shape=(n, STYLE_FEATURES_SIZE), dtype=torch.float32),
+                "observation": Unbounded(shape=rows(OBSERVATION_SIZE), dtype=torch.float32),
+                TASK_REWARD: Unbounded(shape=rows(1), dtype=torch.float32),
+                STYLE_FEATURES: Unbounded(shape=rows(STYLE_FEATURES_SIZE), dtype=torch.float32),
             },
-            shape=(n,),
+            shape=self.batch_size,
         )
-        self.reward_spec = Unbounded(shape=(n, 1), dtype=torch.float32)
+        self.reward_spec = Unbounded(shape=rows(1), dtype=torch.float32)
         self.done_spec = Composite(
-            {name: Binary(n=1, shape=(n, 1), dtype=torch.bool) for name in ("done", "terminated", "truncated")},
-            shape=(n,),
+            {name: Binary(n=1, shape=rows(1), dtype=torch.bool) for name in ("done", "terminated", "truncated")},
+            shape=self.batch_size,
         )
 
     def _set_seed(self, seed: int | None) -> None:

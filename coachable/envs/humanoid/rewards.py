@@ -44,5 +44,5 @@ def move_reward(
         standing = standing * tolerance(
             cosine, bounds=(ALIGNED, np.inf), margin=margin, value_at_margin=0, sigmoid="linear"
         )
-    effortless = tolerance(controls, margin=1, value_at_margin=0, sigmoid="quadratic").mean(axis=1)
+    effortless = np.mean(tolerance(controls, margin=1, value_at_margin=0, sigmoid="quadratic"), axis=1)
     return moving * standing * (4 + effortless) / 5
