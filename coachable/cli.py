@@ -1,6 +1,7 @@
 """The `coachable` command. Each sub-command imports what it needs only when it runs."""
 
 import argparse
+import glob
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -68,6 +69,16 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("--seed", type=int, default=0)
     render.set_defaults(run=_render)
 
+    curves = commands.add_parser("curves", help="draw learning curves of runs, with intervals over seeds")
+    curves.add_argument(
+        "groups", nargs="+", type=_group, metavar="LABEL=PATTERN", help="runs by label, such as bf16='runs/bf16_*'"
+    )
+    curves.add_argument("--x", default="updates", help="metric of the horizontal axis (default: %(default)s)")
+    curves.add_argument("--y", default="episode/return", help="metric to draw (default: %(default)s)")
+    curves.add_argument("--smooth", type=int, default=5, help="rows of the moving average (default: %(default)s)")
+    curves.add_argument("--out", type=Path, default=Path("curves.png"), help="(default: %(default)s)")
+    curves.set_defaults(run=_curves)
+
     weights = commands.add_parser("weights", help="write the small weights file of a checkpoint")
     weights.add_argument("source", help="a run's folder or a checkpoint")
     weights.add_argument("out", type=Path, help="the file, such as coachable/pretrained/humanoid/weights.pt")
@@ -92,6 +103,16 @@ def _render(options: argparse.Namespace) -> int:
     from coachable.evaluation.video import render
 
     print(f"wrote {render(options.source, **_arguments(options, without=('source',)))}")
+    return 0
+
+
+def _curves(options: argparse.Namespace) -> int:
+    from coachable.evaluation.curves import draw_learning_curves
+
+    last = draw_learning_curves(dict(options.groups), options.out, x=options.x, y=options.y, smooth=options.smooth)
+    for label, value in last.items():
+        print(f"{label}: {options.y} {value:.4g} at the end")
+    print(f"wrote {options.out}")
     return 0
 
 
@@ -127,6 +148,16 @@ def _style(text: str) -> dict[str, Any]:
         except ValueError:
             style[name.strip()] = value.strip()
     return style
+
+
+def _group(text: str) -> tuple[str, list[Path]]:
+    label, equals, pattern = text.partition("=")
+    if not equals:
+        raise argparse.ArgumentTypeError(f"{text!r} is no LABEL=PATTERN")
+    runs = [Path(run) for run in sorted(glob.glob(pattern)) if (Path(run) / "metrics.csv").is_file()]
+    if not runs:
+        raise argparse.ArgumentTypeError(f"no run with a metrics.csv matches {pattern!r}")
+    return label, runs
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,15 +47,15 @@ def draw_style_grid(grid: StyleGrid, space: StyleSpace, path: Path, title: str, 
             spread = np.array([[rows[i][f"{column}_low"], rows[i][f"{column}_high"]] for i in cells])
             offset = (index - (len(groups) - 1) / 2) * 0.004 * (axis.high - axis.low) / 0.35
             error = np.abs(spread - values[:, None]).T
-            panel.errorbar(x + offset, values, error, marker=_MARKERS[index], label=_readable(group), capsize=2, ms=5)
+            panel.errorbar(x + offset, values, error, marker=_MARKERS[index], label=readable(group), capsize=2, ms=5)
         if name == axis.name:
             panel.plot([axis.low, axis.high], [axis.low, axis.high], color="0.6", ls="--", lw=1, label="as requested")
-            panel.set_ylabel(f"measured {_readable(name)}{unit}")
+            panel.set_ylabel(f"measured {readable(name)}{unit}")
         else:
-            panel.set_ylabel(_LABELS.get(name, _readable(name)))
+            panel.set_ylabel(_LABELS.get(name, readable(name)))
             if name in _SHARES:
                 panel.set_ylim(-0.03, 1.05)
-        panel.set_xlabel(f"requested {_readable(axis.name)}{unit}")
+        panel.set_xlabel(f"requested {readable(axis.name)}{unit}")
         panel.grid(alpha=0.3)
     axes[0, 0].legend(fontsize=8)
     figure.suptitle(title, fontsize=10)
@@ -63,27 +63,6 @@ def draw_style_grid(grid: StyleGrid, space: StyleSpace, path: Path, title: str, 
     plt.close(figure)
 
 
-def draw_curves(runs: Mapping[str, Mapping[str, np.ndarray]], x: str, panels: Mapping[str, str], path: Path) -> None:
-    """Training curves of several runs side by side.
-
-    Args:
-        runs: label to columns of its metrics; NaN entries are left out.
-        x: column of the horizontal axis.
-        panels: column to axis label.
-        path: PNG file to write.
-    """
-    figure, axes = plt.subplots(1, len(panels), figsize=(4.2 * len(panels), 3.6), squeeze=False, layout="constrained")
-    for panel, (name, label) in zip(axes[0], panels.items(), strict=True):
-        for run, columns in runs.items():
-            valid = ~np.isnan(columns[name])
-            panel.plot(columns[x][valid], columns[name][valid], label=run)
-        panel.set_xlabel(_readable(x))
-        panel.set_ylabel(label)
-        panel.grid(alpha=0.3)
-    axes[0, 0].legend(fontsize=8)
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
-
-
-def _readable(name: Any) -> str:
+def readable(name: Any) -> str:
+    """A name as people write it."""
     return str(name).replace("_", " ")

@@ -1,0 +1,55 @@
+"""Learning curves from the metrics that runs leave behind."""
+
+import numpy as np
+import pytest
+
+from coachable.cli import main
+from coachable.evaluation.curves import draw_learning_curves, read_metric, summarise_runs
+
+
+def make_run(folder, slope, rows=20):
+    folder.mkdir(parents=True)
+    lines = ["updates,episode/return,empty"] + [f"{i},{slope * i},," for i in range(rows)]
+    (folder / "metrics.csv").write_text("\n".join(line.removesuffix(",") for line in lines) + "\n")
+    return folder
+
+
+def test_mean_and_interval_over_runs(tmp_path):
+    runs = [make_run(tmp_path / f"seed{slope}", slope) for slope in (1.0, 2.0, 3.0)]
+    at, mean, (low, high) = summarise_runs(runs, "updates", "episode/return", smooth=1)
+    np.testing.assert_allclose(mean, 2.0 * at)
+    assert at[0] == 0
+    assert at[-1] == 19
+    assert (low[1:] < mean[1:]).all()
+    assert (high[1:] > mean[1:]).all()
+    np.testing.assert_allclose([low[-1], high[-1]], [19.0, 57.0])  # all three the smallest, all three the largest
+
+
+def test_smoothing_is_a_trailing_mean(tmp_path):
+    at, mean, _ = summarise_runs([make_run(tmp_path / "run", 1.0)], "updates", "episode/return", smooth=5)
+    assert at[0] == 4
+    np.testing.assert_allclose(mean, at - 2)
+
+
+def test_the_common_part_of_unequal_runs_is_drawn(tmp_path):
+    runs = [make_run(tmp_path / "a", 1.0, rows=10), make_run(tmp_path / "b", 1.0, rows=20)]
+    last = draw_learning_curves({"both": runs}, tmp_path / "curves.png", smooth=1)
+    assert last == {"both": pytest.approx(9.0)}
+    assert (tmp_path / "curves.png").stat().st_size > 1000
+
+
+def test_unknown_and_empty_metrics_are_named(tmp_path):
+    run = make_run(tmp_path / "run", 1.0)
+    with pytest.raises(ValueError, match=r"no metric 'loss': expected one of \['updates', 'episode/return', 'empty'\]"):
+        read_metric(run, "updates", "loss")
+    with pytest.raises(ValueError, match="no row with both"):
+        read_metric(run, "updates", "empty")
+
+
+def test_the_command(tmp_path, capsys):
+    make_run(tmp_path / "bf16_0", 1.0)
+    assert main(["curves", f"bf16={tmp_path}/bf16_*", "--out", str(tmp_path / "c.png"), "--smooth", "1"]) == 0
+    assert "bf16: episode/return 19 at the end" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main(["curves", f"fp32={tmp_path}/fp32_*"])
+    assert "no run with a metrics.csv matches" in capsys.readouterr().err
