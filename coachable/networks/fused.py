@@ -70,8 +70,8 @@ class Plan:
             rows: Number of rows.
             keep: Whether a backward pass will follow.
         """
-        kernels = load_kernels() if self._suits_kernels() else None
-        if kernels is None:
+        kernels = load_kernels().get(self.members[0].products[0].dtype)
+        if kernels is None or not self._suits_kernels():
             return TorchPasses(self.layers, self.members, keep)
         free = self._spaces.setdefault((rows, keep, *widths), [])
         return free.pop() if free else Workspace(kernels, self.layers, self.members, widths, rows, keep)
@@ -82,8 +82,10 @@ class Plan:
             self._spaces[passes.rows, passes.keep, *passes.widths].append(passes)
 
     def _suits_kernels(self) -> bool:
-        bf16 = self.members[0].products[0].dtype == torch.bfloat16
-        return bf16 and all(layer.norm for layer in self.layers) and torch.get_num_threads() <= _KERNEL_THREADS
+        own = self.members[0].parameters[0]
+        normed = all(layer.norm for layer in self.layers)
+        threads = torch.get_num_threads()
+        return normed and threads <= _KERNEL_THREADS and own.device.type == "cpu" and own.dtype == torch.float32
 
 
 def residual_network(plan: Plan, inputs: Sequence[Tensor]) -> Tensor:

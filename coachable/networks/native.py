@@ -27,32 +27,32 @@ _FLAGS = (
 
 @dataclass(frozen=True)
 class Kernels:
-    """The functions of `kernels.c`; their arguments are addresses and numbers, see there."""
+    """The functions of `kernels.c` for one dtype; their arguments are addresses and numbers, see there."""
 
     layer_forward: Any
     layer_backward: Any
 
 
 @functools.cache
-def load_kernels() -> Kernels | None:
+def load_kernels() -> dict[torch.dtype, Kernels]:
     """Compile (once per machine, about a second) and load the kernels.
 
     Returns:
-        The kernels, or `None` without a working C compiler, or if `COACHABLE_NATIVE=0` is set. Everything works
-        without them, about a tenth slower.
+        The kernels by dtype of the matrix products, or none without a working C compiler, or if `COACHABLE_NATIVE=0`
+        is set. Everything works without them, about a tenth slower.
     """
     if os.environ.get("COACHABLE_NATIVE", "1") == "0":
-        return None
+        return {}
     compiler = next((c for c in (os.environ.get("CC"), "cc", "gcc", "clang") if c and shutil.which(c)), None)
     if compiler is None:
         _LOG.info("no C compiler (cc, gcc or clang): the learner goes without its own kernels, about a tenth slower")
-        return None
+        return {}
     try:
         return _bind(ctypes.CDLL(str(_build(compiler))))
     except (OSError, subprocess.SubprocessError) as error:
         detail = getattr(error, "stderr", "") or error
         _LOG.warning("building %s with %s failed; the learner goes without: %s", _SOURCE.name, compiler, detail)
-        return None
+        return {}
 
 
 def _build(compiler: str) -> Path:
@@ -81,10 +81,13 @@ def _cache() -> Path:
     return Path(tempfile.mkdtemp(prefix="coachable-"))
 
 
-def _bind(library: ctypes.CDLL) -> Kernels:
+def _bind(library: ctypes.CDLL) -> dict[torch.dtype, Kernels]:
     p, i, flag = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int
-    forward, backward = library.layer_forward, library.layer_backward
-    forward.argtypes = [p, p, p, p, p, i, i, i, i, ctypes.c_float, i, i, p, p, p, p]
-    backward.argtypes = [p, p, p, p, p, p, p, p, i, flag, flag, i, p, p, p, p, p]
-    forward.restype = backward.restype = None
-    return Kernels(forward, backward)
+    kernels = {}
+    for dtype, name in ((torch.bfloat16, "bf16"), (torch.float32, "fp32")):
+        forward, backward = library[f"layer_forward_{name}"], library[f"layer_backward_{name}"]
+        forward.argtypes = [p, p, p, p, p, i, i, i, i, ctypes.c_float, i, i, p, p, p, p]
+        backward.argtypes = [p, p, p, p, p, p, p, p, i, flag, flag, i, p, p, p, p, p]
+        forward.restype = backward.restype = None
+        kernels[dtype] = Kernels(forward, backward)
+    return kernels

@@ -16,8 +16,6 @@ from coachable.networks.memory import Arena
 from coachable.networks.native import Kernels
 from coachable.networks.passes import Layer, Member
 
-_BF16 = torch.bfloat16
-
 
 class Workspace:
     """Buffers and prepared calls for one batch size of a plan.
@@ -25,7 +23,7 @@ class Workspace:
     Args:
         kernels: The compiled kernels.
         layers: The residual layers, all with layer norm.
-        members: The networks' tensors, products in bfloat16.
+        members: The networks' tensors, products in the kernels' dtype.
         widths: Widths of the inputs.
         rows: Number of rows of a batch.
         keep: Whether a backward pass will follow.
@@ -41,15 +39,15 @@ class Workspace:
         keep: bool,
     ) -> None:
         self.rows, self.keep, self.widths = rows, keep, tuple(widths)
-        self._arena = Arena()
+        self._arena, self._dtype = Arena(), members[0].products[0].dtype
         widest = max(layer.out_features for layer in layers)
         self._scratch = self._arena.empty(2 * widest)
-        self._input = self._arena.empty(rows, sum(widths), dtype=_BF16)
+        self._input = self._arena.empty(rows, sum(widths), dtype=self._dtype)
         self._slots = self._input.split(list(widths), -1)
         if keep:
-            self._flow = [self._arena.empty(rows, widest, dtype=_BF16) for _ in range(2)]
-            self._dz = self._arena.empty(rows, widest, dtype=_BF16)
-            self._dw = self._arena.empty(max(layer.in_features for layer in layers) * widest, dtype=_BF16)
+            self._flow = [self._arena.empty(rows, widest, dtype=self._dtype) for _ in range(2)]
+            self._dz = self._arena.empty(rows, widest, dtype=self._dtype)
+            self._dw = self._arena.empty(max(layer.in_features for layer in layers) * widest, dtype=self._dtype)
         shared = None if keep else self._buffers(layers)
         self._members = [
             _MemberSpace(self, kernels, layers, member, shared or self._buffers(layers)) for member in members
@@ -59,7 +57,7 @@ class Workspace:
         """Product, output, mean and reciprocal deviation of each layer; little memory if nothing is kept."""
 
         def buffer(layer: Layer) -> Tensor:
-            return self._arena.empty(self.rows, layer.out_features, dtype=_BF16)
+            return self._arena.empty(self.rows, layer.out_features, dtype=self._dtype)
 
         if self.keep or len({layer.out_features for layer in layers}) > 1:
             return [(buffer(n), buffer(n), self._arena.empty(self.rows), self._arena.empty(self.rows)) for n in layers]
@@ -123,17 +121,18 @@ class _MemberSpace:
         self._features = x
         self._head = (self._own[i], self._own[i].t(), self._own[i + 1]) if i < len(self._own) else None
         self._head_grads = self._grads[i:]
-        self._hidden = space._arena.empty(*x.shape) if self._head is not None else None
+        self._hidden = x if x.dtype == torch.float32 else space._arena.empty(*x.shape)  # what the head sees
 
     def forward(self, out: Tensor) -> None:
         kernel = self._layer_forward
         for x, weight, z, arguments in self._forward_steps:
             torch.mm(x, weight, out=z)
             kernel(*arguments)
-        if self._head is None or self._hidden is None:
+        if self._head is None:
             out.copy_(self._features)
         else:
-            self._hidden.copy_(self._features)
+            if self._hidden is not self._features:
+                self._hidden.copy_(self._features)
             torch.addmm(self._head[2], self._hidden, self._head[1], out=out)
 
     def backward(self, grad: Tensor, trained: bool, add: bool, rows: Tensor | None, columns: slice | None) -> Tensor:
@@ -142,7 +141,6 @@ class _MemberSpace:
         count = grad.shape[0]
         if self._head is not None:
             if trained:
-                assert self._hidden is not None
                 weight, bias = self._head_grads
                 if add:
                     weight.addmm_(grad.t(), self._hidden)
@@ -159,11 +157,12 @@ class _MemberSpace:
                 here[:count].copy_(grad)
             kernel(*first, address, count, trained, add, *last)
             if trained:
-                torch.mm(dz_t, x, out=dw)
                 if add:
-                    into.add_(dw)
+                    into.add_(torch.mm(dz_t, x))
+                elif into.dtype == dz_t.dtype:
+                    torch.mm(dz_t, x, out=into)
                 else:
-                    into.copy_(dw)
+                    into.copy_(torch.mm(dz_t, x, out=dw))
             if rows is not None:
                 dz, here = dz[:count], here[:count]
             if below is not None:
