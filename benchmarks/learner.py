@@ -1,104 +1,36 @@
-"""Updates per second of the learner and of its peers, alternating, on one table.
+"""Updates per second of the learner and of its peers, alternating, in one table.
 
     python benchmarks/learner.py --peers /path/to/peers-venv/bin/python
 
-Every contestant is a process of its own (`learner_workers.py`); they take turns in rounds of a few updates, so that
-whatever else the machine does strikes all of them alike. The table gives medians over the rounds. With one thread, times
-are CPU times; with more, wall times.
+Every contestant is a process of its own (`learner_workers.py`); they take turns in rounds of a few updates. The table
+gives medians over the rounds: CPU time with one thread, wall time with more. The last column is what the update's
+matrix products would need at the rate that large bfloat16 products reach here, as a share of the update.
 """
 
 import argparse
 import json
-import os
 import statistics
-import subprocess
 import sys
 from pathlib import Path
 
-from learner_workers import PEERS, WORKERS, flops_per_update
+from contest import Worker, measure
+from learner_workers import MATMUL_FLOPS, PEERS, WORKERS, flops_per_update
 
-HERE = Path(__file__).resolve().parent
-MATMUL_FLOPS = 2 * 1024**3
-
-
-class Worker:
-    """A contestant's process."""
-
-    def __init__(self, name: str, python: str, threads: int) -> None:
-        self.name = name
-        xla = "" if threads > 1 else "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-        env = os.environ | {
-            "OMP_NUM_THREADS": str(threads),
-            "MKL_NUM_THREADS": str(threads),
-            "XLA_FLAGS": xla,
-            "JAX_PLATFORMS": "cpu",
-            "PYTHONPATH": str(HERE.parent),
-        }
-        self.process = subprocess.Popen(
-            [python, str(HERE / "learner_workers.py"), name],
-            env=env,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-
-    def ready(self) -> bool:
-        line = self._line()
-        if line.strip() != "ready":
-            error = self.process.stderr.read().strip().splitlines()[-1:] if self.process.stderr else []
-            sys.stderr.write(f"{self.name} is left out: {' '.join(error)}\n")
-            return False
-        return True
-
-    def run(self, updates: int) -> dict[str, float]:
-        assert self.process.stdin is not None
-        self.process.stdin.write(f"{updates}\n")
-        self.process.stdin.flush()
-        return json.loads(self._line())
-
-    def close(self) -> None:
-        self.process.stdin.close()
-        self.process.wait(10)
-
-    def _line(self) -> str:
-        assert self.process.stdout is not None
-        return self.process.stdout.readline()
+OURS, YARDSTICK = "coachable-bf16", "matmul-bf16"
 
 
-def measure(
-    names: list[str], python: dict[str, str], threads: int, rounds: int, updates: int
-) -> dict[str, list[float]]:
-    """Seconds per update of each contestant, one figure per round."""
-    workers = []
-    for name in names:
-        worker = Worker(name, python[name], threads)
-        if worker.ready():
-            workers.append(worker)
-    clock = "cpu" if threads == 1 else "wall"
-    times: dict[str, list[float]] = {w.name: [] for w in workers}
-    for _ in range(rounds):
-        for worker in workers:
-            n = 4 if worker.name.startswith("matmul") else updates
-            times[worker.name].append(worker.run(n)[clock] / n)
-    for worker in workers:
-        worker.close()
-    return times
-
-
-def table(times: dict[str, list[float]]) -> str:
+def table(seconds: dict[str, list[float]]) -> str:
     """Medians, rates, ratios to ours, and the share of the rate of large matrix products."""
-    median = {name: statistics.median(t) for name, t in times.items()}
-    ours = median.get("coachable-bf16")
+    median = {name: statistics.median(t) for name, t in seconds.items()}
+    rate = MATMUL_FLOPS / median[YARDSTICK] if YARDSTICK in median else None
     lines = ["| contestant | ms / update | updates / s | ours is faster by | of large bf16 products |", "|-|-|-|-|-|"]
-    rate = MATMUL_FLOPS / median["matmul-bf16"] if "matmul-bf16" in median else None
-    for name, seconds in median.items():
+    for name, time in median.items():
         if name.startswith("matmul"):
-            lines.append(f"| {name} | {MATMUL_FLOPS / seconds / 1e9:.0f} GFLOP/s | | | |")
+            lines.append(f"| {name} | {MATMUL_FLOPS / time / 1e9:.0f} GFLOP/s | | | |")
             continue
-        ratio = f"{seconds / ours:.2f}" if ours else ""
-        share = f"{flops_per_update() / seconds / rate:.2f}" if rate else ""
-        lines.append(f"| {name} | {1e3 * seconds:.1f} | {1 / seconds:.1f} | {ratio} | {share} |")
+        ratio = f"{time / median[OURS]:.2f}" if OURS in median else ""
+        share = f"{flops_per_update() / time / rate:.2f}" if rate else ""
+        lines.append(f"| {name} | {1e3 * time:.1f} | {1 / time:.1f} | {ratio} | {share} |")
     return "\n".join(lines)
 
 
@@ -111,12 +43,16 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=8, help="per round and contestant, a multiple of 8")
     parser.add_argument("--json", type=Path, help="where to write the seconds of every round")
     args = parser.parse_args()
-    python = {name: args.peers if name in PEERS else sys.executable for name in WORKERS}
-    times = measure(args.only, python, args.threads, args.rounds, args.updates)
-    print(f"{args.threads} thread(s), {'CPU' if args.threads == 1 else 'wall'} time, {args.rounds} rounds, medians\n")
-    print(table(times))
+    python = {name: args.peers if name in PEERS else sys.executable for name in args.only}
+    workers = [Worker("learner_workers.py", name, python[name], args.threads) for name in args.only]
+    work = {name: 4 if name.startswith("matmul") else args.updates for name in args.only}
+    clock = "cpu" if args.threads == 1 else "wall"
+    times = measure(workers, args.rounds, work)
+    seconds = {name: [spent[clock] for spent in rounds] for name, rounds in times.items()}
+    print(f"{args.threads} thread(s), {clock} time, {args.rounds} rounds, medians\n")
+    print(table(seconds))
     if args.json:
-        args.json.write_text(json.dumps(times))
+        args.json.write_text(json.dumps(seconds))
 
 
 if __name__ == "__main__":

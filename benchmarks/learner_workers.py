@@ -4,8 +4,7 @@ Each peer needs only its own packages, so that peers may live in another virtual
 
     python benchmarks/learner_workers.py sb3
 
-The worker writes `ready`, then for every line `N` on standard input makes N updates and writes one JSON object with the
-CPU seconds and the wall seconds they took. `learner.py` drives several workers in turn.
+`learner.py` drives several of them in turn, see `contest.py`.
 
 The work: batch 256, observation 84 + style 4, action 21, policy and twin critics of 3 x 512, fixed temperature 0.01,
 squared error, Adam, Polyak 0.005. "resnet" stands for the residual network with layer norm; the others are plain ReLU
@@ -13,11 +12,12 @@ networks of the same widths, which is slightly less work.
 """
 
 import copy
-import json
+import itertools
 import math
 import os
 import sys
-import time
+
+from contest import serve
 
 B, OBS, STYLE, ACT, WIDTH, LAYERS = 256, 84, 4, 21, 512, 3
 ALPHA, GAMMA, TAU, LR = 0.01, 0.99, 0.005, 1e-4
@@ -191,7 +191,7 @@ def single_file(precision, network="mlp"):
     def mlp(i, o):
         sizes = [i] + [WIDTH] * LAYERS
         layers = []
-        for a, b in zip(sizes[:-1], sizes[1:], strict=True):
+        for a, b in itertools.pairwise(sizes):
             layers += [Block(a, b)] if network == "resnet" else [nn.Linear(a, b), nn.ReLU()]
         return nn.Sequential(*layers, nn.Linear(WIDTH, o))
 
@@ -306,6 +306,9 @@ def sbx(per_call, **policy):
     return run
 
 
+MATMUL_FLOPS = 2 * 1024**3
+
+
 def matmul(precision, size=1024):
     """The yardstick: products of large square matrices; one "update" stands for one product."""
     import torch
@@ -341,21 +344,5 @@ WORKERS = {
 PEERS = ("sb3", "sbx-1", "sbx-8")  # these run in the peers' interpreter
 
 
-def main(name: str) -> None:
-    out = os.fdopen(os.dup(1), "w")  # packages that print on import must not disturb the protocol
-    os.dup2(2, 1)
-    run = WORKERS[name]()
-    run(8)
-    out.write("ready\n")
-    out.flush()
-    for line in sys.stdin:
-        n = int(line)
-        cpu, wall = time.process_time(), time.perf_counter()
-        run(n)
-        times = {"cpu": time.process_time() - cpu, "wall": time.perf_counter() - wall, "updates": n}
-        out.write(json.dumps(times) + "\n")
-        out.flush()
-
-
 if __name__ == "__main__":
-    main(sys.argv[1])
+    serve(WORKERS, sys.argv[1], warmup=8)
