@@ -109,6 +109,8 @@ class ResidualMLP(nn.Module):
         narrowing: What the identity path drops when it narrows, see :func:`fit_features`.
         layer_norm: Layer norm before the activation of every layer.
         eps: Epsilon of the layer norms.
+        head_gain: Factor on the head's initial weights. With the paper's Glorot weights (1) and inputs of unit size the
+            outputs have a standard deviation of about 2, where tanh is nearly flat: a policy may want less.
 
     Raises:
         ValueError: If a width is not positive, or `padding` or `narrowing` is unknown.
@@ -128,6 +130,7 @@ class ResidualMLP(nn.Module):
         narrowing: Narrowing = "padded_side",
         layer_norm: bool = True,
         eps: float = 1e-5,
+        head_gain: float = 1.0,
     ) -> None:
         super().__init__()
         if not widths or min(in_features, *widths) < 1:
@@ -146,7 +149,7 @@ class ResidualMLP(nn.Module):
         )
         self.head = None if out_features is None else nn.Linear(widths[-1], out_features)
         if self.head is not None:
-            nn.init.xavier_uniform_(self.head.weight)
+            nn.init.xavier_uniform_(self.head.weight, gain=head_gain)
             nn.init.zeros_(self.head.bias)
 
         self._plan: Plan | None = None

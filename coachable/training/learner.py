@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import math
+import os
+import shutil
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal, NamedTuple, get_args
@@ -16,6 +19,8 @@ from coachable.networks.memory import Arena
 from coachable.training.acceleration import Acceleration
 from coachable.training.lean_sac import LeanSAC
 from coachable.training.precision import Precision, resolve_precision
+
+_LOG = logging.getLogger(__name__)
 
 UpdateOrder = Literal["simultaneous", "policy_first", "critic_first"]
 
@@ -57,7 +62,8 @@ class Learner:
             and losses; `"auto"` takes it where the device has it in hardware.
         fused: Evaluate residual networks through their hand-written passes (`coachable.networks.fused`) where possible:
             on a CPU, when policy and critics consist of nothing else. The numbers are the same, the update is faster.
-        compile: Compile the loss functions with `torch.compile`; excludes `fused`.
+        compile: Compile the loss functions with `torch.compile` where `fused` does not apply (on a GPU, or with
+            networks of other kinds). On a CPU that takes a C++ compiler; without one the log says that it was left.
         check_every: Read the non-finite flag every so many updates (a device synchronisation on a GPU); 0 leaves that
             to calls of :meth:`check_finite`.
 
@@ -100,7 +106,7 @@ class Learner:
         self.target_updater = SoftUpdate(loss_module, tau=tau)
         self._acceleration: Acceleration | None = None
         self._lean: LeanSAC | None = None
-        if fused and not compile and Acceleration.supports(loss_module):
+        if fused and Acceleration.supports(loss_module):
             self._acceleration = Acceleration(loss_module, torch.bfloat16 if self.precision == "bf16" else None)
             if LeanSAC.supports(loss_module):
                 self._lean = LeanSAC(loss_module, self._acceleration)
@@ -116,7 +122,7 @@ class Learner:
                 _move_moments(optimizer)
         loss: Any = loss_module
         self._losses = _Losses(loss.forward, loss.actor_loss, _critic_loss_of(loss))
-        if compile:
+        if compile and self._acceleration is None and _can_compile(device):
             self._losses = _Losses(*map(torch.compile, self._losses))
         self._watch = torch.zeros((), device=device)
 
@@ -266,6 +272,13 @@ def _parameter_groups(loss_module: LossModule) -> dict[str, list[nn.Parameter]]:
             f"{type(loss_module).__name__} has no trainable parameters of {missing}: the learner needs both"
         )
     return groups
+
+
+def _can_compile(device: torch.device) -> bool:
+    if device.type != "cpu" or any(shutil.which(c) for c in (os.environ.get("CXX"), "g++", "clang++") if c):
+        return True
+    _LOG.warning("compile=True has no effect: torch.compile needs a C++ compiler on a CPU (g++ or clang++, or set CXX)")
+    return False
 
 
 def _move_moments(optimizer: torch.optim.Optimizer) -> None:

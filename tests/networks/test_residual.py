@@ -104,3 +104,10 @@ def test_without_layer_norm():
     block = ResidualBlock(4, 4, layer_norm=False)
     x = torch.randn(3, 4)
     torch.testing.assert_close(block(x), F.relu(block.linear(x)) + x)
+
+
+def test_head_gain_scales_the_initial_head():
+    for gain in (1.0, 0.01):
+        weight = ResidualMLP(6, 3, (64, 64), head_gain=gain).head.weight
+        bound = gain * (6 / 67) ** 0.5
+        assert 0.9 * bound < weight.abs().max() <= bound

@@ -284,3 +284,18 @@ def test_both_precisions_learn_to_follow_the_style(precision):
         loc, _ = loss.actor_network[0].module(test["observation"], test["style"])
     error = (torch.tanh(loc)[:, :2] - 0.5 * test["style"]).abs().mean()
     assert error < 0.15, f"mean distance {error:.3f}; 0.33 without regard to the style"
+
+
+def test_compile_without_a_compiler_is_logged_and_left(monkeypatch, caplog):
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CXX", raising=False)
+    learner = Learner(make_loss(), precision="fp32", fused=False, compile=True)
+    assert "needs a C++ compiler" in caplog.text
+    learner.update(make_batch(16))
+
+
+def test_compile_leaves_hand_written_passes_alone(caplog):
+    """They are the faster of the two."""
+    learner = Learner(make_loss(), compile=True)
+    assert learner._acceleration is not None
+    assert learner._losses.both == learner.loss_module.forward
