@@ -1,0 +1,24 @@
+"""Shipped weights fit the domains that they are named after."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from coachable.domain import domain_names, load_domain
+from coachable.training.weights import load_policy
+
+
+@pytest.mark.parametrize("name", domain_names())
+def test_shipped_weights_act_in_their_domain(name):
+    agent, domain = load_policy(name), load_domain(name)
+    assert agent.metadata["domain"] == name
+    assert agent.space == domain.make_space()
+    env = domain.make_env(num_envs=2, num_threads=1)
+    start = env.reset().set("style", agent.space.sample((2,)))
+    action = agent.actor(start)["action"]
+    assert env.action_spec.is_in(action)
+    with torch.no_grad():
+        styles = torch.stack([agent.space.sample() for _ in range(8)])
+        same = TensorDict({"observation": start["observation"][:1].expand(8, -1), "style": styles}, [8])
+        loc = agent.actor(same)["loc"]
+    assert (loc.std(0) > 0).any()  # the policy looks at the style
