@@ -1,6 +1,7 @@
 """From a command line to a checked, plain configuration; shared by the recipes."""
 
 import difflib
+import itertools
 import json
 import logging
 import sys
@@ -195,8 +196,8 @@ def _same_kind(default: Any, value: Any) -> bool:
 
 def _without_options(arguments: list[str]) -> list[str]:
     """Leaves out Hydra's own options, such as `--cfg job`, with their values."""
-    before = ["", *arguments[:-1]]
-    return [a for a, b in zip(arguments, before, strict=True) if not a.startswith("-") and b not in _VALUED]
+    pairs = itertools.pairwise(["", *arguments])
+    return [argument for before, argument in pairs if not argument.startswith("-") and before not in _VALUED]
 
 
 def _choices(given: str, valid: list[str]) -> str:

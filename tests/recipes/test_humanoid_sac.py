@@ -96,6 +96,12 @@ def test_mistakes_are_named_with_the_valid_choices(argument, message):
         _compose(argument)
 
 
+def test_the_bare_command_chooses_a_preset():
+    (chosen,) = checked_arguments("humanoid_sac", [])
+    assert chosen in ("preset=cpu", "preset=gpu")
+    assert _compose()["preset"] == chosen.removeprefix("preset=")
+
+
 def test_hydras_options_pass_through():
     arguments = checked_arguments("humanoid_sac", ["--cfg", "job", "preset=cpu", "train.total_frames=1e6"])
     assert arguments == ["--cfg", "job", "preset=cpu", "train.total_frames=1e6"]
