@@ -23,6 +23,7 @@ from coachable.networks.workspace import Workspace
 __all__ = ["Layer", "Member", "Plan", "residual_network"]
 
 _KERNEL_THREADS = 4  # the kernels run on one thread; beside many, the parallel operations of torch are faster
+_SIZES = 4  # batch sizes for which memory is kept ready
 _ROWS = 32  # granularity of the row-sparse backward: few distinct sizes keep oneDNN's cache of kernels small
 
 
@@ -73,13 +74,18 @@ class Plan:
         kernels = load_kernels().get(self.members[0].products[0].dtype)
         if kernels is None or not self._suits_kernels():
             return TorchPasses(self.layers, self.members, keep)
-        free = self._spaces.setdefault((rows, keep, *widths), [])
+        key = (rows, keep, *widths)
+        if key not in self._spaces and len(self._spaces) >= _SIZES:
+            del self._spaces[next(iter(self._spaces))]
+        free = self._spaces.setdefault(key, [])
         return free.pop() if free else Workspace(kernels, self.layers, self.members, widths, rows, keep)
 
     def release(self, passes: Workspace | TorchPasses) -> None:
         """Give prepared memory back after its last use."""
         if isinstance(passes, Workspace):
-            self._spaces[passes.rows, passes.keep, *passes.widths].append(passes)
+            free = self._spaces.get((passes.rows, passes.keep, *passes.widths))
+            if free is not None:
+                free.append(passes)
 
     def _suits_kernels(self) -> bool:
         own = self.members[0].parameters[0]

@@ -162,3 +162,17 @@ def test_not_a_number_shows(low):
     x[3, 2] = 0.0
     fused.residual_network(plan, [x, y]).sum().backward()
     assert buffers.grad.isnan().any()
+
+
+@pytest.mark.skipif(not KERNELS, reason="no cc")
+def test_memory_is_kept_for_a_few_batch_sizes_only():
+    _, _, plan = build("equal", 2)
+    for rows in range(1, 10):
+        fused.residual_network(plan, inputs_of("equal", rows)).sum().backward()
+    assert len(plan._spaces) == fused._SIZES
+    assert all(len(free) == 1 for free in plan._spaces.values())
+    (first,) = plan._spaces[9, True, 63, 7]
+    out = fused.residual_network(plan, inputs_of("equal", 9))
+    assert plan._spaces[9, True, 63, 7] == []
+    out.sum().backward()
+    assert plan._spaces[9, True, 63, 7] == [first]
