@@ -78,7 +78,9 @@ class MirrorSymmetry(Transform):
         chosen = torch.rand((*shape, 1), generator=self.generator) < self.probability
         result = tensordict.copy()
         for key, (source, sign) in self._maps.items():
-            value = tensordict.get(key)
+            value = tensordict.get(key, None)
+            if value is None:  # n-step transitions have no style features
+                continue
             if value.shape[-1] != len(source):
                 raise ValueError(f"{key!r} has {value.shape[-1]} entries, its mirror map {len(source)}")
             image = value.index_select(-1, source.to(value.device)) * sign.to(value)
