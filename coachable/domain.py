@@ -76,6 +76,8 @@ class Domain:
         control_step: duration of one env step [s].
         episode_steps: length of a full episode.
         columns: metrics of the published table, in order, with the format of their values.
+        observation_groups: name and width of each block of the observation, in order, for explanations; without it
+            every entry is a group of its own.
     """
 
     name: str
@@ -88,6 +90,7 @@ class Domain:
     control_step: float
     episode_steps: int
     columns: Mapping[str, str] = field(default_factory=dict)
+    observation_groups: Sequence[tuple[str, int]] = ()
 
 
 def domain_names() -> list[str]:

@@ -11,6 +11,7 @@ from coachable.domain import Domain
 from coachable.envs.humanoid.env import EPISODE_STEPS, HumanoidEnv
 from coachable.envs.humanoid.measures import HumanoidMeasures
 from coachable.envs.humanoid.model import CONTROL_STEP
+from coachable.envs.humanoid.observation import OBSERVATION_GROUPS
 from coachable.envs.humanoid.render import HumanoidRenderer
 from coachable.envs.humanoid.styles import POSES, humanoid_style_reward, humanoid_style_space
 
@@ -49,4 +50,5 @@ DOMAIN = Domain(
         "measured_step_length": ".3f",
         "step_length_error": ".3f",
     },
+    observation_groups=tuple((name, width) for name, width, _ in OBSERVATION_GROUPS),
 )
