@@ -84,6 +84,11 @@ def _parser() -> argparse.ArgumentParser:
     weights.add_argument("out", type=Path, help="the file, such as coachable/pretrained/humanoid/weights.pt")
     weights.set_defaults(run=_weights)
 
+    export = commands.add_parser("export", help="write the policy as one ONNX file, to run it without torch")
+    export.add_argument("source", help=_SOURCE_HELP)
+    export.add_argument("--out", type=Path, default=Path("policy.onnx"), help="(default: %(default)s)")
+    export.set_defaults(run=_export)
+
     doctor = commands.add_parser("doctor", help="check this installation and say what it can do")
     doctor.set_defaults(run=_doctor)
     return parser
@@ -121,6 +126,14 @@ def _weights(options: argparse.Namespace) -> int:
 
     file = export_weights(options.source, options.out)
     print(f"wrote {file} ({file.stat().st_size / 1e6:.1f} MB)")
+    return 0
+
+
+def _export(options: argparse.Namespace) -> int:
+    from coachable.coach.export import export
+
+    difference = export(options.source, options.out)
+    print(f"wrote {options.out} ({options.out.stat().st_size / 1e6:.1f} MB), at most {difference:.1g} from torch")
     return 0
 
 

@@ -1,0 +1,155 @@
+"""`coachable export`: a trained policy as one ONNX file that runs without torch."""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from coachable import __version__
+from coachable.domain import domain_names, load_domain
+from coachable.networks.plain import DeterministicAction
+from coachable.styles import StyleSpace
+from coachable.training.weights import LoadedPolicy, load_policy
+
+__all__ = ["SCHEMA_VERSION", "TOLERANCE", "export", "largest_difference", "metadata_of"]
+
+SCHEMA_VERSION = 1
+"""Version of the file's inputs, outputs and metadata."""
+
+TOLERANCE = 1e-5
+"""Largest difference between the file's actions and torch's."""
+
+
+def export(source: str | Path, out: Path) -> float:
+    """Write the deterministic policy as ONNX and compare it with torch.
+
+    Inputs are `observation` (batch, obs_dim) and `style` (batch, d), raw theta in natural units: the encoding is part
+    of the graph. The output is `action` (batch, A) in [-1, 1]; for mixed actions `axes` (batch, axes) in [-1, 1] and
+    `choices` (batch, heads), the index of the chosen value of each head. The batch is dynamic.
+
+    Args:
+        source: checkpoint, run folder, weights file, or the name of a domain that ships with weights.
+        out: the file, for example `policy.onnx`.
+
+    Returns:
+        Largest difference between the file's actions and torch's, over random inputs.
+
+    Raises:
+        ImportError: without the extra `export`.
+        TypeError: if the policy is of a kind that cannot be exported.
+        RuntimeError: if file and torch differ by more than `TOLERANCE`; nothing is left behind.
+    """
+    onnx = _import_onnx()
+    agent = load_policy(source)
+    plain = DeterministicAction(agent.actor).eval()
+    model = _trace(plain).model_proto
+    onnx.helper.set_model_props(model, metadata_of(agent, plain))
+    onnx.checker.check_model(model)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    partial = out.with_name(out.name + ".partial")
+    partial.write_bytes(model.SerializeToString())
+    difference = largest_difference(partial, plain, agent.space)
+    if not difference <= TOLERANCE:
+        partial.unlink()
+        raise RuntimeError(f"the exported policy differs from torch by {difference:.2g}: expected at most {TOLERANCE}")
+    os.replace(partial, out)
+    return difference
+
+
+def metadata_of(agent: LoadedPolicy, plain: DeterministicAction) -> dict[str, str]:
+    """What a program needs to know to use the file, as strings; `style_space` is JSON (`StyleSpace.from_json`).
+
+    Args:
+        agent: from `load_policy`.
+        plain: its policy.
+    """
+    domain = agent.metadata["domain"]
+    known: dict[str, Any] = {
+        "schema_version": SCHEMA_VERSION,
+        "coachable_version": __version__,
+        "domain": domain,
+        "style_space": agent.space.to_json(),
+        "frames": agent.metadata["frames"],
+        "updates": agent.metadata["updates"],
+    }
+    if domain in domain_names():
+        declaration = load_domain(domain)
+        known["control_step"] = declaration.control_step  # [s]
+        known["observation_groups"] = json.dumps(list(declaration.observation_groups))
+    if plain.choice_sizes:
+        known["choice_sizes"] = json.dumps(list(plain.choice_sizes))
+    return {name: str(value) for name, value in known.items() if value is not None}
+
+
+def largest_difference(file: Path, plain: DeterministicAction, space: StyleSpace, samples: int = 256) -> float:
+    """Compare the file, run by onnxruntime, with torch on random inputs, in batches of 1 and of all.
+
+    Args:
+        file: the ONNX file.
+        plain: the policy that it was made from.
+        space: styles are drawn from its training distribution.
+        samples: number of inputs.
+
+    Returns:
+        Largest absolute difference of the axes; for choices, how much less likely than the best one the file's is.
+    """
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+    generator = torch.Generator().manual_seed(0)
+    observation = torch.randn(samples, plain.observation_dim, generator=generator)
+    style = space.sample((samples,), generator)
+    largest = 0.0
+    for rows in (slice(0, 1), slice(None)):
+        inputs = {"observation": observation[rows].numpy(), "style": style[rows].numpy()}
+        results = dict(zip(plain.output_names, map(torch.from_numpy, session.run(None, inputs)), strict=True))
+        with torch.no_grad():
+            expected = dict(zip(plain.output_names, plain(observation[rows], style[rows]), strict=True))
+            for name, value in results.items():
+                if name == "choices":
+                    worst = _shortfall(plain, observation[rows], style[rows], value)
+                else:
+                    worst = (value - expected[name]).abs().max().item()
+                largest = max(largest, worst)
+    return largest
+
+
+def _shortfall(plain: DeterministicAction, observation: Tensor, style: Tensor, choices: Tensor) -> float:
+    """Probability by which the given choices fall short of the likeliest ones: rounding may break exact ties."""
+    probabilities = plain.head_probabilities(observation, style)
+    chosen = [p.gather(-1, choices[:, i : i + 1]).squeeze(-1) for i, p in enumerate(probabilities)]
+    return max((p.amax(-1) - c).max().item() for p, c in zip(probabilities, chosen, strict=True))
+
+
+def _trace(plain: DeterministicAction) -> Any:
+    # Two rows: torch.export would take a batch of one for a constant.
+    example = (torch.zeros(2, plain.observation_dim), torch.zeros(2, plain.style_dim))
+    batch = torch.export.Dim("batch")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the exporter's own deprecations
+        return torch.onnx.export(
+            plain,
+            example,
+            input_names=["observation", "style"],
+            output_names=list(plain.output_names),
+            dynamic_shapes=({0: batch}, {0: batch}),
+            dynamo=True,
+            external_data=False,
+            verbose=False,
+        )
+
+
+def _import_onnx() -> Any:
+    try:
+        import onnx
+        import onnxruntime  # noqa: F401
+        import onnxscript  # noqa: F401
+    except ImportError as error:
+        raise ImportError(f"{error.name} is missing: pip install 'coachable[export]'") from error
+    return onnx
