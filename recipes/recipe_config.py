@@ -4,6 +4,7 @@ import difflib
 import itertools
 import json
 import logging
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -20,10 +21,10 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
-from coachable.training.hardware import choose_preset, detect
+from coachable.training.hardware import choose_preset, detect, estimate_update_seconds, pick_device
+from coachable.training.loop import Train
 
 CONFIGS = Path(__file__).resolve().parent / "configs"
-GROUPS = {folder.name: sorted(f.stem for f in folder.glob("*.yaml")) for folder in CONFIGS.iterdir() if folder.is_dir()}
 
 # What a checkpoint decides: its weights, its replay buffer and its generators belong to these values.
 _FIXED = ("domain", "seed", "network", "loss", "gamma", "style_reward", "replay", "replay_capacity", "init_from")
@@ -44,12 +45,24 @@ _VALUED = (
 )
 
 
-def run_recipe(config_name: str, train: Callable[[dict[str, Any]], Any]) -> None:
+def config_groups(config_name: str) -> dict[str, list[str]]:
+    """Groups of a recipe and the choices of each; presets are the recipe's own, the other groups are shared."""
+    folders = {folder.name: folder for folder in sorted(CONFIGS.iterdir()) if folder.is_dir()}
+    folders["preset"] /= config_name
+    return {group: sorted(file.stem for file in folder.glob("*.yaml")) for group, folder in folders.items()}
+
+
+OmegaConf.register_new_resolver(  # for --help
+    "groups", lambda name: "\n".join(f"{group}: {', '.join(choices)}" for group, choices in config_groups(name).items())
+)
+
+
+def run_recipe(config_name: str, build: Callable[[dict[str, Any]], Train]) -> None:
     """Runs a recipe from the command line.
 
     Args:
         config_name: file in recipes/configs, without its suffix.
-        train: gets the plain, resolved configuration.
+        build: makes the training from the plain, resolved configuration.
     """
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces every buffer it allocates
     sys.argv[1:] = checked_arguments(config_name, sys.argv[1:])
@@ -57,9 +70,15 @@ def run_recipe(config_name: str, train: Callable[[dict[str, Any]], Any]) -> None
     @hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name=config_name)
     def main(cfg: DictConfig) -> None:
         try:
-            train(plain_config(cfg, list(HydraConfig.get().overrides.task)))
-        except CheckpointError as error:  # the user's to solve: the sentence says how, a traceback would hide it
+            config = plain_config(cfg, list(HydraConfig.get().overrides.task))
+            train = build(config)
+        except (CheckpointError, ValueError, ImportError) as error:
+            if "HYDRA_FULL_ERROR" in os.environ:
+                raise
+            # The user's to solve: the sentence says how, a traceback would hide it.
             raise SystemExit(f"error: {error}") from None
+        announce(config, train)
+        train.run()
 
     main()
 
@@ -98,24 +117,28 @@ def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
         overrides = OverridesParser.create().parse_overrides(_without_options(arguments))
     except HydraException as error:
         raise SystemExit(f"error: {error}\nexpected KEY=VALUE, for example loss=sac or train.batch_size=256") from None
-    chosen = {
-        o.key_or_group: str(o.value()) for o in overrides if o.key_or_group in GROUPS and not o.is_sweep_override()
-    }
-    for group, choice in chosen.items():
-        if choice not in GROUPS[group]:
-            raise SystemExit(f"error: {group}={choice} does not exist.{_choices(choice, GROUPS[group])}")
-    swept = any(o.key_or_group == "preset" and o.is_sweep_override() for o in overrides)
-    if chosen.get("preset", "auto") == "auto" and not swept:
-        chosen["preset"] = choose_preset(detect())
-        arguments = [a for a in arguments if not a.startswith("preset=")] + [f"preset={chosen['preset']}"]
+    groups = config_groups(config_name)
+    chosen: dict[str, list[str]] = {}  # several where a sweep asks for them
+    for override in overrides:
+        group = override.key_or_group
+        if group in groups:
+            swept = override.is_sweep_override()
+            chosen[group] = list(override.sweep_string_iterator()) if swept else [str(override.value())]
+            for choice in chosen[group]:
+                if choice not in groups[group]:
+                    raise SystemExit(f"error: {group}={choice} does not exist.{_choices(choice, groups[group])}")
+    if chosen.get("preset", ["auto"]) == ["auto"]:
+        chosen["preset"] = [choose_preset(detect())]
     elif any(o.key_or_group == "resume" and o.value() for o in overrides):
         raise SystemExit("error: a resumed run keeps its preset: leave preset= out, or start anew with init_from=PATH")
+    presets = [f"{config_name}/{preset}" for preset in chosen["preset"]]
     with _configs():
-        known = hydra.compose(config_name, [f"{group}={choice}" for group, choice in chosen.items()])
+        firsts = [f"{group}={choices[0]}" for group, choices in chosen.items() if group != "preset"]
+        known = hydra.compose(config_name, [*firsts, f"preset={presets[0]}"])
     for override in overrides:
-        if override.key_or_group not in GROUPS and not override.key_or_group.startswith("hydra"):
+        if override.key_or_group not in groups and not override.key_or_group.startswith("hydra"):
             _check(override, known)
-    return arguments
+    return [a for a in arguments if not a.startswith("preset=")] + [f"preset={','.join(presets)}"]
 
 
 def plain_config(cfg: DictConfig, overrides: list[str]) -> dict[str, Any]:
@@ -150,6 +173,19 @@ def plain_config(cfg: DictConfig, overrides: list[str]) -> dict[str, Any]:
     config.pop("hydra", None)
     config["run_dir"] = str(Path(config["run_dir"] or _new_run_dir(config["domain"])).expanduser().absolute())
     return {str(key): value for key, value in config.items()}
+
+
+def announce(config: dict[str, Any], train: Train) -> None:
+    """Says what was chosen and about how long it will take."""
+    parameters = sum(p.numel() for p in train.learner.loss_module.actor_network_params.parameters())
+    bf16 = train.learner.precision == "bf16"
+    seconds = estimate_update_seconds(parameters, config["train"]["batch_size"], bf16, pick_device(config["device"]))
+    remaining = config["train"]["total_frames"] - train.frames
+    updates = remaining * (config["train"]["utd_ratio"] or 0)
+    hours = max(updates * seconds, remaining / (config["train"]["throttle"] or float("inf"))) / 3600
+    print(f"Found {detect().describe()}: preset {config['preset']}, {train.learner.precision} updates")
+    print(f"{remaining:,} env-steps to go, about {hours:.1f} h ({seconds * 1e3:.0f} ms per update)")
+    print(f"Writing to {config['run_dir']}; Ctrl-C saves a checkpoint and stops")
 
 
 def save_config(config: dict[str, Any], run_dir: Path) -> None:

@@ -123,6 +123,22 @@ class EventTableBuffer(TensorDictReplayBuffer):
         )
 
     @classmethod
+    def for_events(
+        cls, events: EventPredicate, *, capacity: int, event_capacity: int, event_horizon: int, **kwargs: Any
+    ) -> "EventTableBuffer":
+        """A default table and one table per event, all of one size.
+
+        Args:
+            events: Event predicate.
+            capacity: Records of the default table.
+            event_capacity: Records of each event table.
+            event_horizon: H_max.
+            **kwargs: As for the class.
+        """
+        capacities = {"default": capacity, **dict.fromkeys(events.names, event_capacity)}
+        return cls(capacities, events=events, event_horizon=event_horizon, **kwargs)
+
+    @classmethod
     def for_styles(
         cls,
         space: Any,
@@ -146,8 +162,9 @@ class EventTableBuffer(TensorDictReplayBuffer):
             **kwargs: As for the class.
         """
         events = StyleEvents.of(space, extra, event_admission)
-        capacities = {"default": capacity, **dict.fromkeys(events.names, event_capacity)}
-        return cls(capacities, events=events, event_horizon=event_horizon, **kwargs)
+        return cls.for_events(
+            events, capacity=capacity, event_capacity=event_capacity, event_horizon=event_horizon, **kwargs
+        )
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -126,6 +126,10 @@ class StyleSpace:
         """Draws training styles, `(*shape, dim)` float32; see `Sampler.sample`."""
         return self.sampler.sample(shape, generator, device)
 
+    def with_sampler(self, sampler: Sampler) -> "StyleSpace":
+        """The same parameters with another training distribution."""
+        return StyleSpace(self.parameters, sampler, self.name)
+
     def encode(self, theta: Tensor) -> Tensor:
         """Scales theta for the networks: `theta / max(|low|, |high|)` (paper's f), affine for "range" set-points.
 

@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.data import ReplayBuffer
+from torchrl.envs import EnvBase
 
-from coachable.keys import STYLE, STYLE_FEATURES, TASK_REWARD
+from coachable.keys import EVENTS, STYLE, STYLE_FEATURES, TASK_REWARD
+from coachable.replay import EventTableBuffer
 from coachable.training.checkpoint import CheckpointStore, find_checkpoint, read_state
 from coachable.training.collection import collector_state, load_collector_state, require_finite
 from coachable.training.episodes import EpisodeStatistics, Means
@@ -26,9 +28,9 @@ from coachable.training.stopping import stop_signals
 from coachable.training.throttle import Throttle
 from coachable.training.weights import require_same_agent
 
-__all__ = ["REPLAY_KEYS", "Train"]
+__all__ = ["REPLAY_KEYS", "Train", "replay_keys"]
 
-REPLAY_KEYS: tuple[str | tuple[str, ...], ...] = (
+REPLAY_KEYS: tuple[NestedKey, ...] = (
     "observation",
     "action",
     STYLE,
@@ -40,6 +42,19 @@ REPLAY_KEYS: tuple[str | tuple[str, ...], ...] = (
     ("next", STYLE_FEATURES),
 )
 """What replay stores: what losses and relabelling read. `("next", "style")` equals `style` and is not stored."""
+
+
+def replay_keys(env: EnvBase, *, tables: bool = False) -> tuple[NestedKey, ...]:
+    """What replay stores of an env's transitions.
+
+    Args:
+        env: its observation spec tells whether there are events.
+        tables: whether the buffer is an `EventTableBuffer`, which reads trajectory numbers and events.
+    """
+    if not tables:
+        return REPLAY_KEYS
+    events: tuple[NestedKey, ...] = (("next", EVENTS),) if EVENTS in env.observation_spec.keys() else ()  # noqa: SIM118
+    return (*REPLAY_KEYS, ("collector", "traj_ids"), *events)
 
 
 class Train:
@@ -58,7 +73,7 @@ class Train:
         evaluate: called without arguments now and then, returns metrics; it must leave the global generators as they
             were.
         style_terms: maps style features `(B, F)` and theta `(B, d)` to named, unscaled terms `(B,)` for the log.
-        replay_keys: see `REPLAY_KEYS`.
+        replay_keys: see the function of that name.
     """
 
     def __init__(
@@ -74,7 +89,7 @@ class Train:
         describe: Callable[[], Mapping[str, Any]] = dict,
         evaluate: Callable[[], Mapping[str, float]] | None = None,
         style_terms: Callable[[Any, torch.Tensor], Mapping[str, torch.Tensor]] | None = None,
-        replay_keys: tuple[str | tuple[str, ...], ...] = REPLAY_KEYS,
+        replay_keys: tuple[NestedKey, ...] = REPLAY_KEYS,
     ) -> None:
         self.collector = collector
         self.replay = replay
@@ -141,6 +156,7 @@ class Train:
             )  # flattening the lazy stack without contiguous() takes 25 times as long
             require_finite(data)
             self._episodes.add(data)
+            # Of one trajectory, earlier steps come first: all that an EventTableBuffer needs besides its number.
             self.replay.extend(data.select(*self.replay_keys))
 
     def _update(self, new_frames: int, stop: threading.Event) -> None:
@@ -166,6 +182,8 @@ class Train:
         if ("next", STYLE) not in batch.keys(True):
             batch.set(("next", STYLE), batch.get(STYLE))  # theta is fixed within a training episode
         self._losses.add(self.learner.update(batch))
+        if isinstance(self.replay, EventTableBuffer):
+            self.replay.update_tensordict_priority(batch)
 
     def _evaluate_if_due(self) -> None:
         interval = self.settings.eval_interval
@@ -191,6 +209,9 @@ class Train:
             self._logged = time.monotonic()
             row = {**self._episodes.flush(), **{f"loss/{k}": v for k, v in self._losses.flush().items()}}
             row |= {f"seconds/{name}": round(spent, 3) for name, spent in self.seconds.items()}
+            if isinstance(self.replay, EventTableBuffer):
+                tables = self.replay.statistics()
+                row |= {f"tables/{name}/{key}": tables[name][key] for name in tables for key in ("size", "events")}
             self._latest |= row
             self._write({**self._position(), **row})
 
@@ -279,7 +300,9 @@ class Train:
                 f"the checkpoint has no replay buffer: updates go on after {self.settings.warmup_frames} new env-steps",
                 stacklevel=2,
             )
-        load_collector_state(self.collector, state["collector"])
+        continued = load_collector_state(self.collector, state["collector"])
+        if not continued and isinstance(self.replay, EventTableBuffer):
+            self.replay.finish()
         set_rng_state(state["rng"])  # last: what is restored above draws random numbers
 
     @contextmanager

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from recipe_config import GROUPS, checked_arguments, compose_config
+from recipe_config import checked_arguments, compose_config, config_groups
 
 from coachable.envs.humanoid import HumanoidEnv, humanoid_style_reward
 from coachable.training import Learner
@@ -44,7 +44,9 @@ def _resume(run_dir, *arguments):
     return train
 
 
-@pytest.mark.parametrize("group, choice", [(g, c) for g, choices in GROUPS.items() for c in choices])
+@pytest.mark.parametrize(
+    "group, choice", [(g, c) for g, choices in config_groups("humanoid_sac").items() for c in choices]
+)
 def test_every_choice_composes(group, choice):
     config = _compose(f"{group}={choice}")
     assert config["domain"] == "humanoid"
@@ -98,16 +100,16 @@ def test_mistakes_are_named_with_the_valid_choices(argument, message):
 
 def test_the_bare_command_chooses_a_preset():
     (chosen,) = checked_arguments("humanoid_sac", [])
-    assert chosen in ("preset=cpu", "preset=gpu")
-    assert _compose()["preset"] == chosen.removeprefix("preset=")
+    assert chosen in ("preset=humanoid_sac/cpu", "preset=humanoid_sac/gpu")
+    assert _compose()["preset"] == chosen.removeprefix("preset=humanoid_sac/")
 
 
 def test_hydras_options_pass_through():
     arguments = checked_arguments("humanoid_sac", ["--cfg", "job", "preset=cpu", "train.total_frames=1e6"])
-    assert arguments == ["--cfg", "job", "preset=cpu", "train.total_frames=1e6"]
+    assert arguments == ["--cfg", "job", "train.total_frames=1e6", "preset=humanoid_sac/cpu"]
     assert _compose("+note=mine")["note"] == "mine"
-    sweep = ["--multirun", "preset=smoke,cpu", "seed=0,1"]
-    assert checked_arguments("humanoid_sac", sweep) == sweep
+    arguments = checked_arguments("humanoid_sac", ["--multirun", "preset=smoke,cpu", "seed=0,1"])
+    assert arguments == ["--multirun", "seed=0,1", "preset=humanoid_sac/smoke,humanoid_sac/cpu"]
 
 
 def test_resumed_runs_equal_uninterrupted_ones(tmp_path):

@@ -1,0 +1,51 @@
+"""The combat domain's distribution of training styles and its ablations, for any space of weights."""
+
+from typing import Literal, get_args
+
+from coachable.styles.parameters import Weight
+from coachable.styles.samplers import ContinuousOneHot, Mixture, OneHot, PointMass, Sampler, Uniform
+from coachable.styles.space import StyleSpace
+
+__all__ = ["Single", "own", "style_mixture"]
+
+Single = Literal["continuous_one_hot", "one_hot", "independent"]
+
+
+def own(space: StyleSpace) -> Sampler:
+    """The sampler that the space was declared with."""
+    return space.sampler
+
+
+def style_mixture(
+    space: StyleSpace, single: Single = "continuous_one_hot", *, neutral: float = 0.03, independent: float = 0.10
+) -> Sampler:
+    """No style, every weight at once, or one weight alone (paper, combat training distribution).
+
+    Args:
+        space: Its parameters, all of them weights. Only `single="independent"` serves set-points and choices as well;
+            these have no neutral value, so that everything is drawn independently then.
+        single: How one weight is drawn: "continuous_one_hot" over its range, "one_hot" at its upper bound; or
+            "independent", which draws all weights independently instead (the ablations of Appendix D).
+        neutral: Probability that every weight is 0.
+        independent: Probability that every weight is drawn, independently.
+
+    Returns:
+        A sampler of the space's dimension.
+
+    Raises:
+        ValueError: If `single` is unknown, or a parameter is no weight.
+    """
+    if single not in get_args(Single):
+        raise ValueError(f"single is {single!r}: expected one of {', '.join(get_args(Single))}")
+    others = [p.name for p in space.parameters if not isinstance(p, Weight)]
+    if others and single == "independent":
+        return StyleSpace(space.parameters).sampler
+    if others:
+        raise ValueError(
+            f"sampler {single} leaves all weights but one at 0, which {', '.join(others)} of the style space "
+            f"{space.name!r} cannot be (not a weight): expected sampler=default or sampler=independent"
+        )
+    low, high = space.low.tolist(), space.high.tolist()
+    every = Uniform(low, high)
+    one = {"continuous_one_hot": ContinuousOneHot(low, high), "one_hot": OneHot(high), "independent": every}[single]
+    return Mixture([PointMass([0.0] * space.dim), every, one], [neutral, independent, 1.0 - neutral - independent])

@@ -1,0 +1,94 @@
+"""Every recipe with every loss and replay buffer: composed, and trained for a few updates."""
+
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import torch
+from recipe_config import compose_config, config_groups
+
+from coachable.replay import EventTableBuffer
+from coachable.training.checkpoint import find_checkpoint, read_state
+from coachable.training.loop import REPLAY_KEYS
+
+RECIPES = sorted(file.stem for file in (Path(__file__).resolve().parents[2] / "recipes" / "configs").glob("*_*.yaml"))
+TINY = ["preset=smoke", "env.num_envs=2", "threads.simulator=1", "threads.learner=1", "train.eval_interval=0"]
+TINY += ["init_random_frames=8", "train.warmup_frames=8", "train.batch_size=8", "eval.max_steps=5"]
+TINY += ["train.total_frames=24"]
+POLICY_FIRST = {"qr_sac", "rac", "cat_rac", "sac_categorical"}  # paper, Appendix B
+
+
+def _train(recipe, run_dir, *arguments):
+    config = compose_config(recipe, [*TINY, f"run_dir={run_dir}", *arguments])
+    train = import_module(recipe).build(config)
+    train.run()
+    return train
+
+
+def _choices(group):
+    return [(recipe, choice) for recipe in RECIPES for choice in config_groups(recipe)[group]]
+
+
+def test_recipes_were_found():
+    assert {"humanoid_sac", "cheetah_speed"} <= set(RECIPES)
+
+
+@pytest.mark.parametrize("recipe, loss", _choices("loss"))
+def test_every_loss_trains(recipe, loss, tmp_path):
+    train = _train(recipe, tmp_path, f"loss={loss}", "impersonation.n=1", "replay=uniform")
+    assert train.learner.updates == 2
+    assert train.learner.update_order == ("policy_first" if loss in POLICY_FIRST else "simultaneous")
+    for name, value in train.learner.loss_module.named_parameters():
+        assert torch.isfinite(value).all(), name
+
+
+@pytest.mark.parametrize("recipe, replay", _choices("replay"))
+def test_every_replay_buffer_trains(recipe, replay, tmp_path):
+    train = _train(recipe, tmp_path, f"replay={replay}", "train.total_frames=40")
+    assert train.learner.updates >= 2
+    sample = train.replay.sample(8)
+    assert set(REPLAY_KEYS) - {("next", "style_features")} <= set(sample.keys(True))
+    assert isinstance(train.replay, EventTableBuffer) == (replay != "uniform")
+
+
+@pytest.mark.parametrize("group", ["sampler", "collector", "network", "preset"])
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_every_choice_composes(recipe, group):
+    for choice in config_groups(recipe)[group]:
+        config = compose_config(recipe, [f"{group}={choice}"])
+        assert config["preset"] != "auto", "auto was replaced by what it chose"
+
+
+@pytest.mark.parametrize("loss, replay", [("sac", "n_step"), ("cat_rac", "event_tables")])
+def test_runs_with_tables_resume_bit_for_bit(loss, replay, tmp_path):
+    choice = [f"loss={loss}", f"replay={replay}"]
+    if replay == "event_tables":
+        choice += ["replay.n_steps=3", "replay.prioritized=true"]
+    _train("humanoid_sac", tmp_path / "whole", *choice, "train.total_frames=120")
+    _train("humanoid_sac", tmp_path / "half", *choice, "train.total_frames=60")
+    rest = compose_config("humanoid_sac", [f"resume={tmp_path / 'half'}", "train.total_frames=120"])
+    import_module("humanoid_sac").build(rest).run()
+    states = [read_state(find_checkpoint(tmp_path / name)) for name in ("whole", "half")]
+    for name, value in states[0]["actor"].items():
+        assert torch.equal(value, states[1]["actor"][name]), name
+
+
+@pytest.mark.parametrize(
+    "recipe, arguments, message",
+    [
+        ("humanoid_sac", ["sampler=one_hot"], r"pose, step_length .* cannot be \(not a weight\)"),
+        ("humanoid_sac", ["replay=n_step", "impersonation.n=4"], r"impersonation.n=4 with replay.n_steps=3"),
+        ("humanoid_sac", ["replay=event_tables", "events=null"], r"replay=event_tables: humanoid names no events"),
+        (
+            "humanoid_sac",
+            ["replay=event_tables", "train.batch_size=2"],
+            r"train.batch_size=2: every batch .* 3 tables \(default, step, fall\)",
+        ),
+        ("humanoid_sac", ["loss=cat_rac", "critic_support.v_min=600"], r"v_min"),
+        ("humanoid_sac", ["init_from=nowhere"], r"nowhere"),
+        ("cheetah_speed", ["mirror=0.5"], r"cheetah has no mirror images, expected mirror=0"),
+    ],
+)
+def test_what_makes_no_sense_fails_at_the_start_with_one_sentence(recipe, arguments, message, tmp_path):
+    with pytest.raises((ValueError, RuntimeError), match=message):
+        _train(recipe, tmp_path, *arguments)
