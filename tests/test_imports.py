@@ -24,6 +24,7 @@ LAYERS = {
     "transforms": 1,
     "domain": 1,
     "envs": 1,
+    "gym": 1,
     "training": 2,
     "evaluation": 2,
     "pretrained": 2,

@@ -1,0 +1,52 @@
+"""Gymnasium action spaces as the components of our action tensor: categorical heads, then axes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+__all__ = ["action_components", "native_action"]
+
+
+def action_components(space: spaces.Space) -> tuple[list[int], int]:
+    """Sizes of the categorical components of an action space, and its number of continuous entries."""
+    match space:
+        case spaces.Discrete():
+            return [int(space.n)], 0
+        case spaces.MultiDiscrete():
+            return space.nvec.reshape(-1).tolist(), 0
+        case spaces.MultiBinary():
+            return [2] * int(np.prod(space.shape)), 0
+        case spaces.Box() if np.isfinite(space.low).all() and np.isfinite(space.high).all():
+            return [], int(np.prod(space.shape))
+        case spaces.Tuple() | spaces.Dict():
+            parts = [action_components(part) for part in (space.values() if isinstance(space, spaces.Dict) else space)]
+            return [size for sizes, _ in parts for size in sizes], sum(axes for _, axes in parts)
+    raise ValueError(
+        f"the action space {space} is not supported: expected Box with finite bounds, Discrete, MultiDiscrete, "
+        "MultiBinary, or a Tuple or Dict of these"
+    )
+
+
+def native_action(space: spaces.Space, choices: Iterator[int], axes: Iterator[float]) -> Any:
+    """An action of the space from the next choices and axes (in [-1, 1])."""
+    match space:
+        case spaces.Discrete():
+            return space.start + next(choices)
+        case spaces.MultiDiscrete():
+            taken = [next(choices) for _ in range(space.nvec.size)]
+            return space.start + np.array(taken, dtype=space.dtype).reshape(space.shape)
+        case spaces.MultiBinary():
+            return np.array([next(choices) for _ in range(int(np.prod(space.shape)))], np.int8).reshape(space.shape)
+        case spaces.Box():
+            unit = np.array([next(axes) for _ in range(space.low.size)]).reshape(space.shape)
+            scaled = space.low + (space.high - space.low) * 0.5 * (unit + 1.0)
+            return scaled.clip(space.low, space.high).astype(space.dtype)
+        case spaces.Tuple():
+            return tuple(native_action(part, choices, axes) for part in space)
+        case spaces.Dict():
+            return {name: native_action(part, choices, axes) for name, part in space.items()}
+    raise AssertionError(space)  # action_components saw to it

@@ -1,0 +1,156 @@
+"""`GymnasiumEnv`: copies of a Gymnasium environment as one TorchRL environment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from coachable.gym.actions import action_components, native_action
+from coachable.gym.features import Features, checked_features, flat_observation
+from coachable.keys import STYLE_FEATURES, TASK_REWARD
+from coachable.networks.action_heads import ActionHeads
+
+__all__ = ["GymnasiumEnv"]
+
+
+class GymnasiumEnv(EnvBase):
+    """N copies of a Gymnasium environment as one TorchRL environment `[N]`, to be wrapped by `coachable_env`.
+
+    Observations are flattened to float32. Actions are what our policies emit: every `Box` mapped to [-1, 1] per entry,
+    every `Discrete`, `MultiDiscrete` and `MultiBinary` a one-hot per component, `Tuple` and `Dict` spaces of these in
+    one tensor (`ActionHeads`). The environments are stepped one after the other; for more processes take
+    `collector=process`.
+
+    Args:
+        make: Name of a registered environment, or a function that makes one.
+        features: Becomes `style_features`, see `Features`.
+        num_envs: N.
+        seed: Seed of the first resets.
+
+    Keys written: `observation` (N, obs_dim), `task_reward` (N, 1), the environment's reward, `style_features` (N, F),
+    `done`, `terminated`, `truncated` (N, 1).
+
+    Raises:
+        ValueError: If the action space has a component of another kind, or a `Box` without finite bounds.
+
+    Example:
+        >>> env = GymnasiumEnv("Pendulum-v1", lambda obs, action, info: obs[2:], num_envs=2, seed=0)
+        >>> env.rollout(3)["next", "style_features"].shape
+        torch.Size([2, 3, 1])
+    """
+
+    def __init__(
+        self,
+        make: str | Callable[[], gymnasium.Env],
+        features: Features,
+        num_envs: int = 1,
+        *,
+        seed: int | None = None,
+    ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        super().__init__(device="cpu", batch_size=torch.Size((num_envs,)))
+        self.features = features
+        self.envs = [gymnasium.make(make) if isinstance(make, str) else make() for _ in range(num_envs)]
+        first = self.envs[0]
+        sizes, axes = action_components(first.action_space)
+        self.heads = ActionHeads(tuple(sizes), axes)
+        self._observation = np.zeros((num_envs, spaces.flatdim(first.observation_space)), dtype=np.float32)
+        self._finished = np.zeros(num_envs, dtype=bool)
+        first.reset()
+        trial = first.action_space.sample()
+        observation, _, _, _, info = first.step(trial)
+        self._num_features = len(checked_features(features(observation, trial, info)))
+        self._make_specs()
+        self._set_seed(seed)
+
+    def _make_specs(self) -> None:
+        def rows(width: int) -> torch.Size:
+            return torch.Size((*self.batch_size, width))
+
+        self.action_spec = self.heads.spec(self.batch_size)
+        self.observation_spec = Composite(
+            {
+                "observation": Unbounded(shape=rows(self._observation.shape[1]), dtype=torch.float32),
+                TASK_REWARD: Unbounded(shape=rows(1), dtype=torch.float32),
+                STYLE_FEATURES: Unbounded(shape=rows(self._num_features), dtype=torch.float32),
+            },
+            shape=self.batch_size,
+        )
+        self.reward_spec = Unbounded(shape=rows(1), dtype=torch.float32)
+        self.done_spec = Composite(
+            {name: Binary(n=1, shape=rows(1), dtype=torch.bool) for name in ("done", "terminated", "truncated")},
+            shape=self.batch_size,
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Seeds are handed to the environments when they are next reset."""
+        self._seeds: list[int | None] = [None] * len(self.envs)
+        if seed is not None:
+            self._seeds[:] = np.random.SeedSequence(seed).generate_state(len(self.envs)).tolist()
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
+        partial = None if tensordict is None else tensordict.get("_reset", None)
+        mask = np.ones(len(self.envs), dtype=bool) if partial is None else partial.reshape(-1).numpy()
+        for row in np.flatnonzero(mask).tolist():
+            self._start(row)
+        none = np.zeros(len(self.envs), dtype=bool)
+        out = self._package(np.zeros(len(self.envs)), np.zeros((len(self.envs), self._num_features)), none, none)
+        return out.exclude("reward")
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        actions = tensordict.get("action").detach()
+        if bool(actions.isnan().any()):
+            raise ValueError("action contains NaN: the policy has diverged")
+        choices = self.heads.choices(actions).tolist() if self.heads.categorical else [[]] * len(self.envs)
+        axes = self.heads.split(actions)[1].clamp(-1.0, 1.0).tolist()
+        rewards = np.zeros(len(self.envs))
+        terminated, truncated = np.zeros((2, len(self.envs)), dtype=bool)
+        features = np.zeros((len(self.envs), self._num_features))
+        for row, env in enumerate(self.envs):
+            if self._finished[row]:  # stepped on without a reset, as evaluation does with episodes it no longer counts
+                self._start(row)
+            action = native_action(env.action_space, iter(choices[row]), iter(axes[row]))
+            observation, reward, terminated[row], truncated[row], info = env.step(action)
+            rewards[row] = float(reward)
+            features[row] = checked_features(self.features(observation, action, info))
+            self._observation[row] = flat_observation(env.observation_space, observation)
+        self._finished = terminated | truncated
+        return self._package(rewards, features, terminated, truncated)
+
+    def _start(self, row: int) -> None:
+        env = self.envs[row]
+        observation, _ = env.reset(seed=self._seeds[row])
+        self._seeds[row] = None
+        self._finished[row] = False
+        self._observation[row] = flat_observation(env.observation_space, observation)
+
+    def _package(
+        self, rewards: np.ndarray, features: np.ndarray, terminated: np.ndarray, truncated: np.ndarray
+    ) -> TensorDictBase:
+        flags = {"done": terminated | truncated, "terminated": terminated, "truncated": truncated}
+        reward = torch.from_numpy(rewards)[:, None].float()
+        return TensorDict(
+            {
+                "observation": torch.from_numpy(self._observation.copy()),
+                TASK_REWARD: reward,
+                "reward": reward.clone(),
+                STYLE_FEATURES: torch.from_numpy(features).float(),
+                **{name: torch.from_numpy(flag.copy())[:, None] for name, flag in flags.items()},
+            },
+            batch_size=self.batch_size,
+        )
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Close the environments."""
+        if not self.is_closed:
+            for env in self.envs:
+                env.close()
+        super().close(raise_if_closed=raise_if_closed)

@@ -1,0 +1,130 @@
+"""`StyleWrapper`: a Gymnasium environment that shows a style and rewards following it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.utils import RecordConstructorArgs
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from coachable.gym.features import Features, checked_features, flat_observation
+from coachable.keys import STYLE, STYLE_REWARD, TASK_REWARD
+from coachable.styles import Sampler, StyleReward
+from coachable.transforms.style_sampler import derive_seed
+
+__all__ = ["StyleWrapper"]
+
+
+class StyleWrapper(gymnasium.Wrapper, RecordConstructorArgs):
+    """Makes a Gymnasium environment coachable: it shows a style, drawn anew for each episode, and rewards following it.
+
+    The reward of a step is the environment's plus the style's, for the style that the step's observation showed. The
+    info holds `style` (the one in the returned observation), and after a step `task_reward` and `style_reward`.
+
+    Args:
+        env: Any Gymnasium environment.
+        style_reward: What following a style is rewarded with; brings the `StyleSpace`.
+        features: What the reward's terms read, see `Features`.
+        sampler: Distribution of styles; the space's own if None.
+        flat: Observe one vector, `cat(flattened observation, style)`, instead of the Dict `{observation, style}`.
+
+    The style shown is raw theta. Networks that do not encode it themselves may want their inputs normalised.
+
+    Example:
+        >>> from coachable.styles import StyleSpace, Weight, WeightedFeature
+        >>> space = StyleSpace([Weight("effort", -1.0, 1.0)])
+        >>> reward = StyleReward(space, {"effort": WeightedFeature("effort", 0)})
+        >>> env = StyleWrapper(gymnasium.make("Pendulum-v1"), reward, lambda obs, action, info: -np.square(action))
+        >>> env.set_style({"effort": 0.5})
+        >>> observation, info = env.reset(seed=0)
+        >>> observation["observation"].shape, observation["style"]
+        ((3,), array([0.5], dtype=float32))
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        style_reward: StyleReward,
+        features: Features,
+        *,
+        sampler: Sampler | None = None,
+        flat: bool = False,
+    ) -> None:
+        RecordConstructorArgs.__init__(
+            self, _disable_deepcopy=True, style_reward=style_reward, features=features, sampler=sampler, flat=flat
+        )
+        gymnasium.Wrapper.__init__(self, env)
+        self.space = style_reward.space
+        self.style_reward = style_reward
+        self.features = features
+        self.sampler = self.space.sampler if sampler is None else sampler
+        self.flat = flat
+        style = spaces.Box(self.space.low.numpy(), self.space.high.numpy(), dtype=np.float32)
+        if flat:
+            inner = spaces.flatten_space(env.observation_space)
+            assert isinstance(inner, spaces.Box)  # of anything but sequences and graphs
+            self._flat_dtype = np.result_type(inner.dtype, np.float32)
+            low, high = np.append(inner.low, style.low), np.append(inner.high, style.high)
+            self.observation_space = spaces.Box(
+                low.astype(self._flat_dtype), high.astype(self._flat_dtype), dtype=self._flat_dtype.type
+            )
+        else:
+            self.observation_space = spaces.Dict({"observation": env.observation_space, STYLE: style})
+        self._generator = torch.Generator()
+        self._generator.seed()
+        self._held: Tensor | None = None
+        self._style = self.space.default  # of the last observation
+
+    def set_style(self, style: Mapping[str, float | str] | ArrayLike | None, strict: bool = False) -> None:
+        """Ask for a style: shown from the next observation on, also in later episodes.
+
+        Args:
+            style: Values by name (others take their default), or raw theta `(dim,)`; None draws styles again from the
+                next episode on.
+            strict: Raise instead of clamping to the trained range with a warning.
+
+        Raises:
+            ValueError: If a name is unknown, a shape wrong, a value NaN, or `strict` and out of range.
+        """
+        if style is None:
+            self._held = None
+        elif isinstance(style, Mapping):
+            self._held = self.space.make(strict=strict, **style)
+        else:
+            theta = torch.as_tensor(np.array(style, dtype=np.float32))
+            if theta.shape != (self.space.dim,):
+                raise ValueError(f"style has shape {tuple(theta.shape)}: expected ({self.space.dim},), one style.")
+            self._held = self.space.clamp(theta, strict=strict)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start an episode under a style that was set, or else a newly drawn one; `seed` also seeds the draws."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        if seed is not None:
+            self._generator.manual_seed(derive_seed(seed, STYLE))
+        drawn = self.sampler.sample((), self._generator)  # also where one is held, so that seeded draws stay aligned
+        self._style = drawn if self._held is None else self._held
+        return self._shown(observation), {**info, STYLE: self._style.numpy().copy()}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Step, and add the style's reward for the style that the previous observation showed."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        features = checked_features(self.features(observation, action, info))
+        task_reward = float(reward)  # pyright: ignore[reportArgumentType]  # SupportsFloat
+        style_reward = self.style_reward(torch.from_numpy(features)[None], self._style[None]).item()
+        if self._held is not None:
+            self._style = self._held
+        info = {**info, STYLE: self._style.numpy().copy(), TASK_REWARD: task_reward, STYLE_REWARD: style_reward}
+        return self._shown(observation), task_reward + style_reward, terminated, truncated, info
+
+    def _shown(self, observation: Any) -> Any:
+        style = self._style.numpy().copy()
+        if not self.flat:
+            return {"observation": observation, STYLE: style}
+        flattened = flat_observation(self.env.observation_space, observation)
+        return np.concatenate([flattened, style]).astype(self._flat_dtype)

@@ -1,0 +1,324 @@
+"""Gymnasium both ways: a wrapped environment is a Gymnasium environment, and a Gymnasium environment trains here."""
+
+import functools
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs.utils import check_env_specs
+from torchrl.objectives import SACLoss
+
+from coachable.networks import make_critic, make_gaussian_actor
+from coachable.styles import Choice, PointMass, Setpoint, StyleRangeWarning, StyleReward, StyleSpace, Term
+from coachable.training import Learner
+from coachable.training.collection import evaluate_policy, make_collector
+from coachable.training.episodes import EpisodeSums
+from coachable.training.logging import MetricsLog, Progress
+from coachable.training.loop import Train
+from coachable.training.settings import TrainSettings
+from coachable.transforms import coachable_env
+
+gymnasium = pytest.importorskip("gymnasium")
+from gymnasium import spaces  # noqa: E402
+from gymnasium.utils.env_checker import check_env  # noqa: E402
+
+from coachable.gym import GymnasiumEnv, StyleWrapper  # noqa: E402
+from coachable.gym.actions import action_components, native_action  # noqa: E402
+
+STEPS = 5
+
+
+class Walk(gymnasium.Env):
+    """A walk on a line: moves by the action, pays 1 per step, ends beyond 3 (terminated) or after 5 steps."""
+
+    action_space = spaces.Box(-1.0, 1.0, (1,))
+    observation_space = spaces.Box(-10.0, 10.0, (2,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.position, self.steps = self.np_random.uniform(-1, 1), 0
+        return self._observation(), {"options": options}
+
+    def step(self, action):
+        self.position += float(action[0])
+        self.steps += 1
+        return self._observation(), 1.0, abs(self.position) > 3, self.steps >= STEPS, {"moved": float(action[0])}
+
+    def _observation(self):
+        return np.array([self.position, self.steps / STEPS], dtype=np.float32)
+
+
+SPACE = StyleSpace([Setpoint("stride", -1.0, 1.0), Choice("hat", ("red", "blue"))])
+
+
+def style_reward():
+    """Minus the distance between the move and the requested one; a red hat costs 10."""
+    return StyleReward(
+        SPACE,
+        {
+            "stride": Term(lambda f, s: -(f[..., 0] - s["stride"]).abs(), parameters=("stride",)),
+            "hat": Term(lambda f, s: -10.0 * s["hat"][..., 0], parameters=("hat",)),
+        },
+    )
+
+
+def moved(observation, action, info):
+    assert info["moved"] == action[0]
+    return action
+
+
+@pytest.fixture
+def env():
+    return StyleWrapper(Walk(), style_reward(), moved)
+
+
+# -- out ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.filterwarnings("ignore:.*different from the unwrapped version.*:UserWarning")
+@pytest.mark.parametrize("flat", [False, True])
+def test_gymnasium_approves(flat):
+    check_env(StyleWrapper(Walk(), style_reward(), moved, flat=flat), skip_render_check=True)
+
+
+def test_a_registered_environment_can_be_made_again():
+    env = StyleWrapper(gymnasium.make("Pendulum-v1"), style_reward(), lambda o, a, i: a)
+    again = gymnasium.make(env.spec)
+    assert isinstance(again, StyleWrapper) and again.observation_space == env.observation_space
+
+
+def test_the_observation_is_a_dict_or_one_vector(env):
+    observation, info = env.reset(seed=0)
+    assert set(observation) == {"observation", "style"}
+    flat = StyleWrapper(Walk(), style_reward(), moved, flat=True)
+    vector, _ = flat.reset(seed=0)
+    np.testing.assert_array_equal(vector, np.concatenate([observation["observation"], observation["style"]]))
+    np.testing.assert_array_equal(info["style"], observation["style"])
+    assert vector.dtype == np.float32 and vector.shape == flat.observation_space.shape == (5,)
+
+
+def test_the_reward_is_of_the_style_that_was_shown(env):
+    env.set_style({"stride": 0.5, "hat": "blue"})
+    env.reset(seed=0)
+    env.set_style({"stride": -0.5, "hat": "blue"})  # shown from the next observation on
+    observation, reward, _, _, info = env.step(np.array([0.25], dtype=np.float32))
+    assert reward == pytest.approx(1.0 - 0.25)
+    assert info["task_reward"] == 1.0 and info["style_reward"] == pytest.approx(-0.25)
+    np.testing.assert_array_equal(observation["style"], [-0.5, 0, 1])
+    np.testing.assert_array_equal(info["style"], [-0.5, 0, 1])
+    _, reward, *_ = env.step(np.array([0.25], dtype=np.float32))
+    assert reward == pytest.approx(1.0 - 0.75)
+
+
+def test_a_style_is_drawn_per_episode_and_kept_within(env):
+    shown = []
+    for episode in range(20):
+        observation, _ = env.reset(seed=3 if episode == 0 else None)
+        shown.append(observation["style"])
+        for _ in range(3):
+            observation, *_ = env.step(np.zeros(1, dtype=np.float32))
+            np.testing.assert_array_equal(observation["style"], shown[-1])
+    assert len({float(style[0]) for style in shown}) == 20
+    env.reset(seed=3)
+    np.testing.assert_array_equal(env.reset()[0]["style"], shown[1])  # the seed also restarts the draws
+
+
+def test_the_draws_are_the_environments_own():
+    """Neither torch's global generator nor another wrapper's decides them."""
+    first, second = (StyleWrapper(Walk(), style_reward(), moved) for _ in range(2))
+    torch.manual_seed(0)
+    a = first.reset(seed=1)[0]["style"]
+    torch.manual_seed(5)
+    np.testing.assert_array_equal(second.reset(seed=1)[0]["style"], a)
+    assert not np.array_equal(second.reset(seed=2)[0]["style"], a)
+
+
+def test_a_held_style_stays_until_it_is_released(env):
+    env.set_style({"hat": "blue", "stride": 1.0})
+    for _ in range(3):
+        np.testing.assert_array_equal(env.reset()[0]["style"], [1, 0, 1])
+    env.set_style(None)
+    assert len({float(env.reset()[0]["style"][0]) for _ in range(5)}) == 5
+    env.set_style([0.25, 1, 0])
+    np.testing.assert_array_equal(env.reset()[0]["style"], [0.25, 1, 0])
+
+
+def test_bad_requests_change_nothing(env):
+    env.set_style({"stride": 0.5})
+    for request, message in [
+        ({"pace": 1.0}, "unknown style parameter 'pace'"),
+        ({"hat": "green"}, "no option"),
+        ([0.5, 1.0], r"expected \(3,\)"),
+        ([float("nan"), 1, 0], "NaN"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            env.set_style(request)
+    with pytest.raises(ValueError, match="outside"):
+        env.set_style({"stride": 2.0}, strict=True)
+    np.testing.assert_array_equal(env.reset()[0]["style"], [0.5, 1, 0])
+    with pytest.warns(StyleRangeWarning, match="stride = 2 lies outside"):
+        env.set_style({"stride": 2.0})
+    np.testing.assert_array_equal(env.reset()[0]["style"], [1, 1, 0])
+
+
+def test_another_sampler(env):
+    env = StyleWrapper(Walk(), style_reward(), moved, sampler=PointMass([0.5, 0, 1]))
+    np.testing.assert_array_equal(env.reset()[0]["style"], [0.5, 0, 1])
+
+
+def test_options_reach_the_environment_inside(env):
+    assert env.reset(options={"level": 2})[1]["options"] == {"level": 2}
+
+
+def test_features_of_another_shape_are_refused():
+    env = StyleWrapper(Walk(), style_reward(), lambda o, a, i: float(a[0]))
+    env.reset()
+    with pytest.raises(ValueError, match=r"returned shape \(\): expected \(F,\)"):
+        env.step(np.zeros(1, dtype=np.float32))
+
+
+def test_vectorised_environments_collect_the_style():
+    make = functools.partial(StyleWrapper, Walk(), style_reward(), moved)
+    vector = gymnasium.vector.SyncVectorEnv([lambda: make(), lambda: StyleWrapper(Walk(), style_reward(), moved)])
+    observation, info = vector.reset(seed=0)
+    np.testing.assert_array_equal(observation["style"], info["style"])
+    assert observation["style"].shape == (2, 3)
+    vector.call("set_style", {"stride": 0.5})
+    observation, *_ = vector.step(np.zeros((2, 1), dtype=np.float32))
+    np.testing.assert_array_equal(observation["style"], [[0.5, 1, 0]] * 2)
+
+
+# -- in -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "make, features",
+    [
+        (Walk, moved),
+        ("CartPole-v1", lambda observation, action, info: [observation[0], action]),
+        ("Pendulum-v1", lambda observation, action, info: observation[2:]),
+    ],
+)
+def test_torchrl_approves(make, features):
+    env = GymnasiumEnv(make, features, num_envs=3, seed=0)
+    check_env_specs(env)
+    env.close()
+
+
+def test_a_batch_equals_its_environments_one_by_one():
+    env = GymnasiumEnv(Walk, moved, num_envs=3, seed=7)
+    rollout = env.rollout(12, policy=env.rand_action, break_when_any_done=False, auto_cast_to_device=False)
+    seeds = np.random.SeedSequence(7).generate_state(3).tolist()
+    for row, seed in enumerate(seeds):
+        walk = Walk()
+        observation, _ = walk.reset(seed=seed)
+        for step in rollout[row].unbind(0):
+            np.testing.assert_array_equal(step["observation"], observation)
+            observation, reward, terminated, truncated, _ = walk.step(step["action"].numpy())
+            after = step["next"]
+            np.testing.assert_array_equal(after["observation"], observation)
+            assert after["task_reward"].item() == after["reward"].item() == reward
+            assert after["terminated"].item() == terminated and after["truncated"].item() == truncated
+            np.testing.assert_array_equal(after["style_features"], step["action"])
+            if terminated or truncated:
+                observation, _ = walk.reset()
+
+
+def test_a_partial_reset_touches_nothing_else():
+    env = GymnasiumEnv(Walk, moved, num_envs=3, seed=0)
+    before = env.rollout(2)[:, -1]["next"]
+    mask = torch.tensor([[False], [True], [False]])
+    after = env.reset(before.select("observation").set("_reset", mask))
+    np.testing.assert_array_equal(after["observation"][[0, 2]], before["observation"][[0, 2]])
+    assert after["observation"][1, 1] == 0
+
+
+def test_an_ended_episode_may_be_stepped_on():
+    """Evaluation goes on with the others, and no longer counts this one."""
+    env = GymnasiumEnv(Walk, moved, num_envs=2, seed=0)
+    current = env.reset()
+    for step in range(STEPS + 2):
+        current = env.step(current.set("action", torch.zeros(2, 1)))["next"]
+        assert current["truncated"].all() == (step == STEPS - 1)
+        current = current.exclude("reward", "task_reward", "style_features")
+    assert current["observation"][0, 1].item() == pytest.approx(2 / STEPS)
+
+
+def test_one_seed_one_run():
+    rollouts = []
+    for _ in range(2):
+        torch.manual_seed(0)
+        env = coachable_env(GymnasiumEnv(Walk, moved, num_envs=2), SPACE, style_reward(), seed=4)
+        rollouts.append(env.rollout(12, break_when_any_done=False))
+    assert (rollouts[0] == rollouts[1]).all()
+
+
+def test_every_component_of_an_action_space():
+    space = spaces.Dict(
+        {
+            "buttons": spaces.MultiDiscrete([3, 2]),
+            "jump": spaces.Discrete(4, start=2),
+            "sticks": spaces.Tuple([spaces.Box(np.array([-2.0, 0.0]), np.array([2.0, 10.0]), dtype=np.float64)]),
+            "switch": spaces.MultiBinary(2),
+        }
+    )
+    assert action_components(space) == ([3, 2, 4, 2, 2], 2)
+    action = native_action(space, iter([2, 0, 1, 1, 0]), iter([0.5, -1.0]))
+    assert space.contains(action)
+    np.testing.assert_array_equal(action["buttons"], [2, 0])
+    assert action["jump"] == 3
+    np.testing.assert_allclose(action["sticks"][0], [1.0, 0.0])
+    np.testing.assert_array_equal(action["switch"], [1, 0])
+
+
+@pytest.mark.parametrize("space", [spaces.Box(-np.inf, np.inf, (2,)), spaces.Text(3)])
+def test_other_action_spaces_are_refused(space):
+    class Odd(Walk):
+        action_space = space
+
+    with pytest.raises(ValueError, match="not supported: expected Box with finite bounds"):
+        GymnasiumEnv(Odd, moved)
+
+
+def test_a_diverged_policy_is_named():
+    env = GymnasiumEnv(Walk, moved, num_envs=1)
+    with pytest.raises(ValueError, match="NaN"):
+        env.step(env.reset().set("action", torch.full((1, 1), torch.nan)))
+
+
+def test_training_on_a_gymnasium_environment(tmp_path):
+    """Our loop, unchanged, learns the requested stride: its error falls from about 0.5 to below 0.2."""
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    space = StyleSpace([Setpoint("stride", -0.5, 0.5)])
+    reward = StyleReward(space, {"stride": Term(lambda f, s: -(f[..., 0] - s["stride"]).abs(), parameters=("stride",))})
+
+    def make_env(seed, num_envs=16):
+        return coachable_env(GymnasiumEnv(Walk, moved, num_envs, seed=seed), space, reward, EpisodeSums(), seed=seed)
+
+    actor = make_gaussian_actor(2, 1, space, (32,))
+    critics = [make_critic(2, 1, space, (32,)) for _ in range(2)]
+    loss = SACLoss(
+        actor, critics, action_spec=make_env(0).action_spec[0], loss_function="l2", fixed_alpha=True, alpha_init=0.01
+    )
+    loss.make_value_estimator(gamma=0.9)
+    Train(
+        collector=make_collector(make_env, actor, frames_per_batch=16, init_random_frames=200),
+        replay=TensorDictReplayBuffer(storage=LazyTensorStorage(5000)),
+        learner=Learner(loss, actor_lr=3e-3, critic_lr=3e-3, precision="fp32"),
+        settings=TrainSettings(total_frames=2400, batch_size=64, warmup_frames=200, utd_ratio=0.1),
+        log=MetricsLog(tmp_path),
+        progress=Progress(2400, every=1e9),
+        checkpoints=None,
+        describe=dict,
+    ).run()
+    outcome = evaluate_policy(make_env(1, 64), actor, max_steps=STEPS)
+    assert (outcome["task_return"] - outcome["return"]) / outcome["length"] < 0.2
+
+
+def test_the_documented_program_runs():
+    text = (Path(__file__).resolve().parent.parent / "docs" / "bring_your_gymnasium_env.md").read_text()
+    exec("\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)), {})
