@@ -30,9 +30,12 @@ def cheetah_space() -> StyleSpace:
     return StyleSpace([Setpoint("speed", 0.0, 5.0, unit="m/s", help="forward speed")], name="cheetah")
 
 
-def cheetah_style_reward(space: StyleSpace, *, scale: float = 1.0, margin: float = 2.0) -> StyleReward:
-    """Up to `scale` per step for the requested speed, a tenth of it `margin` [m/s] off."""
-    term = SetpointTolerance("speed", SPEED, margin=margin, sigmoid="long_tail")
+def cheetah_style_reward(space: StyleSpace, *, scale: float = 1.0, margin: float = 5.0) -> StyleReward:
+    """Up to `scale` per step for the requested speed, linearly less down to nothing `margin` [m/s] off.
+
+    The margin is as wide as the range: where a reward is flat, standing still looks as good as a little running.
+    """
+    term = SetpointTolerance("speed", SPEED, margin=margin, sigmoid="linear", value_at_margin=0.0)
     return StyleReward(space, {"speed": term}, scales={"speed": scale})
 
 
