@@ -106,6 +106,40 @@ def coachable(precision, fused=True, order="simultaneous"):
     return run
 
 
+def our_loss(name, precision="bf16"):
+    """Another of our losses on the same trunks, policy first as in the paper's recipes."""
+    import torch
+
+    from coachable.losses import CategoricalSACLoss, CatRACLoss, QRSACLoss, RACLoss
+    from coachable.networks import make_critic, make_gaussian_actor, make_hl_gauss_critic
+    from coachable.training.learner import Learner
+
+    torch.manual_seed(0)
+    widths, bins = (WIDTH,) * LAYERS, {"v_min": -600.0, "v_max": 1000.0, "num_atoms": 255}
+    make_loss, arguments = {
+        "qr_sac": (QRSACLoss, {"num_quantiles": 32}),
+        "rac": (RACLoss, {"entropy_samples": 1000}),
+        "cat_rac": (CatRACLoss, {"entropy_samples": 1000, **bins}),
+        "sac_categorical": (CategoricalSACLoss, bins),
+    }[name]
+
+    def critic():
+        if "v_min" in arguments:
+            return make_hl_gauss_critic(OBS, ACT, _Space(), widths, **bins)
+        return make_critic(OBS, ACT, _Space(), widths, num_outputs=arguments.get("num_quantiles", 1))
+
+    loss = make_loss(make_gaussian_actor(OBS, ACT, _Space(), widths), [critic(), critic()], alpha=ALPHA, **arguments)
+    loss.make_value_estimator(gamma=GAMMA)
+    learner = Learner(loss, actor_lr=LR, critic_lr=LR, tau=TAU, precision=precision, update_order="policy_first")
+    batch = _batch()
+
+    def run(n):
+        for _ in range(n):
+            learner.update(batch)
+
+    return run
+
+
 def torchrl(network):
     """TorchRL's `SACLoss` as its own SAC recipe uses it: one critic module vmapped, plain Adam, one backward."""
     import torch
@@ -329,6 +363,11 @@ WORKERS = {
     "coachable-bf16": lambda: coachable("bf16"),
     "coachable-bf16-policy-first": lambda: coachable("bf16", order="policy_first"),
     "coachable-bf16-autocast": lambda: coachable("bf16", fused=False),
+    "coachable-qr_sac": lambda: our_loss("qr_sac"),
+    "coachable-rac": lambda: our_loss("rac"),
+    "coachable-cat_rac": lambda: our_loss("cat_rac"),
+    "coachable-cat_rac-fp32": lambda: our_loss("cat_rac", "fp32"),
+    "coachable-sac_categorical": lambda: our_loss("sac_categorical"),
     "torchrl": lambda: torchrl("mlp"),
     "torchrl-resnet": lambda: torchrl("resnet"),
     "single-file-fp32": lambda: single_file("fp32"),

@@ -12,6 +12,7 @@ from coachable.gl import choose_gl_backend
 choose_gl_backend()  # MuJoCo, which TorchRL imports, reads the choice once, when it is imported
 
 if TYPE_CHECKING:
+    from coachable.replay import EventTableBuffer
     from coachable.styles import Choice, Setpoint, StyleReward, StyleSpace, Weight
     from coachable.transforms import CoachableEnv, StyleRewardTransform, StyleSampler, TaskImpersonation, coachable_env
 
@@ -20,6 +21,7 @@ __version__ = "0.1.0.dev0"
 # Where each public name lives. Resolved lazily by `__getattr__` (PEP 562).
 _MODULE_OF = {
     "Choice": "coachable.styles",
+    "EventTableBuffer": "coachable.replay",
     "Setpoint": "coachable.styles",
     "StyleReward": "coachable.styles",
     "StyleSpace": "coachable.styles",
@@ -34,6 +36,7 @@ _MODULE_OF = {
 __all__ = [
     "Choice",
     "CoachableEnv",
+    "EventTableBuffer",
     "Setpoint",
     "StyleReward",
     "StyleRewardTransform",

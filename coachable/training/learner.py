@@ -227,7 +227,7 @@ class Learner:
         if self._params["alpha"]:
             self._step("alpha")
         metrics["td_error"] = batch.get("td_error").mean()
-        return metrics
+        return metrics | _critic_health(losses)
 
     def _sequential(self, batch: TensorDictBase, functions: _Losses) -> dict[str, Tensor]:
         policy_first = self.update_order == "policy_first"
@@ -241,7 +241,7 @@ class Learner:
         metrics["td_error"] = extra["td_error"].mean()
         if not policy_first:
             metrics |= self._update_actor(batch, functions)
-        return metrics
+        return metrics | _critic_health(extra)
 
     def _update_actor(self, batch: TensorDictBase, functions: _Losses) -> dict[str, Tensor]:
         with self._autocast():
@@ -257,6 +257,12 @@ class Learner:
                 loss.alpha_loss(log_prob).mean().backward()
                 self._step("alpha")
         return metrics
+
+
+def _critic_health(outputs: Any) -> dict[str, Tensor]:
+    """Share of targets outside a categorical critic's support; empty for other critics."""
+    clipped = outputs.get("clipped_fraction", None)
+    return {} if clipped is None else {"clipped_fraction": clipped.mean()}
 
 
 def _parameter_groups(loss_module: LossModule) -> dict[str, list[nn.Parameter]]:
