@@ -1,0 +1,106 @@
+"""What a domain adds to live coaching beyond its `Domain`: live controls, words, presets."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from torchrl.envs import EnvBase
+
+from coachable.styles import Setpoint
+
+
+@dataclass(frozen=True)
+class Control:
+    """Something that is steered while the agent acts and is no style: the policy sees it in its observation.
+
+    Attributes:
+        parameter: name, range, unit and neutral value.
+        apply: writes a value into the base environment.
+        circular: values beyond one end go on at the other, such as angles.
+    """
+
+    parameter: Setpoint
+    apply: Callable[[EnvBase, float], None]
+    circular: bool = False
+
+    def fit(self, value: float) -> float:
+        """The value brought into the control's range.
+
+        Raises:
+            ValueError: if it is no finite number.
+        """
+        low, high = self.parameter.low, self.parameter.high
+        if not math.isfinite(value):
+            raise ValueError(f"{self.parameter.name} = {value}: expected a number in [{low:g}, {high:g}].")
+        if self.circular and not low <= value <= high:
+            return low + (value - low) % (high - low)
+        return min(max(value, low), high)
+
+
+@dataclass(frozen=True)
+class Coaching:
+    """A domain's additions.
+
+    Attributes:
+        controls: live controls, such as the humanoid's course.
+        vocabulary: further words of the phrase box; see `StyleGrammar`.
+        presets: named styles.
+        terminated: what a terminated episode means here, in the past tense.
+    """
+
+    controls: Sequence[Control] = ()
+    vocabulary: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    terminated: str = "ended"
+
+
+def _steer(env: EnvBase, course_deg: float) -> None:
+    env.steer(math.radians(course_deg))  # pyright: ignore[reportCallIssue]
+
+
+_COACHING = {
+    "humanoid": Coaching(
+        controls=(
+            Control(
+                Setpoint("course", -180.0, 180.0, unit="deg", help="direction of walking, left is positive"),
+                _steer,
+                circular=True,
+            ),
+        ),
+        vocabulary={
+            "pose": ("arm", "hand", "posture", "elbow"),
+            "pose=arms_up": (
+                *("up", "arms raised", "raise arms", "raise both arms", "lift arms", "hands up", "hands high"),
+                *(
+                    "overhead",
+                    "above head",
+                    "over head",
+                    "reach up",
+                    "arms high",
+                    "arms in the air",
+                    "hands in the air",
+                ),
+            ),
+            "pose=arms_in_front": ("forward", "front", "in front", "ahead", "zombie", "sleepwalker"),
+            "pose=t_pose": ("t shape", "t", "sideway", "to side", "out to side", "spread", "aeroplane", "airplane"),
+            "step_length": ("step", "stride", "gait", "pace"),
+            "step_length=low": ("baby step", "shuffle", "tiptoe"),
+            "step_length=high": ("leap", "stretch your legs"),
+            "course": ("turn", "heading", "veer", "steer"),
+        },
+        presets={
+            "tightrope": {"pose": "t_pose", "step_length": 0.30},
+            "sleepwalker": {"pose": "arms_in_front", "step_length": 0.40},
+            "victory lap": {"pose": "arms_up", "step_length": 0.60},
+        },
+        terminated="fell",
+    )
+}
+
+
+def coaching_of(domain: str) -> Coaching:
+    """The additions of a domain; none for one that declares none."""
+    return _COACHING.get(domain, Coaching())

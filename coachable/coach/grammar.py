@@ -1,0 +1,355 @@
+"""`StyleGrammar`: short phrases such as "shorter steps, arms up" or "0.4 m" into style parameters.
+
+A convenience built from the declarations, not language understanding: it knows names, options, words of the help texts
+and the words of `coachable.coach.vocabulary`. What it does not know, it says.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import cast
+
+from coachable.coach import segments
+from coachable.coach.segments import Mention, Segment
+from coachable.coach.vocabulary import (
+    ANY,
+    DEFAULTS,
+    DIRECTIONS,
+    FACTORS,
+    FILLERS,
+    LEVELS,
+    NEGATIONS,
+    PERCENT,
+    PLAINLY,
+    PREFERENCES,
+    SEPARATORS,
+    SLIGHTLY,
+    STRONGLY,
+    TURNS,
+    UNITS,
+    stem,
+    tokenise,
+)
+from coachable.styles import Choice, Parameter, StyleSpace, Weight
+
+Value = float | str
+_ENDS = {"low": 0.0, "high": 1.0}
+
+
+@dataclass(frozen=True)
+class Understanding:
+    """What a phrase was taken to mean.
+
+    Attributes:
+        phrase: as given.
+        changes: value by parameter name, to be handed to `CoachSession.set`; it may lie outside the trained range.
+        said: one sentence per request that was understood.
+        failed: one sentence per piece that was not.
+        last: parameter and direction of the last change, for "a bit more".
+    """
+
+    phrase: str
+    changes: dict[str, Value]
+    said: tuple[str, ...]
+    failed: tuple[str, ...]
+    last: tuple[str, float] | None = None
+
+    def __str__(self) -> str:
+        return "; ".join([*self.said, *(f"not understood: {text}" for text in self.failed)])
+
+
+@dataclass
+class _Reading:
+    """A phrase while it is being read."""
+
+    values: dict[str, Value]
+    changes: dict[str, Value] = field(default_factory=dict)
+    said: list[str] = field(default_factory=list)
+    failed: list[str] = field(default_factory=list)
+    excluded: dict[str, str] = field(default_factory=dict)  # by parameter: an option was ruled out, none was named
+    last: tuple[str, float] | None = None
+
+
+class StyleGrammar:
+    """Reads phrases about the parameters of a style space.
+
+    Args:
+        parameters: what can be asked for; a `StyleSpace` or any list of declarations.
+        vocabulary: further words and phrases by meaning: "name" for a parameter, "name=option" for an option,
+            "name=low", "name=high" or "name=0.4" for a value. Singular forms suffice.
+
+    Raises:
+        ValueError: if the vocabulary names something that does not exist.
+
+    Example:
+        >>> from coachable.styles import Setpoint
+        >>> grammar = StyleGrammar([Setpoint("gap", 0.0, 2.0, unit="m")])
+        >>> print(grammar.read("a bit more gap", {"gap": 1.0}))
+        gap 1 -> 1.2 m
+        >>> print(grammar.read("sing louder", {"gap": 1.0}))
+        not understood: 'sing louder' (unknown: sing, louder)
+    """
+
+    def __init__(
+        self, parameters: StyleSpace | Sequence[Parameter], vocabulary: Mapping[str, Sequence[str]] | None = None
+    ) -> None:
+        declared = parameters.parameters if isinstance(parameters, StyleSpace) else tuple(parameters)
+        self.parameters: dict[str, Parameter] = {p.name: p for p in declared}
+        self.lexicon: dict[tuple[str, ...], Mention] = {}
+        self._add_help()
+        self._add_names()
+        for meaning, phrases in (vocabulary or {}).items():
+            mention = self._mention(meaning)
+            for phrase in phrases:
+                self._add(phrase, mention)
+
+    def read(self, phrase: str, current: Mapping[str, Value], previous: Understanding | None = None) -> Understanding:
+        """Understands a phrase, relative to the style in force.
+
+        Args:
+            phrase: what the coach said.
+            current: value of every parameter.
+            previous: what was understood before, to which "a bit more" refers.
+        """
+        reading = _Reading(dict(current), last=previous.last if previous is not None else None)
+        split = segments.split(tokenise(phrase), self.lexicon)
+        if not split:
+            reading.failed.append(f"'{phrase.strip()}'" if phrase.strip() else "an empty phrase")
+        for segment in split:
+            if segment.default and not segment.unknown and not segment.mentions:
+                for name, parameter in self.parameters.items():
+                    self._change(reading, name, parameter.default)
+            else:
+                self._interpret(segment, reading)
+        reading.failed += [text for name, text in reading.excluded.items() if name not in reading.changes]
+        return Understanding(phrase, reading.changes, tuple(reading.said), tuple(reading.failed), reading.last)
+
+    # -- lexicon ---------------------------------------------------------------------------------------------------
+
+    def _add(self, phrase: str, mention: Mention) -> None:
+        words = tuple(stem(token) for token in tokenise(phrase))
+        if words:
+            self.lexicon[words] = mention
+
+    def _add_names(self) -> None:
+        singles: Counter[str] = Counter()
+        for p in self.parameters.values():
+            for name in (p.name, *(p.options if isinstance(p, Choice) else ())):
+                singles.update(set(tokenise(name)))
+        for p in self.parameters.values():
+            for name, mention in [
+                (p.name, Mention(p.name)),
+                *((option, Mention(p.name, option)) for option in (p.options if isinstance(p, Choice) else ())),
+            ]:
+                for word in tokenise(name):
+                    if singles[word] == 1 and self._is_free(word):
+                        self._add(word, mention)
+                self._add(name, mention)
+
+    def _add_help(self) -> None:
+        """Content words of the help texts that belong to one parameter alone."""
+        words = {p.name: {w for w in tokenise(p.help) if self._is_free(w)} for p in self.parameters.values()}
+        counts = Counter(word for found in words.values() for word in found)
+        for name, found in words.items():
+            for word in found:
+                if counts[word] == 1:
+                    self._add(word, Mention(name))
+
+    @staticmethod
+    def _is_free(word: str) -> bool:
+        """Whether a word has no other meaning, so that alone it may stand for a parameter."""
+        taken = (DIRECTIONS, LEVELS, FACTORS, NEGATIONS, PREFERENCES, DEFAULTS, FILLERS, SEPARATORS, UNITS, PERCENT)
+        return word.isalpha() and len(word) > 1 and not any(word in table for table in taken)
+
+    def _mention(self, meaning: str) -> Mention:
+        name, _, value = meaning.partition("=")
+        parameter = self.parameters.get(name)
+        if parameter is None:
+            raise ValueError(f"the vocabulary has words for {name!r}: expected one of {list(self.parameters)}")
+        if not value:
+            return Mention(name)
+        if isinstance(parameter, Choice):
+            if value not in parameter.options:
+                raise ValueError(f"the vocabulary has words for {meaning!r}: options are {list(parameter.options)}")
+            return Mention(name, value)
+        if value in _ENDS:
+            return Mention(name, parameter.low + _ENDS[value] * (parameter.high - parameter.low))
+        return Mention(name, float(value))
+
+    # -- meaning ---------------------------------------------------------------------------------------------------
+
+    def _interpret(self, segment: Segment, reading: _Reading) -> None:
+        if segment.negated and segment.unknown:  # what is denied is not known
+            reading.failed.append(f"'{segment.text}' (unknown: {', '.join(segment.unknown)})")
+            return
+        values = [mention for mention in segment.mentions if mention.value is not None]
+        if values:
+            self._take_values(segment, values, reading)
+            return
+        name, problem = self._target(segment, reading)
+        if name is None:
+            reading.failed.append(f"'{segment.text}'{problem}")
+            return
+        parameter = self.parameters[name]
+        if isinstance(parameter, Choice):
+            if segment.keep or segment.default:
+                self._change(reading, name, parameter.default if segment.default else reading.values[name])
+            else:
+                unknown = f"unknown: {', '.join(segment.unknown)}; " if segment.unknown else ""
+                reading.failed.append(f"'{segment.text}' ({unknown}{name} can be {_listed(parameter.options)})")
+            return
+        value = self._number(parameter, segment, float(reading.values[name]), reading.last)
+        if isinstance(value, str):
+            reading.failed.append(f"'{segment.text}' ({value})")
+            return
+        self._note_unknown(segment, reading)
+        self._change(reading, name, value)
+
+    def _take_values(self, segment: Segment, values: list[Mention], reading: _Reading) -> None:
+        """Options of choices, and values that the vocabulary gives a name."""
+        for mention in values:
+            assert mention.value is not None
+            if not segment.negated:
+                self._note_unknown(segment, reading)
+                self._change(reading, mention.name, mention.value)
+                continue
+            parameter = self.parameters[mention.name]
+            others = [o for o in parameter.options if o != mention.value] if isinstance(parameter, Choice) else []
+            if isinstance(parameter, Choice) and reading.values[mention.name] != mention.value:
+                reading.said.append(f"{mention.name} stays {_shown(parameter, reading.values[mention.name])}")
+            elif len(others) == 1:
+                self._change(reading, mention.name, others[0])
+            else:
+                instead = f"say what instead: {_listed(others)}" if others else "say how much instead"
+                reading.excluded[mention.name] = f"'{segment.text}' ({instead})"
+
+    def _target(self, segment: Segment, reading: _Reading) -> tuple[str | None, str]:
+        """The parameter that a segment is about, or why there is none."""
+        if segment.mentions:
+            return segment.mentions[0].name, ""
+        if segment.unknown:
+            return None, f" (unknown: {', '.join(segment.unknown)})"
+        if not segment.has_head:
+            return None, ""
+        dimension = segment.dimension
+        numeric = [n for n, p in self.parameters.items() if not isinstance(p, Choice)]
+        if dimension:
+            fitting = [n for n in numeric if _dimension(self.parameters[n]) == dimension]
+            if not fitting:
+                return None, f" (nothing here has a {dimension})"
+        else:
+            fitting = [n for n in numeric if _dimension(self.parameters[n]) != "angle"]
+        if reading.last is not None and (reading.last[0] in fitting or not dimension):
+            return reading.last[0], ""
+        if len(fitting) == 1:
+            return fitting[0], ""
+        return None, f" (of what: {_listed(fitting)}?)"
+
+    def _number(self, p: Parameter, segment: Segment, now: float, last: tuple[str, float] | None) -> float | str:
+        """The value that a segment asks of a numeric parameter, or what is missing."""
+        span = p.high - p.low
+        sign = self._sign(segment, p, last)
+        if segment.keep and sign is None and segment.only_degree:
+            return now
+        if segment.number is not None:
+            return self._given_number(p, segment, now, sign)
+        if segment.negated and segment.direction is not None:
+            return now  # "not longer" asks for no change
+        if segment.factor is not None:
+            return now * segment.factor
+        degree = segment.degree or (SLIGHTLY if segment.negated else PLAINLY)
+        if segment.level is not None and sign is None:
+            share = segment.level
+            if segment.degree == STRONGLY:
+                share = float(round(share)) if share != 0.5 else 0.5
+            elif segment.degree == SLIGHTLY:
+                share = 0.5 + (share - 0.5) / 2
+            return share * p.high if isinstance(p, Weight) else p.low + share * span
+        if sign is not None:
+            step = TURNS[degree] * 360.0 if p.unit == "deg" else degree * span
+            return min(max(now + sign * step, p.low), p.high) if p.unit != "deg" else now + sign * step
+        if segment.default:
+            return float(cast(float, p.default))
+        if isinstance(p, Weight):
+            if segment.negated:
+                return p.low
+            if segment.degree == SLIGHTLY:
+                return p.high / 4
+            if segment.preferred or not segment.unknown:
+                return p.high
+        return f"how much? {p.name} goes from {p.low:g} to {p.high:g} {p.unit}".rstrip()
+
+    def _sign(self, segment: Segment, p: Parameter, last: tuple[str, float] | None) -> float | None:
+        """+1 or -1 for a change relative to the value in force."""
+        if segment.direction is not None:
+            dimension, sign = segment.direction
+            if segment.repeated and dimension == ANY and not segment.mentions and last and last[0] == p.name:
+                return sign * last[1]  # "a bit more" of what was asked before
+            return sign
+        if segment.level is not None and (segment.too or segment.negated) and segment.level != 0.5:
+            return -1.0 if segment.level > 0.5 else 1.0
+        if segment.repeated and last is not None and last[0] == p.name:
+            return last[1]
+        return None
+
+    def _given_number(self, p: Parameter, segment: Segment, now: float, sign: float | None) -> float | str:
+        assert segment.number is not None
+        number, unit = segment.number
+        if segment.negated:
+            return "say what instead"
+        if unit in PERCENT:
+            if sign is not None and not segment.absolute:
+                return now * (1 + sign * number / 100)
+            return p.low + (p.high - p.low) * number / 100
+        if unit:
+            if _dimension(p) != UNITS[unit][0]:
+                return f"{p.name} is no {UNITS[unit][0]}" + (f", it is in {p.unit}" if p.unit else "")
+            number = number * UNITS[unit][1] / UNITS[stem(p.unit)][1]
+        if segment.signed or (number < 0 and p.low >= 0):
+            return now + number
+        if sign is not None and not segment.absolute and segment.level is None:
+            return now + sign * number
+        return float(f"{number:.9g}")
+
+    # -- echo ------------------------------------------------------------------------------------------------------
+
+    def _change(self, reading: _Reading, name: str, value: Value) -> None:
+        parameter, before = self.parameters[name], reading.values[name]
+        if isinstance(value, float) and isinstance(before, float):
+            value = float(f"{value:.6g}")
+            if abs(value - before) <= 1e-6 * (parameter.high - parameter.low):
+                at = "already at its " + ("highest" if value >= parameter.high else "lowest")
+                ends = not parameter.low < value < parameter.high
+                reading.said.append(f"{name} stays {_shown(parameter, before)}" + (f", {at}" if ends else ""))
+                return
+            reading.last = (name, 1.0 if value > before else -1.0)
+        if value == before:
+            reading.said.append(f"{name} stays {_shown(parameter, value)}")
+            return
+        number = isinstance(before, float)
+        was = f"{before:.3g}" if number else _shown(parameter, before)
+        outside = number and not parameter.low <= float(value) <= parameter.high
+        trained = f", outside the trained range {parameter.low:g} to {parameter.high:g}" if outside else ""
+        reading.said.append(f"{name} {was} -> {_shown(parameter, value)}{trained}")
+        reading.values[name] = reading.changes[name] = value
+
+    @staticmethod
+    def _note_unknown(segment: Segment, reading: _Reading) -> None:
+        if segment.unknown:
+            reading.failed.append(f"{', '.join(repr(word) for word in segment.unknown)} in '{segment.text}'")
+
+
+def _dimension(parameter: Parameter) -> str:
+    return UNITS.get(stem(parameter.unit), (ANY, 1.0))[0] if parameter.unit else ANY
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " or ".join(name.replace("_", " ") for name in names)
+
+
+def _shown(parameter: Parameter, value: Value) -> str:
+    if isinstance(value, str):
+        return value.replace("_", " ")
+    return f"{value:.3g} {parameter.unit}".rstrip()

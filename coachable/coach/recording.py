@@ -1,0 +1,87 @@
+"""A coached session as JSON: the seed and what was asked when, which is enough to run it again exactly."""
+
+from __future__ import annotations
+
+import json
+import zlib
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+SCHEMA_VERSION = 1
+
+
+class ReplayMismatch(RuntimeError):
+    """A replay does not reach the recorded states."""
+
+
+@dataclass
+class Recording:
+    """A session since it was last seeded.
+
+    Attributes:
+        domain: name of the domain.
+        source: where the policy came from, as the user gave it.
+        seed: of the initial states.
+        style: request at the start, by parameter name.
+        controls: live controls at the start.
+        endless: whether time limits were ignored.
+        events: `{"step": k, ...}` in order, each applied before step k (from 0) with one of `style` (what changed),
+            `controls` (what changed) and `reset` (true).
+        steps: length.
+        checks: step and checksum of the observation after it, by which a replay notices that it differs.
+    """
+
+    domain: str
+    source: str
+    seed: int
+    style: dict[str, float | str]
+    controls: dict[str, float]
+    endless: bool = True
+    events: list[dict[str, Any]] = field(default_factory=list)
+    steps: int = 0
+    checks: list[tuple[int, int]] = field(default_factory=list)
+
+    def to_json(self) -> str:
+        """The recording as a JSON string; floats keep every bit."""
+        return json.dumps({"version": SCHEMA_VERSION, **asdict(self)}, indent=1, allow_nan=False)
+
+    @classmethod
+    def from_json(cls, text: str) -> Recording:
+        """Reads what `to_json` wrote.
+
+        Raises:
+            ValueError: if it is no recording, or one of another version.
+        """
+        try:
+            values = json.loads(text)
+            version = values.pop("version")
+        except (ValueError, AttributeError, KeyError, TypeError):
+            raise ValueError("this is no recording: expected JSON written by a coaching session") from None
+        if version != SCHEMA_VERSION:
+            raise ValueError(f"recording has schema version {version!r}: this release reads version {SCHEMA_VERSION}")
+        try:
+            recording = cls(**values)
+        except TypeError as error:
+            raise ValueError(f"this recording is incomplete or has unknown entries: {error}") from None
+        recording.checks = [(int(step), int(checksum)) for step, checksum in recording.checks]
+        return recording
+
+    def save(self, file: Path | str) -> Path:
+        """Writes the JSON file."""
+        file = Path(file)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(self.to_json(), encoding="utf-8")
+        return file
+
+    @classmethod
+    def load(cls, file: Path | str) -> Recording:
+        """Reads a JSON file; see `from_json`."""
+        return cls.from_json(Path(file).read_text(encoding="utf-8"))
+
+
+def checksum(observation: Tensor) -> int:
+    """Of every bit of an observation."""
+    return zlib.crc32(observation.detach().cpu().contiguous().numpy().tobytes())

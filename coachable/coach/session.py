@@ -1,0 +1,420 @@
+"""`CoachSession`: an agent that acts while somebody tells it how. Headless; the page and scripts are its clients."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+
+from coachable.coach.coaching import Coaching, coaching_of
+from coachable.coach.grammar import StyleGrammar, Understanding
+from coachable.coach.recording import Recording, ReplayMismatch, checksum
+from coachable.coach.report import MeasuredWindow, StyleReport
+from coachable.domain import Domain, load_domain
+from coachable.keys import STYLE
+from coachable.styles import Choice, StyleSpace
+from coachable.training.weights import load_policy
+from coachable.transforms import coachable_env
+
+TIME_IS_UP = "time is up"
+_CHECK_EVERY = 40  # steps
+_EXPLORATION = threading.Lock()  # the exploration type is global to the process, sessions may run in several threads
+
+
+class CoachSession:
+    """One agent in one environment, coached while it acts.
+
+    A request applies at the next observation: what `set` writes is what the policy sees in the following `step`. The
+    request stays in force through resets while `hold` is true; otherwise each episode draws a style as in training.
+    An episode that has ended is reset by the following `step`.
+
+    Args:
+        policy: reads `observation` and `style`, writes `action`.
+        space: the styles it was trained on.
+        domain: where it acts.
+        source: where the policy came from, kept in recordings.
+        seed: of the initial states and drawn styles.
+        style: first request, by parameter name; the space's default for those left out.
+        strict: raise for a request outside the trained range instead of clamping it with a warning.
+        endless: go on when the domain's time limit is reached.
+        window: length of the measured window [s].
+        coaching: live controls, words and presets; by default those of the domain.
+
+    Attributes:
+        env: the environment, of batch size 1.
+        presets: named styles, yours to extend.
+        grammar: reads the phrases of `say`.
+        hold: see above.
+        step_count: steps since the session was last seeded.
+
+    Example:
+        >>> session = CoachSession.open("humanoid", seed=1)
+        >>> session.set(pose="t_pose", step_length=0.5)
+        >>> transition = session.step()
+        >>> session.style["pose"]
+        't_pose'
+        >>> session.close()
+    """
+
+    def __init__(
+        self,
+        policy: TensorDictModuleBase,
+        space: StyleSpace,
+        domain: Domain,
+        *,
+        source: str = "",
+        seed: int = 0,
+        style: Mapping[str, float | str] | None = None,
+        strict: bool = False,
+        endless: bool = True,
+        window: float = 2.0,
+        coaching: Coaching | None = None,
+    ) -> None:
+        self.policy, self.space, self.domain, self.source = policy, space, domain, source
+        self.coaching = coaching_of(domain.name) if coaching is None else coaching
+        self.strict, self.endless, self.hold = strict, endless, True
+        self.env = coachable_env(domain.make_env(num_envs=1, num_threads=1), space, domain.make_reward(space))
+        self.presets: dict[str, dict[str, Any]] = {"default": space.describe(space.default)}
+        self.presets |= {name: dict(style) for name, style in self.coaching.presets.items()}
+        self._controls = {control.parameter.name: control for control in self.coaching.controls}
+        self._control_values = {name: cast(float, c.parameter.default) for name, c in self._controls.items()}
+        self.grammar = StyleGrammar(
+            [*space.parameters, *(control.parameter for control in self.coaching.controls)], self.coaching.vocabulary
+        )
+        self._understood: Understanding | None = None
+        self._window = MeasuredWindow(domain.measures, round(window / domain.control_step))
+        self._outside: dict[str, float] = {}
+        self._agenda: deque[tuple[int, dict[str, Any]]] = deque()
+        self._replayed: Recording | None = None
+        self._expected: dict[int, int] = {}
+        self._theta = space.make(strict=strict, **(style or {}))
+        self.reset(seed)
+
+    @classmethod
+    def open(cls, source: str | Path, **settings: Any) -> CoachSession:
+        """Opens a trained agent.
+
+        Args:
+            source: name of a domain that ships with weights, a run's folder, a checkpoint or a weights file.
+            **settings: as for the constructor.
+
+        Raises:
+            CheckpointError: if there is no such agent, or it is of another version.
+        """
+        agent = load_policy(source)
+        return cls(agent.actor, agent.space, load_domain(agent.metadata["domain"]), source=str(source), **settings)
+
+    # -- requests --------------------------------------------------------------------------------------------------
+
+    @property
+    def style(self) -> dict[str, float | str]:
+        """The request in force, by parameter name."""
+        return self.space.describe(self._theta)
+
+    @property
+    def controls(self) -> dict[str, float]:
+        """The live controls, such as the humanoid's course [deg]."""
+        return dict(self._control_values)
+
+    def set(self, **values: float | str) -> None:
+        """Asks for another style from the next observation on; what is not named stays as it is.
+
+        Args:
+            **values: a number per `Weight` or `Setpoint`, an option's name per `Choice`.
+
+        Raises:
+            ValueError: for an unknown name or option, NaN, or in strict mode a number outside the trained range. The
+                request in force then stays.
+        """
+        theta = self.space.make(strict=self.strict, **(self.style | values))
+        self._stop_replay()
+        outside = {name: value for name, value in values.items() if self._is_outside(name, value)}
+        self._outside = {k: v for k, v in self._outside.items() if k not in values} | cast(dict[str, float], outside)
+        self._request(theta)
+
+    def apply(self, preset: str) -> None:
+        """Asks for a preset.
+
+        Raises:
+            ValueError: if there is none of that name.
+        """
+        if preset not in self.presets:
+            raise ValueError(f"no preset named {preset!r}: expected one of {list(self.presets)}")
+        self.set(**self.presets[preset])
+
+    def steer(self, **values: float) -> None:
+        """Sets live controls from the next step on; a circular one wraps around, others stop at their ends.
+
+        Raises:
+            ValueError: for an unknown control or NaN.
+        """
+        for name in values:
+            if name not in self._controls:
+                raise ValueError(f"no live control named {name!r}: {self.domain.name} has {list(self._controls)}")
+        fitted = {name: self._controls[name].fit(float(value)) for name, value in values.items()}
+        self._stop_replay()
+        self._apply({"controls": fitted})
+
+    def say(self, phrase: str) -> Understanding:
+        """Asks in words: "shorter steps, arms up", "0.4 m", "a bit more", or a preset's name.
+
+        Returns:
+            What was understood, and what was not. Only what was understood is asked for.
+
+        Raises:
+            ValueError: in strict mode, for a number outside the trained range.
+        """
+        preset = next((name for name in self.presets if name.lower() == phrase.strip().lower()), None)
+        if preset is not None:
+            self.apply(preset)
+            return Understanding(phrase, dict(self.presets[preset]), (f"preset {preset}",), ())
+        understood = self.grammar.read(phrase, self.style | self.controls, self._understood)
+        style = {name: value for name, value in understood.changes.items() if name in self.space}
+        controls = {name: float(value) for name, value in understood.changes.items() if name in self._controls}
+        if style:
+            self.set(**style)
+        if controls:
+            self.steer(**controls)
+        self._understood = understood
+        return understood
+
+    def schedule(self, plan: Mapping[float, Mapping[str, float | str] | str]) -> None:
+        """Asks for styles at given times from now on [s], each a style or a preset's name; replaces an earlier plan.
+
+        Raises:
+            ValueError: for a negative time or a style that `set` would refuse; nothing is scheduled then.
+        """
+        agenda = []
+        for seconds, style in sorted(plan.items()):
+            if not 0.0 <= seconds < math.inf:
+                raise ValueError(f"the plan has the time {seconds}: expected seconds from now on, 0 or more")
+            if isinstance(style, str) and style not in self.presets:
+                raise ValueError(f"no preset named {style!r}: expected one of {list(self.presets)}")
+            values = self.presets[style] if isinstance(style, str) else dict(style)
+            theta = self.space.make(strict=self.strict, **(self.style | values))
+            request = {name: value for name, value in self.space.describe(theta).items() if name in values}
+            agenda.append((self.step_count + round(seconds / self.domain.control_step), {"style": request}))
+        self._stop_replay()
+        self._agenda = deque(agenda)
+
+    @property
+    def scheduled(self) -> int:
+        """Number of requests that are still to come, of a plan or a replay."""
+        return len(self._agenda)
+
+    def cancel(self) -> None:
+        """Drops the rest of a plan or replay; the request in force stays."""
+        self._stop_replay()
+        self._agenda.clear()
+
+    # -- acting ----------------------------------------------------------------------------------------------------
+
+    def reset(self, seed: int | None = None) -> None:
+        """Starts a new episode; with a seed the session starts over, and with it the recording.
+
+        Style and live controls stay; a plan is dropped.
+        """
+        self.cancel()
+        if seed is None:
+            self._apply({"reset": True})
+            return
+        self.step_count = 0
+        self._steps_at_request = 0
+        self._complied_at: int | None = None
+        self._episode, self._endings = 0, Counter[str]()
+        self._generator = torch.Generator().manual_seed(seed)
+        self._recording = Recording(
+            self.domain.name, self.source, seed, self.style, self.controls, endless=self.endless
+        )
+        self.env.set_seed(seed)
+        self._steer_env()
+        self._begin_episode()
+
+    @torch.no_grad()
+    def step(self) -> TensorDictBase:
+        """One control step under the request in force.
+
+        Returns:
+            The transition, batch shape (1,), as `env.step` gives it.
+
+        Raises:
+            ReplayMismatch: if a replay differs from its recording; a further `step` goes on without checking.
+        """
+        while self._agenda and self._agenda[0][0] <= self.step_count:
+            self._apply(self._agenda.popleft()[1])
+        if self.ended is not None:
+            self._begin_episode(draw=not self.hold and self._replayed is None)
+        with _deterministic():
+            action = self.policy(self._current.set(STYLE, self._theta[None]))
+        transition = self.env.step(action)
+        self.step_count += 1
+        self._episode_steps += 1
+        after = transition.get("next")
+        self._window.add(transition)
+        if self._complied_at is None and self._window.complies(self.step_count - self._steps_at_request):
+            self._complied_at = self.step_count
+        if after.get("terminated").any():
+            self.ended = self.coaching.terminated
+        elif after.get("done").any() and not self.endless:
+            self.ended = TIME_IS_UP
+        if self.ended is not None:
+            self._endings[self.ended] += 1
+        self._current = step_mdp(transition)
+        self._check()
+        return transition
+
+    def run(self, seconds: float, on_step: Callable[[CoachSession], None] | None = None) -> None:
+        """Steps for so long, in simulated time [s]."""
+        for _ in range(round(seconds / self.domain.control_step)):
+            self.step()
+            if on_step is not None:
+                on_step(self)
+
+    # -- measuring -------------------------------------------------------------------------------------------------
+
+    def report(self) -> StyleReport:
+        """Requested against measured style over the window, which begins anew with each episode."""
+        return StyleReport(
+            requested=self.style,
+            measured=self._window.summary(),
+            outside=dict(self._outside),
+            complied_after=None if self._complied_at is None else self._seconds(self._complied_at),
+            since_request=self._seconds(self.step_count),
+            episode=self._episode,
+            episode_time=self._episode_steps * self.domain.control_step,
+            ended=self.ended,
+            endings=dict(self._endings),
+        )
+
+    @property
+    def base_env(self) -> EnvBase:
+        """The domain's own environment, below the transforms."""
+        env: EnvBase = self.env
+        while isinstance(env, TransformedEnv):
+            env = env.base_env
+        return env
+
+    def close(self) -> None:
+        """Releases the environment."""
+        if not self.env.is_closed:
+            self.env.close()
+
+    # -- recording -------------------------------------------------------------------------------------------------
+
+    def recording(self) -> Recording:
+        """What happened since the session was last seeded, as a copy."""
+        copy = Recording.from_json(self._recording.to_json())
+        copy.steps = self.step_count
+        if self.step_count:
+            copy.checks.append((self.step_count, checksum(self._current.get("observation"))))
+        return copy
+
+    def replay(self, recording: Recording) -> None:
+        """Starts over as recorded; the following `recording.steps` steps repeat the session bit for bit.
+
+        Any request, steering or reset in between takes over from the replay.
+
+        Raises:
+            ValueError: if the recording belongs to another domain or style space.
+        """
+        if recording.domain != self.domain.name:
+            raise ValueError(f"the recording belongs to {recording.domain!r}, this session to {self.domain.name!r}")
+        self._theta, self._outside = self.space.make(strict=True, **recording.style), {}
+        self._control_values = {name: recording.controls.get(name, v) for name, v in self._control_values.items()}
+        self.endless = recording.endless
+        self.reset(recording.seed)
+        self._agenda = deque((event["step"], event) for event in recording.events)
+        self._replayed, self._expected = recording, dict(recording.checks)
+
+    @property
+    def replaying(self) -> bool:
+        """Whether a replay is under way; false after its last step."""
+        return self._replayed is not None
+
+    # -- inside ----------------------------------------------------------------------------------------------------
+
+    def _apply(self, event: Mapping[str, Any]) -> None:
+        """Carries out an event now, and records it."""
+        if "style" in event:
+            self._outside = {}
+            self._request(self.space.make(**(self.style | event["style"])))
+        if "controls" in event:
+            self._control_values |= event["controls"]
+            self._steer_env()
+            self._log({"controls": dict(event["controls"])})
+        if "reset" in event:
+            self._log({"reset": True})
+            self._begin_episode(draw=not self.hold and self._replayed is None)
+
+    def _request(self, theta: Tensor) -> None:
+        before = self.style
+        self._theta = theta
+        changed = {name: value for name, value in self.style.items() if value != before[name]}
+        if changed:
+            self._steps_at_request, self._complied_at = self.step_count, None
+            self._log({"style": changed})
+
+    def _log(self, event: dict[str, Any]) -> None:
+        self._recording.events.append({"step": self.step_count, **event})
+
+    def _begin_episode(self, draw: bool = False) -> None:
+        if draw:
+            self._request(self.space.sample((), self._generator))
+        self._current = self.env.reset(TensorDict({STYLE: self._theta[None]}, [1]))
+        self._window.clear()
+        self._episode += 1
+        self._episode_steps = 0
+        self.ended: str | None = None
+
+    def _steer_env(self) -> None:
+        for name, value in self._control_values.items():
+            self._controls[name].apply(self.base_env, value)
+
+    def _is_outside(self, name: str, value: float | str) -> bool:
+        parameter = self.space[name]
+        if isinstance(parameter, Choice):
+            return False
+        return not np.float32(parameter.low) <= np.float32(value) <= np.float32(parameter.high)
+
+    def _seconds(self, step: int) -> float:
+        return (step - self._steps_at_request) * self.domain.control_step
+
+    def _check(self) -> None:
+        """Notes a checksum now and then, and compares it with that of a replayed recording."""
+        step, due = self.step_count, self._expected.pop(self.step_count, None)
+        if due is None and step % _CHECK_EVERY:
+            return
+        found = checksum(self._current.get("observation"))
+        if step % _CHECK_EVERY == 0:
+            self._recording.checks.append((step, found))
+        if due is not None and due != found:
+            self._expected = {}
+            raise ReplayMismatch(
+                f"the replay differs from the recording at step {step}: it was made with other weights than those of "
+                f"{self.source!r}, with other versions, or on another processor"
+            )
+        if self._replayed is not None and step >= self._replayed.steps:
+            self._replayed = None
+
+    def _stop_replay(self) -> None:
+        if self._replayed is not None:
+            self._agenda.clear()
+            self._replayed, self._expected = None, {}
+
+
+@contextmanager
+def _deterministic() -> Iterator[None]:
+    with _EXPLORATION, set_exploration_type(ExplorationType.DETERMINISTIC):
+        yield

@@ -1,0 +1,303 @@
+"""The coaching session: when requests act, what is measured, and exact replays."""
+
+import json
+import math
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+
+from coachable.coach.recording import Recording, ReplayMismatch
+from coachable.coach.session import TIME_IS_UP, CoachSession
+from coachable.keys import STYLE
+from coachable.styles import StyleRangeWarning
+from coachable.training.checkpoint import CheckpointError
+from tests.coach.echo_domain import echo_session
+
+
+@pytest.fixture
+def session():
+    session = echo_session(seed=3)
+    yield session
+    session.close()
+
+
+def test_a_request_acts_at_the_next_observation(session):
+    session.set(target=0.25)
+    first = session.step()
+    assert first[STYLE][0, 0] == 0.25
+    assert first["action"].item() == 0.25
+    session.set(target=-0.5, mood="wild_card")
+    assert first[STYLE][0, 0] == 0.25, "the transition before keeps its style"
+    second = session.step()
+    assert second["observation"].equal(first["next", "observation"])
+    assert second["action"].item() == -0.5
+    assert session.style == {"target": -0.5, "mood": "wild_card", "fire": 0.0}
+
+
+def test_outside_the_trained_range_is_clamped_with_a_warning_and_flagged(session):
+    with pytest.warns(StyleRangeWarning, match=r"target = 1.5 m lies outside \[-0.8, 0.8\] m"):
+        session.set(target=1.5)
+    assert session.style["target"] == pytest.approx(0.8)
+    assert session.report().outside == {"target": 1.5}
+    session.set(fire=1.0)
+    assert session.report().outside == {"target": 1.5}
+    session.set(target=0.8)
+    assert session.report().outside == {}
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"target": math.nan}, "NaN"),
+        ({"speed": 1.0}, "unknown style parameter 'speed'"),
+        ({"mood": "angry"}, "no option"),
+        ({"target": "fast"}, "is no number"),
+    ],
+)
+def test_a_bad_request_changes_nothing(session, values, message):
+    before = session.style
+    with pytest.raises(ValueError, match=message):
+        session.set(**values)
+    assert session.style == before
+    assert session.recording().events == []
+
+
+def test_strict_sessions_refuse():
+    session = echo_session(strict=True)
+    with pytest.raises(ValueError, match="lies outside"):
+        session.set(target=0.9)
+    with pytest.raises(ValueError, match="lies outside"):
+        session.schedule({0.0: {"target": 0.9}})
+    assert session.style["target"] == 0.0 and session.scheduled == 0
+
+
+def test_measured_beside_requested(session):
+    session.set(target=0.5)
+    session.run(0.5)
+    report = session.report()
+    assert report.requested["target"] == 0.5
+    assert report.measured == {"task_reward": 0.0, "target": 0.5, "pace": 0.5}
+    assert report.complied_after == pytest.approx(0.05)
+    assert report.since_request == pytest.approx(0.5)
+
+
+def test_compliance_counts_from_the_latest_request(session):
+    session.run(0.2)
+    stubborn = TensorDictModule(lambda style: torch.zeros_like(style[..., :1]), in_keys=[STYLE], out_keys=["action"])
+    session.policy = stubborn
+    session.set(target=0.5)
+    session.run(0.2)
+    assert session.report().complied_after is None
+    session.set(target=0.0)
+    session.step()
+    assert session.report().complied_after == pytest.approx(0.05)
+
+
+def run_until_ended(session: CoachSession) -> None:
+    session.set(target=0.8)
+    while session.ended is None:
+        session.step()
+
+
+def test_an_ended_episode_is_reset_by_the_next_step(session):
+    run_until_ended(session)
+    assert session.report().endings == {"ended": 1}
+    assert session.report().episode == 1
+    session.step()
+    report = session.report()
+    assert report.ended is None and report.episode == 2
+    assert report.episode_time == pytest.approx(0.05)
+    assert report.requested["target"] == pytest.approx(0.8), "the request is held"
+
+
+def test_without_hold_each_episode_draws_a_style(session):
+    session.hold = False
+    run_until_ended(session)
+    session.step()
+    assert session.style["target"] != pytest.approx(0.8)
+    assert session.recording().events[-1]["style"]["target"] == session.style["target"]
+
+
+def test_time_limits_are_ignored_unless_wanted(session):
+    session.set(target=0.0)
+    limited = echo_session(seed=3, endless=False)
+    reasons = set()
+    for _ in range(60):
+        limited.step()
+        reasons.add(limited.ended)
+    assert TIME_IS_UP in reasons
+    while session.ended is None and session.step_count < 60:
+        session.step()
+    assert session.ended != TIME_IS_UP
+    assert TIME_IS_UP not in session.report().endings
+
+
+def test_schedules(session):
+    session.presets["sprint"] = {"target": 0.75, "fire": 1.0}
+    session.step()
+    session.schedule({0.1: {"target": 0.25}, 0.2: "sprint", 0.0: {"mood": "wild_card"}})
+    assert session.scheduled == 3
+    seen = []
+    for _ in range(6):
+        session.step()
+        seen.append((session.style["target"], session.style["mood"], session.style["fire"]))
+    assert seen == [(0.0, "wild_card", 0.0)] * 2 + [(0.25, "wild_card", 0.0)] * 2 + [(0.75, "wild_card", 1.0)] * 2
+    session.schedule({1.0: {"target": 0.0}})
+    session.cancel()
+    assert session.scheduled == 0
+    for plan, message in [({-1.0: {}}, "time -1"), ({0.0: "walk"}, "no preset named 'walk'"), ({0.0: {"x": 1}}, "'x'")]:
+        with pytest.raises(ValueError, match=message):
+            session.schedule(plan)
+
+
+def test_phrases_and_presets(session):
+    understood = session.say("wild card, target 0.3 m, sing")
+    assert session.style["mood"] == "wild_card" and session.style["target"] == pytest.approx(0.3)
+    assert understood.failed == ("'sing' (unknown: sing)",)
+    session.say("a bit more")
+    assert session.style["target"] == pytest.approx(0.46)  # a tenth of the range, upwards as before
+    assert session.say("Default").said == ("preset default",)
+    assert session.style == {"target": 0.0, "mood": "calm", "fire": 0.0}
+    with pytest.raises(ValueError, match="no preset named 'jog'"):
+        session.apply("jog")
+
+
+def coached(session: CoachSession) -> list[torch.Tensor]:
+    """A session with everything that can happen; the states after each step."""
+    states = []
+
+    def note(session: CoachSession) -> None:
+        states.append(session.base_env.simulator_state()["position"].clone())
+
+    session.set(target=0.1)
+    session.run(0.5, note)
+    session.set(target=1 / 3, mood="wild_card")
+    session.run(2.0, note)
+    session.reset()
+    session.hold = False
+    session.run(1.5, note)
+    session.schedule({0.1: {"target": -0.7}, 0.5: "default"})
+    session.run(3.0, note)
+    return states
+
+
+def test_a_replay_repeats_every_bit(session, tmp_path):
+    states = coached(session)
+    recording = session.recording()
+    assert recording.steps == len(states) == 140
+    file = recording.save(tmp_path / "session.json")
+    fresh = echo_session(seed=99)
+    fresh.replay(Recording.load(file))
+    for state in states:
+        assert fresh.replaying
+        fresh.step()
+        assert fresh.base_env.simulator_state()["position"].equal(state)
+    assert not fresh.replaying
+    assert fresh.recording() == recording
+
+
+def test_a_replay_in_the_same_session(session):
+    states = coached(session)
+    session.replay(session.recording())
+    for state in states:
+        session.step()
+        assert session.base_env.simulator_state()["position"].equal(state)
+
+
+def test_a_request_takes_over_from_a_replay(session):
+    coached(session)
+    recording = session.recording()
+    session.replay(recording)
+    session.step()
+    session.set(target=0.0)
+    assert not session.replaying and session.scheduled == 0
+    session.run(1.0)
+    assert session.style["target"] == 0.0
+
+
+def test_a_replay_with_other_weights_is_noticed(session):
+    coached(session)
+    recording = session.recording()
+    other = echo_session()
+    other.policy = TensorDictModule(lambda style: style[..., :1] * 0.5, in_keys=[STYLE], out_keys=["action"])
+    other.replay(recording)
+    with pytest.raises(ReplayMismatch, match="differs from the recording at step 40"):
+        other.run(7.0)
+    other.step()
+
+
+def test_bad_recordings(session):
+    good = json.loads(session.recording().to_json())
+    for change, message in [
+        ({"version": 2}, "schema version 2"),
+        ({"colour": 1}, "unknown entries"),
+        ({"domain": "racing"}, "belongs to 'racing'"),
+        ({"style": {"speed": 1.0}}, "unknown style parameter 'speed'"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            session.replay(Recording.from_json(json.dumps(good | change)))
+    for text in ("", "[1]", "{}", "nonsense"):
+        with pytest.raises(ValueError, match="no recording"):
+            Recording.from_json(text)
+
+
+def test_seeding_starts_over(session):
+    first = [session.step()["next", "observation"] for _ in range(5)]
+    session.reset(seed=3)
+    assert session.step_count == 0 and session.recording().events == []
+    second = [session.step()["next", "observation"] for _ in range(5)]
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+def test_a_missing_agent():
+    with pytest.raises(CheckpointError, match="no checkpoint at nowhere"):
+        CoachSession.open("nowhere")
+
+
+@pytest.fixture(scope="module")
+def humanoid():
+    session = CoachSession.open("humanoid", seed=1)
+    yield session
+    session.close()
+
+
+class TestHumanoid:
+    def test_it_acts_and_is_measured(self, humanoid):
+        humanoid.reset(seed=1)
+        humanoid.say("T-pose, 0.5 m")
+        humanoid.run(1.0)
+        report = humanoid.report()
+        assert report.requested == {"pose": "t_pose", "step_length": 0.5}
+        assert {"forward_speed", "pose_held"} <= set(report.measured)
+
+    def test_the_course_turns_and_wraps_around(self, humanoid):
+        humanoid.reset(seed=1)
+        humanoid.steer(course=190.0)
+        assert humanoid.controls == {"course": -170.0}
+        assert humanoid.base_env.course[0] == pytest.approx(math.radians(-170.0))
+        humanoid.say("turn left by 30 degrees")
+        assert humanoid.controls == {"course": -140.0}
+        for bad, message in [({"course": math.nan}, "course = nan"), ({"altitude": 1.0}, "no live control named")]:
+            with pytest.raises(ValueError, match=message):
+                humanoid.steer(**bad)
+
+    def test_a_replay_repeats_every_bit(self, humanoid):
+        humanoid.reset(seed=5)
+        humanoid.steer(course=0.0)
+        humanoid.reset(seed=5)
+        states = []
+
+        def note(session):
+            states.append(session.base_env.simulator_state()["state"])
+
+        humanoid.run(0.5, note)
+        humanoid.set(pose="arms_up", step_length=0.6)
+        humanoid.steer(course=30.0)
+        humanoid.run(1.5, note)
+        recording = Recording.from_json(humanoid.recording().to_json())
+        humanoid.steer(course=77.0)
+        humanoid.replay(recording)
+        for state in states:
+            humanoid.step()
+            assert humanoid.base_env.simulator_state()["state"].equal(state)
