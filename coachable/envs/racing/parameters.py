@@ -1,0 +1,193 @@
+"""Parameters of cars, tyre compounds and resources."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from dataclasses import dataclass, fields, replace
+from importlib.resources import files
+from typing import Any
+
+import torch
+from torch import Tensor
+
+CARS = ("gt3", "x2019", "street")
+MAX_GEARS = 8
+
+COMPOUNDS = tuple(
+    f"{kind}_{hardness}" for kind in ("comfort", "sport", "race") for hardness in ("hard", "medium", "soft")
+)
+RACE_COMPOUNDS = (6, 7, 8)  # indices into COMPOUNDS
+_KIND_GRIP = {"comfort": 0.70, "sport": 0.83, "race": 1.0}  # estimate
+_HARDNESS = {"hard": (0.95, 0.7), "medium": (1.0, 1.0), "soft": (1.04, 1.6)}  # grip, wear; estimate
+
+_DEGREES = ("peak_slip_angle", "steer_max", "steer_rate")
+
+
+@dataclass(frozen=True)
+class Car:
+    """One car, or many: each field is a number, or a tensor (N,) with one value per car.
+
+    Units are SI; angles in radians (the data files have degrees), `grip_per_load` in 1/kN, engine speeds in rpm. What
+    each field means is written in the data files, `coachable/envs/racing/cars/*.toml`. `gears` has eight ratios, the
+    last repeated, and `top_gear` counts the real ones.
+    """
+
+    mass: Any
+    yaw_inertia: Any
+    front_axle: Any
+    rear_axle: Any
+    cg_height: Any
+    track_front: Any
+    track_rear: Any
+    roll_share_front: Any
+    length: Any
+    width: Any
+    drag_area: Any
+    lift_area: Any
+    aero_share_front: Any
+    rolling_resistance: Any
+    wheel_radius: Any
+    wheel_inertia_front: Any
+    wheel_inertia_rear: Any
+    grip: Any
+    grip_per_load: Any
+    reference_load: Any
+    peak_slip_ratio: Any
+    peak_slip_angle: Any
+    shape: Any
+    power: Any
+    torque: Any
+    engine_brake: Any
+    engine_inertia: Any
+    rpm_idle: Any
+    rpm_max: Any
+    efficiency: Any
+    final_drive: Any
+    drive_share_front: Any
+    brake_torque: Any
+    brake_share_front: Any
+    steer_max: Any
+    steer_rate: Any
+    gears: tuple[Any, ...]
+    top_gear: Any
+
+    def pack(self, dtype: torch.dtype = torch.float32) -> Tensor:
+        """All numbers of one car in one tensor (P,), gears last but one; the inverse is `unpack`."""
+        scalars = [getattr(self, name) for name in _SCALARS]
+        return torch.tensor([*scalars, *self.gears, self.top_gear], dtype=dtype)
+
+    @classmethod
+    def unpack(cls, packed: Tensor) -> Car:
+        """Cars from a tensor (P, N): every field becomes a tensor (N,)."""
+        rows = packed.unbind(0)
+        count = len(_SCALARS)
+        named = dict(zip(_SCALARS, rows[:count], strict=True))
+        return cls(**named, gears=tuple(rows[count : count + MAX_GEARS]), top_gear=rows[-1])
+
+
+_SCALARS = tuple(f.name for f in fields(Car) if f.name not in ("gears", "top_gear"))
+
+
+def load_car(name: str) -> Car:
+    """One of the shipped cars.
+
+    Args:
+        name: "gt3", "x2019" or "street".
+
+    Raises:
+        ValueError: if there is no such car.
+
+    Example:
+        >>> load_car("gt3").mass
+        1320.0
+    """
+    if name not in CARS:
+        raise ValueError(f"unknown car {name!r}: expected one of {', '.join(CARS)}")
+    table = tomllib.loads((files("coachable.envs.racing") / "cars" / f"{name}.toml").read_text())
+    values = {key: entry["value"] for key, entry in table.items()}
+    for key in _DEGREES:
+        values[key] = math.radians(values[key])
+    gears = values.pop("gears")
+    return Car(**values, gears=tuple(gears + gears[-1:] * (MAX_GEARS - len(gears))), top_gear=float(len(gears)))
+
+
+def compound_index(name: str) -> int:
+    """Index of a tyre compound in `COMPOUNDS`.
+
+    Raises:
+        ValueError: if there is no such compound.
+    """
+    if name not in COMPOUNDS:
+        raise ValueError(f"unknown tyre compound {name!r}: expected one of {', '.join(COMPOUNDS)}")
+    return COMPOUNDS.index(name)
+
+
+def compound_table() -> Tensor:
+    """Grip and wear factors of each compound, (9, 2)."""
+    rows = []
+    for name in COMPOUNDS:
+        kind, hardness = name.split("_")
+        grip, wear = _HARDNESS[hardness]
+        rows.append([_KIND_GRIP[kind] * grip, wear])
+    return torch.tensor(rows)
+
+
+@dataclass(frozen=True)
+class Resources:
+    """How fast tyres wear and fuel burns; 0 switches either off.
+
+    Attributes:
+        wear: multiple of the physical wear rate, k_wear.
+        fuel: multiple of the physical fuel rate, k_fuel.
+        fuel_exponent: n of the fuel law: 1 is physical, 2.5 is the game-like law that rewards part throttle.
+    """
+
+    wear: float = 0.0
+    fuel: float = 0.0
+    fuel_exponent: float = 2.5
+
+
+def car_pool(count: int = 530, seed: int = 0, archetype: str | None = None) -> Tensor:
+    """Packed parameters (P, count) of a seeded pool of different cars (our choice, for the paper's 530).
+
+    Six archetypes (GT3, open wheel and street car, and the GT3 car with front-, all-wheel drive and mid engine) are
+    perturbed in mass, power, torque, centre of gravity, grip and aerodynamics. The first 50 are GT3-like.
+
+    Args:
+        count: number of cars.
+        seed: of the perturbations.
+        archetype: use only this shipped car as the archetype.
+    """
+    gt3 = load_car("gt3")
+    archetypes = [
+        gt3,
+        load_car("x2019"),
+        load_car("street"),
+        replace(gt3, drive_share_front=1.0, front_axle=1.05, rear_axle=1.60, power=300e3, torque=430.0, lift_area=1.2),
+        replace(gt3, drive_share_front=0.4, mass=1420.0, power=430e3, torque=600.0, lift_area=1.4),
+        replace(gt3, front_axle=1.50, rear_axle=1.15, mass=1250.0, yaw_inertia=1700.0),
+    ]
+    if archetype is not None:
+        archetypes = [load_car(archetype)]
+    generator = torch.Generator().manual_seed(seed)
+    columns = []
+    for index in range(count):
+        kind = 0 if index < 50 or len(archetypes) == 1 else index % len(archetypes)
+        base = archetypes[kind]
+        mass, power, grip, lift, drag, shift = (1 + 0.08 * (2 * torch.rand(6, generator=generator) - 1)).tolist()
+        moved = (shift - 1) * (base.front_axle + base.rear_axle) / 2
+        car = replace(
+            base,
+            mass=base.mass * mass,
+            yaw_inertia=base.yaw_inertia * mass,
+            power=base.power * power,
+            torque=base.torque * power,
+            grip=base.grip * grip,
+            lift_area=base.lift_area * lift,
+            drag_area=base.drag_area * drag,
+            front_axle=base.front_axle + moved,
+            rear_axle=base.rear_axle - moved,
+        )
+        columns.append(car.pack())
+    return torch.stack(columns, dim=1)
