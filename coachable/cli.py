@@ -84,6 +84,16 @@ def _parser() -> argparse.ArgumentParser:
     weights.add_argument("out", type=Path, help="the file, such as coachable/pretrained/humanoid/weights.pt")
     weights.set_defaults(run=_weights)
 
+    explain = commands.add_parser("explain", help="rank the inputs that the agent listens to, by SHAP and saliency")
+    explain.add_argument("source", help=_SOURCE_HELP)
+    explain.add_argument("--out", type=Path, default=Path("explanation"), help="folder (default: %(default)s)")
+    explain.add_argument("--episodes", type=int, default=100, help="trajectories (default: %(default)s)")
+    explain.add_argument("--states", type=int, default=16, help="of each trajectory (default: %(default)s)")
+    explain.add_argument("--steps", type=int, help="length of an episode (default: the domain's)")
+    explain.add_argument("--seed", type=int, default=0)
+    explain.add_argument("--threads", type=int, dest="num_threads", help="physics threads (default: all free cores)")
+    explain.set_defaults(run=_explain)
+
     export = commands.add_parser("export", help="write the policy as one ONNX file, to run it without torch")
     export.add_argument("source", help=_SOURCE_HELP)
     export.add_argument("--out", type=Path, default=Path("policy.onnx"), help="(default: %(default)s)")
@@ -126,6 +136,13 @@ def _weights(options: argparse.Namespace) -> int:
 
     file = export_weights(options.source, options.out)
     print(f"wrote {file} ({file.stat().st_size / 1e6:.1f} MB)")
+    return 0
+
+
+def _explain(options: argparse.Namespace) -> int:
+    from coachable.evaluation.explain import explain
+
+    print(explain(options.source, **_arguments(options, without=("source",))))
     return 0
 
 

@@ -1,0 +1,159 @@
+"""How much each group of inputs moves a policy's action, by saliency and SHAP."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from coachable.domain import Domain
+from coachable.styles import StyleSpace
+from coachable.training.rng import preserved_rng, seed_everything
+
+__all__ = ["METHODS", "Group", "Ranking", "import_captum", "input_groups", "rank_groups"]
+
+METHODS = ("SHAP", "saliency")
+_SHAP_DRAWS = 8  # baselines per state
+_CHUNK = 256  # states per pass
+
+
+@dataclass(frozen=True)
+class Group:
+    """Inputs that are ranked together.
+
+    Attributes:
+        name: "joint_angles", or "style: pose".
+        columns: of the network's input, `cat(observation, encode(theta))`.
+        is_style: whether the coach sets them.
+    """
+
+    name: str
+    columns: slice
+    is_style: bool
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """Importance of each group by one method.
+
+    Attributes:
+        method: "SHAP" or "saliency".
+        groups: the most important first.
+        means: (G,) mean over trajectories.
+        deviations: (G,) standard deviation over trajectories.
+    """
+
+    method: str
+    groups: tuple[Group, ...]
+    means: np.ndarray
+    deviations: np.ndarray
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One row per group."""
+        return [
+            {
+                "method": self.method,
+                "rank": rank,
+                "group": group.name,
+                "kind": "style" if group.is_style else "observation",
+                "mean": float(mean),
+                "std": float(deviation),
+            }
+            for rank, (group, mean, deviation) in enumerate(
+                zip(self.groups, self.means, self.deviations, strict=True), start=1
+            )
+        ]
+
+
+def input_groups(domain: Domain, space: StyleSpace, observation_dim: int) -> list[Group]:
+    """The domain's observation groups, or every entry on its own, and the style parameters.
+
+    Raises:
+        ValueError: if the widths do not add up to the observation's.
+    """
+    named = list(domain.observation_groups) or [(f"observation {i}", 1) for i in range(observation_dim)]
+    covered = sum(width for _, width in named)
+    if covered != observation_dim:
+        raise ValueError(
+            f"observation_groups of domain {domain.name!r} cover {covered} entries, the policy observes "
+            f"{observation_dim}: correct them where the Domain is declared"
+        )
+    groups, first = [], 0
+    for name, width in named:
+        groups.append(Group(name, slice(first, first + width), is_style=False))
+        first += width
+    for name, columns in space.slices.items():
+        groups.append(Group(f"style: {name}", slice(first + columns.start, first + columns.stop), is_style=True))
+    return groups
+
+
+def rank_groups(
+    outputs: Callable[[Tensor], Tensor],
+    trajectories: Sequence[Tensor],
+    groups: Sequence[Group],
+    *,
+    seed: int = 0,
+    progress: bool = True,
+) -> list[Ranking]:
+    """Importance of each group for the outputs, by SHAP and by saliency.
+
+    Saliency (Simonyan et al. 2014): mean of |d output / d input| over a group's entries and over the outputs; how much
+    a small change of an input changes the action. SHAP (Lundberg and Lee 2017), estimated by expected gradients with
+    the recorded states as baselines: a group's contribution is the sum over its entries of how far they moved the
+    output from its mean, absolute, averaged over the outputs. Both are averaged along each trajectory first; the paper
+    does not say how it pools entries and outputs.
+
+    Args:
+        outputs: (B, D) to (B, outputs), differentiable.
+        trajectories: (S, D) each.
+        groups: of the D columns.
+        seed: of the baselines.
+        progress: show a bar.
+
+    Returns:
+        A ranking per method, in the order of `METHODS`.
+    """
+    attr = import_captum()
+    states = torch.cat(list(trajectories))
+    with torch.no_grad():
+        count = outputs(states[:1]).shape[-1]
+    saliency, shap = attr.Saliency(outputs), attr.GradientShap(outputs)
+    totals = {method: np.zeros((len(states), len(groups))) for method in METHODS}
+    jobs = [(target, first) for target in range(count) for first in range(0, len(states), _CHUNK)]
+    with preserved_rng():
+        seed_everything(seed)  # captum draws from the global generators
+        for target, first in tqdm(jobs, desc="attributing", disable=None if progress else True, leave=False):
+            rows = slice(first, first + _CHUNK)
+            gradients = saliency.attribute(states[rows].clone().requires_grad_(), target=target, abs=True)
+            totals["saliency"][rows] += _per_group(gradients, groups, Tensor.mean)
+            contributions = shap.attribute(
+                states[rows].clone(), baselines=states, n_samples=_SHAP_DRAWS, stdevs=0.0, target=target
+            )
+            totals["SHAP"][rows] += np.abs(_per_group(contributions, groups, Tensor.sum))
+    ends = np.cumsum([len(trajectory) for trajectory in trajectories])[:-1]
+    rankings = []
+    for method, total in totals.items():
+        means = np.array([part.mean(0) for part in np.split(total / count, ends)])  # (trajectories, groups)
+        order = np.argsort(-means.mean(0), kind="stable")
+        ranked = tuple(groups[i] for i in order)
+        rankings.append(Ranking(method, ranked, means.mean(0)[order], means.std(0)[order]))
+    return rankings
+
+
+def _per_group(values: Tensor, groups: Sequence[Group], pool: Callable[..., Tensor]) -> np.ndarray:
+    values = values.detach()
+    return torch.stack([pool(values[:, group.columns], dim=-1) for group in groups], -1).double().numpy()
+
+
+def import_captum() -> Any:
+    """`captum.attr`, or an ImportError that names the extra to install."""
+    try:
+        import captum.attr
+    except ImportError as error:
+        raise ImportError(f"{error.name} is missing: pip install 'coachable[explain]'") from error
+    return captum.attr

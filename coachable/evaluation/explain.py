@@ -1,0 +1,194 @@
+"""`coachable explain`: which inputs the policy listens to, as the paper's tables (Appendix D)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+from coachable.domain import Domain, load_domain
+from coachable.evaluation.attribution import Ranking, import_captum, input_groups, rank_groups
+from coachable.evaluation.figures import readable
+from coachable.evaluation.rollouts import record_episodes
+from coachable.evaluation.style_grid import markdown_table, write_csv
+from coachable.networks.plain import ActionOutputs
+from coachable.styles import StyleSpace
+from coachable.training.weights import load_policy
+from coachable.transforms import coachable_env
+
+__all__ = ["explain", "record_states"]
+
+_SHOWN = 30  # rows of the paper's tables
+_BARS = 20
+_RECORDED = 250  # states kept of an episode, from which `states` are chosen
+
+
+def explain(
+    source: str | Path,
+    out: Path,
+    *,
+    episodes: int = 100,
+    states: int = 16,
+    steps: int | None = None,
+    seed: int = 0,
+    num_threads: int | None = None,
+    progress: bool = True,
+) -> str:
+    """Rank the inputs of a policy over states of its own episodes; write `explain.csv`, `explain.md`, `explain.png`.
+
+    Args:
+        source: checkpoint, run folder, weights file, or the name of a domain that ships with weights.
+        out: folder for the results, created if missing.
+        episodes: trajectories, each under a style drawn from the training distribution (the paper has 100).
+        states: per trajectory, evenly spaced.
+        steps: length of an episode; default: the domain's.
+        seed: of initial states, styles and baselines. The same seed gives the same files.
+        num_threads: physics threads.
+        progress: show progress bars.
+
+    Returns:
+        The two tables side by side, Markdown.
+
+    Raises:
+        ImportError: without the extra `explain`.
+        ValueError: if the domain's groups do not fit its observation.
+    """
+    import_captum()
+    agent = load_policy(source)
+    domain = load_domain(agent.metadata["domain"])
+    outputs = ActionOutputs(agent.actor).eval()
+    groups = input_groups(domain, agent.space, outputs.observation_dim)
+    trajectories = record_states(
+        domain,
+        agent.actor,
+        agent.space,
+        episodes=episodes,
+        states=states,
+        steps=steps,
+        seed=seed,
+        num_threads=num_threads,
+        progress=progress,
+    )
+    rankings = rank_groups(outputs, trajectories, groups, seed=seed, progress=progress)
+    out.mkdir(parents=True, exist_ok=True)
+    write_csv([row for ranking in rankings for row in ranking.rows()], out / "explain.csv")
+    table = _side_by_side(rankings)
+    count = sum(len(trajectory) for trajectory in trajectories)
+    title = f"{domain.name}: what moves the action ({len(trajectories)} trajectories, {count} states, seed {seed})"
+    (out / "explain.md").write_text(f"# {title}\n\n{table}")
+    _draw(rankings, out / "explain.png", title)
+    return table
+
+
+def record_states(
+    domain: Domain,
+    policy: TensorDictModuleBase,
+    space: StyleSpace,
+    *,
+    episodes: int = 100,
+    states: int = 16,
+    steps: int | None = None,
+    seed: int = 0,
+    num_threads: int | None = None,
+    progress: bool = True,
+) -> list[Tensor]:
+    """Inputs of the network along episodes of its own, each with a style from the training distribution.
+
+    Args:
+        domain: what to run in.
+        policy: reads `observation` and `style`.
+        space: its styles.
+        episodes: number of trajectories.
+        states: at most so many per trajectory, evenly spaced.
+        steps: length of an episode; default: the domain's.
+        seed: of the initial states and of the styles.
+        num_threads: physics threads.
+        progress: show a bar.
+
+    Returns:
+        Per trajectory (S, observation + theta), the observation and the encoded style.
+    """
+    if episodes < 2 or states < 1:
+        raise ValueError(f"expected at least 2 episodes and 1 state of each, got {episodes=}, {states=}")
+    steps = steps or domain.episode_steps
+    theta = space.sample((episodes,), torch.Generator().manual_seed(seed))
+    recorder = _Observations(max(1, steps // _RECORDED))
+    simulation = domain.make_env(num_envs=episodes, num_threads=num_threads)
+    env = coachable_env(simulation, space, domain.make_reward(space), seed=seed)
+    label = f"{episodes} episodes" if progress else None
+    record = record_episodes(env, policy, theta, recorder, steps=steps, seed=seed, progress=label)
+    env.close()
+    observed = torch.stack(recorder.observations)  # (T', N, observation)
+    lengths = record.alive[:: recorder.every].sum(0).tolist()
+    encoded = space.encode(theta)
+    trajectories = []
+    for row, length in enumerate(lengths):
+        chosen = torch.linspace(0, length - 1, min(states, length)).round().long()
+        trajectories.append(torch.cat([observed[chosen, row], encoded[row].expand(len(chosen), -1)], -1))
+    return trajectories
+
+
+class _Observations:
+    """Takes the place of a domain's measures while recording: keeps the observations of every `every`-th step."""
+
+    def __init__(self, every: int) -> None:
+        self.every = every
+        self.observations: list[Tensor] = []
+        self._step = 0
+
+    def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
+        if self._step % self.every == 0:
+            self.observations.append(transition.get("observation").clone())
+        self._step += 1
+        return {}
+
+    def summarise(self, record: Any, alive: Tensor) -> dict[str, Tensor]:
+        return {}
+
+    def complies(self, record: Any) -> Tensor:
+        raise NotImplementedError
+
+
+def _side_by_side(rankings: Sequence[Ranking]) -> str:
+    columns: dict[str, str] = {"rank": ""}
+    rows: list[dict[str, Any]] = [{"rank": i + 1} for i in range(min(_SHOWN, len(rankings[0].groups)))]
+    for ranking in rankings:
+        columns |= {ranking.method: "", f"{ranking.method} mean": ".4f", f"{ranking.method} std": ".4f"}
+        for row, entry in zip(rows, ranking.rows(), strict=False):
+            row[ranking.method] = readable(entry["group"])
+            row[f"{ranking.method} mean"], row[f"{ranking.method} std"] = entry["mean"], entry["std"]
+    return markdown_table(rows, columns)
+
+
+def _draw(rankings: Sequence[Ranking], path: Path, title: str) -> None:
+    shown = min(_BARS, len(rankings[0].groups))
+    figure, axes = plt.subplots(1, len(rankings), figsize=(11, 1.2 + 0.26 * shown), layout="constrained")
+    labels = {
+        "SHAP": "mean |contribution| to the action",
+        "saliency": "mean |d action / d input|",
+    }
+    for panel, ranking in zip(axes, rankings, strict=True):
+        groups, means = ranking.groups[:shown], ranking.means[:shown]
+        colours = ["tab:orange" if group.is_style else "tab:blue" for group in groups]
+        panel.barh(range(shown), means, xerr=ranking.deviations[:shown], color=colours, ecolor="0.4", capsize=2)
+        panel.set_yticks(range(shown), [readable(group.name) for group in groups])
+        panel.invert_yaxis()
+        panel.set_xlim(left=0)
+        panel.set_xlabel(labels[ranking.method])
+        panel.set_title(ranking.method, fontsize=10)
+        panel.set_axisbelow(True)
+        panel.grid(axis="x", alpha=0.3)
+    handles = [plt.Rectangle((0, 0), 1, 1, color=colour) for colour in ("tab:orange", "tab:blue")]
+    axes[-1].legend(handles, ["style", "observation"], loc="lower right", fontsize=9)
+    figure.suptitle(title, fontsize=10)
+    figure.savefig(path, dpi=130, metadata={"Software": None})
+    plt.close(figure)
