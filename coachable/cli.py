@@ -99,6 +99,10 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--out", type=Path, default=Path("policy.onnx"), help="(default: %(default)s)")
     export.set_defaults(run=_export)
 
+    from coachable.coach.command import add_parser
+
+    add_parser(commands, _SOURCE_HELP, _coach)
+
     doctor = commands.add_parser("doctor", help="check this installation and say what it can do")
     doctor.set_defaults(run=_doctor)
     return parser
@@ -151,6 +155,13 @@ def _export(options: argparse.Namespace) -> int:
 
     difference = export(options.source, options.out)
     print(f"wrote {options.out} ({options.out.stat().st_size / 1e6:.1f} MB), at most {difference:.1g} from torch")
+    return 0
+
+
+def _coach(options: argparse.Namespace) -> int:
+    from coachable.coach.command import serve
+
+    serve(say=lambda text: print(text, flush=True), **_arguments(options))
     return 0
 
 

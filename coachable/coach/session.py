@@ -84,7 +84,7 @@ class CoachSession:
     ) -> None:
         self.policy, self.space, self.domain, self.source = policy, space, domain, source
         self.coaching = coaching_of(domain.name) if coaching is None else coaching
-        self.strict, self.endless, self.hold = strict, endless, True
+        self.strict, self.endless, self.hold, self.window = strict, endless, True, window
         self.env = coachable_env(domain.make_env(num_envs=1, num_threads=1), space, domain.make_reward(space))
         self.presets: dict[str, dict[str, Any]] = {"default": space.describe(space.default)}
         self.presets |= {name: dict(style) for name, style in self.coaching.presets.items()}
@@ -94,7 +94,7 @@ class CoachSession:
             [*space.parameters, *(control.parameter for control in self.coaching.controls)], self.coaching.vocabulary
         )
         self._understood: Understanding | None = None
-        self._window = MeasuredWindow(domain.measures, round(window / domain.control_step))
+        self._recent = MeasuredWindow(domain.measures, round(window / domain.control_step))
         self._outside: dict[str, float] = {}
         self._agenda: deque[tuple[int, dict[str, Any]]] = deque()
         self._replayed: Recording | None = None
@@ -262,8 +262,8 @@ class CoachSession:
         self.step_count += 1
         self._episode_steps += 1
         after = transition.get("next")
-        self._window.add(transition)
-        if self._complied_at is None and self._window.complies(self.step_count - self._steps_at_request):
+        self._recent.add(transition)
+        if self._complied_at is None and self._recent.complies(self.step_count - self._steps_at_request):
             self._complied_at = self.step_count
         if after.get("terminated").any():
             self.ended = self.coaching.terminated
@@ -288,7 +288,7 @@ class CoachSession:
         """Requested against measured style over the window, which begins anew with each episode."""
         return StyleReport(
             requested=self.style,
-            measured=self._window.summary(),
+            measured=self._recent.summary(),
             outside=dict(self._outside),
             complied_after=None if self._complied_at is None else self._seconds(self._complied_at),
             since_request=self._seconds(self.step_count),
@@ -305,6 +305,12 @@ class CoachSession:
         while isinstance(env, TransformedEnv):
             env = env.base_env
         return env
+
+    def replica(self) -> CoachSession:
+        """Another session of the same agent, in an environment of its own."""
+        return CoachSession(
+            self.policy, self.space, self.domain, source=self.source, window=self.window, coaching=self.coaching
+        )
 
     def close(self) -> None:
         """Releases the environment."""
@@ -373,7 +379,7 @@ class CoachSession:
         if draw:
             self._request(self.space.sample((), self._generator))
         self._current = self.env.reset(TensorDict({STYLE: self._theta[None]}, [1]))
-        self._window.clear()
+        self._recent.clear()
         self._episode += 1
         self._episode_steps = 0
         self.ended: str | None = None

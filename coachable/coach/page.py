@@ -1,0 +1,240 @@
+"""The coaching page: a thin client of `CoachSession` in the browser."""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from coachable.coach.film import film
+from coachable.coach.loop import LiveLoop
+from coachable.coach.plan import read_plan
+from coachable.coach.recording import Recording
+from coachable.coach.report import StyleReport, measures_by_parameter
+from coachable.coach.session import CoachSession
+from coachable.coach.views import make_view
+from coachable.coach.widgets import Chart, MeasuredText, ParameterWidget, number, write
+
+if TYPE_CHECKING:
+    import viser
+
+_FRAMES_PER_SECOND = 30.0
+_REPORTS_PER_SECOND = 5.0
+_FILM_SECONDS = 10.0
+
+
+class CoachPage:
+    """Widgets, view and read-outs of one session.
+
+    Every browser that opens the page shows and steers the same session. Widgets hand their requests to the loop, which
+    carries them out before the next step; everything shown is read from the session.
+
+    Args:
+        server: an empty page.
+        session: what is coached; from `start` on it belongs to the loop's thread.
+
+    Attributes:
+        loop: runs the session.
+        widgets: by parameter name, live controls included.
+    """
+
+    def __init__(self, server: viser.ViserServer, session: CoachSession) -> None:
+        self.server, self.session = server, session
+        self.loop = LiveLoop(session, self._on_step)
+        self._view = None
+        self._frame_due = self._report_due = 0.0
+        self.status = server.gui.add_markdown("")
+        self._add_phrase_box()
+        self.widgets: dict[str, ParameterWidget] = {}
+        self.measured: dict[str, MeasuredText] = {}
+        with server.gui.add_folder("Style"):
+            for parameter in session.space.parameters:
+                self._add_widget(parameter, session.style[parameter.name], self._set)
+                self.measured[parameter.name] = MeasuredText(server, parameter)
+            self.others = server.gui.add_markdown("")
+        with server.gui.add_folder("Requested and measured"):
+            self.chart = Chart(server, session.space, 1.0 / _REPORTS_PER_SECOND)
+        self._add_run()
+        if session.coaching.controls:
+            with server.gui.add_folder("Steering"):
+                for control in session.coaching.controls:
+                    name = control.parameter.name
+                    self._add_widget(control.parameter, session.controls[name], self._steer)
+        self._add_presets()
+        self._add_recording()
+
+    def start(self) -> None:
+        """Begins to act."""
+        self.loop.start()
+
+    def stop(self) -> None:
+        """Ends the loop; the session stays open."""
+        self.loop.stop()
+        if self._view is not None:
+            self._view.close()
+
+    # -- widgets ---------------------------------------------------------------------------------------------------
+
+    def _add_widget(self, parameter: Any, value: float | str, write: Callable[[ParameterWidget], None]) -> None:
+        name = parameter.name
+        self.widgets[name] = ParameterWidget(self.server, parameter, value, lambda: write(self.widgets[name]))
+
+    def _set(self, widget: ParameterWidget) -> None:
+        self.loop.submit(lambda session: session.set(**widget.take()))
+
+    def _steer(self, widget: ParameterWidget) -> None:
+        self.loop.submit(lambda session: session.steer(**widget.take()))  # pyright: ignore[reportArgumentType]
+
+    def _add_phrase_box(self) -> None:
+        gui = self.server.gui
+        with gui.add_form("Say it") as form:
+            self.phrase = gui.add_text("phrase", "", hint="such as: shorter steps, arms up; a bit more; 0.4 m")
+            say = gui.add_button("Apply")
+            self.answer = gui.add_markdown("")
+        say.on_click(lambda _: form.submit())
+
+        @form.on_submit
+        def _(_: Any) -> None:
+            phrase = self.phrase.value
+            self.loop.submit(lambda session: write(self.answer, _escaped(str(session.say(phrase)))))
+
+    def _add_run(self) -> None:
+        gui = self.server.gui
+        with gui.add_folder("Run"):
+            self.pause = gui.add_button("Pause")
+            self.step = gui.add_button("Single step")
+            self.reset = gui.add_button("Reset")
+            self.speed = gui.add_slider("speed (1 is real time)", 0.1, 4.0, 0.1, 1.0)
+            self.seed = gui.add_number("seed", self.session.recording().seed, min=0, step=1)
+            reseed = gui.add_button("Start over with seed", hint="also begins a new recording")
+            self.hold = gui.add_checkbox(
+                "hold the style", True, hint="otherwise each episode draws one, as in training"
+            )
+
+        self.pause.on_click(lambda _: self._pause(not self.loop.paused))
+        self.step.on_click(lambda _: self.loop.single_step())
+        self.reset.on_click(lambda _: self.loop.submit(lambda session: session.reset()))
+        reseed.on_click(lambda _: self.loop.submit(lambda session: session.reset(int(self.seed.value))))
+        self.hold.on_update(lambda _: self.loop.submit(lambda session: setattr(session, "hold", self.hold.value)))
+        self.speed.on_update(lambda _: self._change_speed())
+
+    def _change_speed(self) -> None:
+        if self.speed.value > 0:  # false for NaN
+            self.loop.speed = float(self.speed.value)
+
+    def _pause(self, paused: bool) -> None:
+        self.loop.paused = paused
+        self.loop.submit(lambda _: None)  # shows the state
+
+    def _add_presets(self) -> None:
+        gui = self.server.gui
+        with gui.add_folder("Presets and schedule"):
+            self.preset = gui.add_dropdown("preset", list(self.session.presets))
+            apply = gui.add_button("Apply preset")
+            self.preset_name = gui.add_text("new name", "")
+            keep = gui.add_button("Save style as preset")
+            self.plan = gui.add_text("schedule", "", multiline=True, hint="SECONDS: PHRASE or preset; one per line")
+            run = gui.add_button("Run schedule")
+            cancel = gui.add_button("Stop schedule or replay")
+
+        apply.on_click(lambda _: self.loop.submit(lambda session: session.apply(self.preset.value)))
+        keep.on_click(lambda _: self.loop.submit(self._save_preset))
+        run.on_click(lambda _: self.loop.submit(lambda session: session.schedule(read_plan(self.plan.value, session))))
+        cancel.on_click(lambda _: self.loop.submit(lambda session: session.cancel()))
+
+    def _save_preset(self, session: CoachSession) -> None:
+        name = self.preset_name.value.strip()
+        if not name:
+            raise ValueError("give the preset a name first")
+        session.presets[name] = session.style
+        self.preset.options = tuple(session.presets)
+        self.preset.value = name
+
+    def _add_recording(self) -> None:
+        gui = self.server.gui
+        with gui.add_folder("Recording", expand_by_default=False):
+            save = gui.add_button("Download JSON", hint="everything since the last seed; replays exactly")
+            again = gui.add_button("Replay from the start")
+            load = gui.add_upload_button("Replay a JSON file", mime_type="application/json")
+            shoot = gui.add_button(f"Film the last {_FILM_SECONDS:g} s (mp4)")
+            self.film_note = gui.add_markdown("")
+
+        save.on_click(lambda _: self.loop.submit(self._send_recording))
+        again.on_click(lambda _: self.loop.submit(lambda session: session.replay(session.recording())))
+        load.on_upload(lambda _: self.loop.submit(lambda session: session.replay(_read(load.value.content))))
+        shoot.on_click(lambda _: self.loop.submit(self._shoot))
+
+    def _send_recording(self, session: CoachSession) -> None:
+        self.server.send_file_download(f"{session.domain.name}.json", session.recording().to_json().encode())
+
+    def _shoot(self, session: CoachSession) -> None:
+        recording = session.recording()
+        self.film_note.content = "drawing, the agent goes on meanwhile ..."
+        threading.Thread(target=self._film, args=(recording,), name="filming", daemon=True).start()
+
+    def _film(self, recording: Recording) -> None:
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                file = film(recording, self.session, Path(folder) / "film.mp4", last=_FILM_SECONDS)
+                self.server.send_file_download(f"{recording.domain}.mp4", file.read_bytes())
+            self.film_note.content = "drawn"
+        except Exception as error:  # this thread has nobody else to tell
+            self.film_note.content = f"⚠ {_escaped(str(error))}"
+
+    # -- read-outs, in the loop's thread ---------------------------------------------------------------------------
+
+    def _on_step(self) -> None:
+        now = time.perf_counter()
+        if self._view is None:
+            self._view = make_view(self.server, self.session)
+        if now >= self._frame_due or self.loop.paused:
+            self._frame_due = now + 1.0 / _FRAMES_PER_SECOND
+            self._view.update()
+        for name, value in (self.session.style | self.session.controls).items():
+            self.widgets[name].follow(value)
+        if now >= self._report_due or self.loop.paused or self.session.ended is not None:
+            self._report_due = now + 1.0 / _REPORTS_PER_SECOND
+            self._show(self.session.report())
+
+    def _show(self, report: StyleReport) -> None:
+        with self.server.atomic():
+            write(self.status, self._status(report))
+            self.pause.label = "Resume" if self.loop.paused else "Pause"
+            groups = measures_by_parameter(self.session.space, report.measured)
+            for name, text in self.measured.items():
+                text.update(report, groups[name])
+            others = ", ".join(f"{m.replace('_', ' ')} **{number(report.measured[m])}**" for m in groups[""])
+            write(self.others, f"also measured: {others}" if others else "")
+            self.chart.add(self.session.step_count * self.session.domain.control_step, report)
+
+    def _status(self, report: StyleReport) -> str:
+        if self.loop.problem:
+            first = f"⚠ **{_escaped(self.loop.problem)}**"
+        elif report.ended is not None:
+            first = f"🔄 **The agent {report.ended}** after {report.episode_time:.1f} s; a new episode begins."
+        elif report.complied_after is not None:
+            first = f"✅ **Does what was asked**, {report.complied_after:.1f} s after the request."
+        else:
+            first = f"⏳ Asked {report.since_request:.1f} s ago, not yet met."
+        state = "paused" if self.loop.paused else f"{self.loop.factor:.2f} of real time"
+        if self.session.replaying:
+            state += " · replaying"
+        elif self.session.scheduled:
+            state += f" · {self.session.scheduled} scheduled"
+        endings = "".join(f" · {reason}: {count}" for reason, count in report.endings.items())
+        return f"{first}\n\n{state} · episode {report.episode}, {report.episode_time:.1f} s{endings}"
+
+
+def _read(content: bytes) -> Recording:
+    try:
+        return Recording.from_json(content.decode())
+    except UnicodeDecodeError:
+        raise ValueError("this is no recording: expected JSON written by a coaching session") from None
+
+
+def _escaped(text: str) -> str:
+    """Without what Markdown would take for markup."""
+    return "".join(f"\\{c}" if c in "\\`*_{}[]<>#|~" else c for c in text)

@@ -1,0 +1,108 @@
+"""What the page shows of the agent: MuJoCo bodies in 3-D, or the domain's own picture."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol, cast
+
+import numpy as np
+
+from coachable.coach.session import CoachSession
+
+if TYPE_CHECKING:
+    import viser
+
+_PICTURES_PER_SECOND = 12.0
+_PICTURE_SIZE = (800, 600)  # [px]
+
+
+class View(Protocol):
+    """Draws a session; called only in the thread that steps it."""
+
+    def update(self) -> None:
+        """Shows the present state."""
+        ...
+
+    def close(self) -> None:
+        """Releases what it holds."""
+        ...
+
+
+class HumanoidView:
+    """The humanoid in 3-D, followed by the camera, with an arrow along the course.
+
+    mjviser is at 0.0.x: this is the only place that touches it.
+    """
+
+    def __init__(self, server: viser.ViserServer, session: CoachSession) -> None:
+        import mujoco
+        from mjviser import ViserMujocoScene
+
+        from coachable.envs.humanoid.model import load_spec
+
+        self._server, self._env = server, cast(Any, session.base_env)
+        self._mujoco = mujoco
+        self._model = load_spec().compile()
+        self._data = mujoco.MjData(self._model)
+        self._scene = ViserMujocoScene(server, self._model, num_envs=1)
+        self._scene.camera_tracking_enabled = False  # it would also follow the bobbing of the torso
+        self._torso = self._model.body("torso").id
+        server.scene.set_up_direction("+z")
+        server.initial_camera.position = (2.4, -2.4, 1.5)
+        server.initial_camera.look_at = (0.0, 0.0, 0.85)
+        self._arrow: Any = None
+        self._course: float | None = None
+
+    def update(self) -> None:
+        """See `View.update`. The world moves, so that the camera, which belongs to the viewer, need not."""
+        self._data.qpos[:] = self._env.simulation.positions[0]
+        self._mujoco.mj_kinematics(self._model, self._data)
+        offset = np.array([*self._data.xpos[self._torso, :2], 0.0])
+        with self._server.atomic():
+            self._scene.update_from_arrays(self._data.xpos[None] - offset, self._data.xmat.reshape(1, -1, 3, 3))
+            self._scene.fixed_bodies_frame.position = -offset
+            self._point(float(self._env.course[0]))
+
+    def _point(self, course: float) -> None:
+        if course == self._course:
+            return
+        self._course = course
+        ahead = np.array([np.cos(course), np.sin(course), 0.0])
+        start = np.array([0.0, 0.0, 0.01]) + 0.5 * ahead
+        self._arrow = self._server.scene.add_arrows(
+            "/course", np.array([[start, start + 0.7 * ahead]]), colors=(31, 119, 180), shaft_radius=0.015
+        )
+
+    def close(self) -> None:
+        """See `View.close`."""
+
+
+class PictureView:
+    """The domain's renderer as the background of the page, drawn only while somebody looks."""
+
+    def __init__(self, server: viser.ViserServer, session: CoachSession) -> None:
+        self._server, self._session = server, session
+        self._renderer = session.domain.make_renderer(*_PICTURE_SIZE)
+        self._due = 0.0
+
+    def update(self) -> None:
+        """See `View.update`."""
+        now = time.perf_counter()
+        if now < self._due or not self._server.get_clients():
+            return
+        self._due = now + 1.0 / _PICTURES_PER_SECOND
+        picture = self._renderer.draw(self._session.env)
+        self._server.scene.set_background_image(picture, format="jpeg", jpeg_quality=85)
+
+    def close(self) -> None:
+        """See `View.close`."""
+        self._renderer.close()
+
+
+_SCENES: dict[str, Callable[[viser.ViserServer, CoachSession], View]] = {"humanoid": HumanoidView}
+
+
+def make_view(server: viser.ViserServer, session: CoachSession) -> View:
+    """The 3-D view of a domain that has one, otherwise its renderer's picture."""
+    return _SCENES.get(session.domain.name, PictureView)(server, session)
