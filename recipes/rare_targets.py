@@ -1,0 +1,115 @@
+"""Reach the one of eight small targets that the style names: where event tables and task impersonation matter.
+
+python recipes/rare_targets.py                            both on, a minute on one core
+python recipes/rare_targets.py replay=uniform impersonation.n=0
+python recipes/rare_targets.py preset=smoke
+
+Chance seldom leads to a target, and seldom to the right one. Event tables keep what led there; impersonation asks of each such
+path what it would have been worth to somebody who wanted that target.
+"""
+
+import math
+from typing import Any
+
+import torch
+from recipe_config import run_recipe
+from recipe_training import build_training
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from coachable.keys import EVENTS, STYLE_FEATURES, TASK_REWARD
+from coachable.replay import KeyEvents
+from coachable.styles import StyleReward, StyleSpace, Weight, WeightedFeature
+from coachable.styles.mixtures import style_mixture
+from coachable.training.loop import Train
+
+TARGETS = 8
+NAMES = tuple(f"target_{i}" for i in range(TARGETS))
+RADIUS, DISTANCE = 0.08, 1.0  # of a target, and from the centre to it
+SPEED = 0.06  # per step
+STEPS = 60
+
+
+class RareTargets(EnvBase):
+    """N points in the plane, steered at bounded speed. An episode ends at any target, whoever wanted it."""
+
+    def __init__(self, num_envs: int = 64, seed: int = 0, num_threads: int = 1) -> None:
+        super().__init__(batch_size=[num_envs])
+        shape = (num_envs,)
+        observations = {"observation": 3, TASK_REWARD: 1, STYLE_FEATURES: TARGETS}
+        self.observation_spec = Composite(
+            **{name: Unbounded((num_envs, width)) for name, width in observations.items()},
+            **{EVENTS: Binary(TARGETS, (num_envs, TARGETS), dtype=torch.bool)},
+            shape=shape,
+        )
+        self.action_spec = Bounded(-1.0, 1.0, (num_envs, 2))
+        self.reward_spec = Unbounded((num_envs, 1))
+        done = {name: Binary(1, (num_envs, 1), dtype=torch.bool) for name in ("done", "terminated", "truncated")}
+        self.done_spec = Composite(done, shape=shape)
+        angles = torch.arange(TARGETS) * (2 * math.pi / TARGETS)
+        self.targets = DISTANCE * torch.stack([angles.cos(), angles.sin()], -1)
+        self.position = torch.zeros(num_envs, 2)
+        self.age = torch.zeros(num_envs, 1)
+        self.generator = torch.Generator()
+        self._set_seed(seed)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.generator.manual_seed(seed or 0)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        again = torch.ones_like(self.age, dtype=torch.bool) if mask is None else mask.reshape(self.age.shape)
+        start = 0.2 * torch.rand(self.position.shape, generator=self.generator) - 0.1
+        self.position = torch.where(again, start, self.position)
+        self.age = torch.where(again, 0.0, self.age)
+        return self._package(torch.zeros(*self.batch_size, TARGETS, dtype=torch.bool))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.position = (self.position + SPEED * tensordict["action"]).clamp(-1.2, 1.2)
+        self.age = self.age + 1
+        reached = (self.position.unsqueeze(1) - self.targets).norm(dim=-1) < RADIUS
+        return self._package(reached).set("reward", torch.zeros_like(self.age))
+
+    def _package(self, reached: Tensor) -> TensorDictBase:
+        terminated = reached.any(-1, keepdim=True)
+        truncated = (self.age >= STEPS) & ~terminated
+        return TensorDict(
+            {
+                "observation": torch.cat([self.position, self.age / STEPS], -1),
+                TASK_REWARD: torch.zeros_like(self.age),
+                STYLE_FEATURES: reached.float(),
+                EVENTS: reached,
+                "terminated": terminated,
+                "truncated": truncated,
+                "done": terminated | truncated,
+            },
+            batch_size=self.batch_size,
+        )
+
+
+def target_space() -> StyleSpace:
+    """What each target is worth; mostly one at a time."""
+    space = StyleSpace([Weight(name, 0.0, 1.0, help="worth of this target") for name in NAMES], name="targets")
+    return space.with_sampler(style_mixture(space))
+
+
+def target_reward(space: StyleSpace, *, scale: float = 10.0) -> StyleReward:
+    """`scale` times the weight of the target that was reached."""
+    terms = {name: WeightedFeature(name, i) for i, name in enumerate(NAMES)}
+    return StyleReward(space, terms, scales=dict.fromkeys(terms, scale))
+
+
+def target_events() -> KeyEvents:
+    """One table per target."""
+    return KeyEvents(NAMES)
+
+
+def build(config: dict[str, Any]) -> Train:
+    """Composes the training."""
+    return build_training(config, target_space(), target_reward)
+
+
+if __name__ == "__main__":
+    run_recipe("rare_targets", build)
