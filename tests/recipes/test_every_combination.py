@@ -13,8 +13,8 @@ from coachable.training.loop import REPLAY_KEYS
 
 RECIPES = sorted(file.stem for file in (Path(__file__).resolve().parents[2] / "recipes" / "configs").glob("*_*.yaml"))
 TINY = ["preset=smoke", "env.num_envs=2", "threads.simulator=1", "threads.learner=1", "train.eval_interval=0"]
-TINY += ["init_random_frames=8", "train.warmup_frames=8", "train.batch_size=8", "eval.max_steps=5"]
-TINY += ["train.total_frames=24"]
+TINY += ["init_random_frames=8", "train.warmup_frames=8", "train.batch_size=12", "eval.max_steps=5"]
+TINY += ["train.total_frames=28", "impersonation.n=0"]
 POLICY_FIRST = {"qr_sac", "rac", "cat_rac", "sac_categorical"}  # paper, Appendix B
 
 
@@ -44,7 +44,7 @@ def test_every_loss_trains(recipe, loss, tmp_path):
 
 @pytest.mark.parametrize("recipe, replay", _choices("replay"))
 def test_every_replay_buffer_trains(recipe, replay, tmp_path):
-    train = _train(recipe, tmp_path, f"replay={replay}", "train.total_frames=40")
+    train = _train(recipe, tmp_path, f"replay={replay}", "train.total_frames=50")
     assert train.learner.updates >= 2
     sample = train.replay.sample(8)
     assert set(REPLAY_KEYS) - {("next", "style_features")} <= set(sample.keys(True))
