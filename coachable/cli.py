@@ -84,6 +84,18 @@ def _parser() -> argparse.ArgumentParser:
     weights.add_argument("out", type=Path, help="the file, such as coachable/pretrained/humanoid/weights.pt")
     weights.set_defaults(run=_weights)
 
+    report = commands.add_parser("report", help="everything that can be measured of an agent, on one page")
+    report.add_argument("sources", nargs="+", metavar="source", help=f"{_SOURCE_HELP}; several: one per training seed")
+    report.add_argument("--out", type=Path, default=Path("report"), help="folder (default: %(default)s)")
+    report.add_argument("--seeds", type=int, default=5, help="runs of a single agent (default: %(default)s)")
+    report.add_argument("--episodes", type=int, default=4, help="per run and style (default: %(default)s)")
+    report.add_argument("--switch-episodes", type=int, default=20, help="per run (default: %(default)s)")
+    report.add_argument("--sweep-points", type=int, default=5, help="values of each weight (default: %(default)s)")
+    report.add_argument("--steps", type=int, help="length of an episode (default: the domain's)")
+    report.add_argument("--seed", type=int, default=0)
+    report.add_argument("--threads", type=int, dest="num_threads", help="physics threads (default: all free cores)")
+    report.set_defaults(run=_report)
+
     explain = commands.add_parser("explain", help="rank the inputs that the agent listens to, by SHAP and saliency")
     explain.add_argument("source", help=_SOURCE_HELP)
     explain.add_argument("--out", type=Path, default=Path("explanation"), help="folder (default: %(default)s)")
@@ -140,6 +152,13 @@ def _weights(options: argparse.Namespace) -> int:
 
     file = export_weights(options.source, options.out)
     print(f"wrote {file} ({file.stat().st_size / 1e6:.1f} MB)")
+    return 0
+
+
+def _report(options: argparse.Namespace) -> int:
+    from coachable.evaluation.report import report
+
+    print(report(options.sources, **_arguments(options, without=("sources",))))
     return 0
 
 

@@ -11,13 +11,46 @@ def interquartile_mean(values: np.ndarray, axis: int = -1) -> np.ndarray:
     """Mean of the middle half of the values (Agarwal et al. 2021, arXiv 2108.13264).
 
     Args:
-        values: numbers; a quarter of them, rounded down, is cut at each end of `axis`.
+        values: numbers; NaN are left out. Of the rest a quarter, rounded down, is cut at each end of `axis`.
         axis: axis to aggregate.
+
+    Returns:
+        The means, without `axis`; NaN where there are no values.
     """
-    ordered = np.sort(values, axis=axis)
-    count = ordered.shape[axis]
+    ordered = np.moveaxis(np.sort(values, axis=axis), axis, -1)  # NaN come last
+    count = (~np.isnan(ordered)).sum(-1, keepdims=True)
     cut = count // 4
-    return np.take(ordered, np.arange(cut, count - cut), axis=axis).mean(axis=axis)
+    position = np.arange(ordered.shape[-1])
+    middle = (position >= cut) & (position < count - cut)
+    total = np.where(middle, ordered, 0.0).sum(-1)
+    kept = middle.sum(-1)
+    return np.divide(total, kept, out=np.full(total.shape, np.nan), where=kept > 0)
+
+
+def stratified_interval(
+    scores: np.ndarray, *, confidence: float = 0.95, resamples: int = 2000, seed: int = 0
+) -> tuple[float, float]:
+    """Percentile bootstrap interval of the interquartile mean of several runs on several tasks.
+
+    Runs are drawn with replacement for each task separately, so every resample has every task (Agarwal et al. 2021).
+
+    Args:
+        scores: (runs, tasks); NaN are left out.
+        confidence: probability content of the interval.
+        resamples: number of bootstrap samples.
+        seed: of the resampling.
+
+    Returns:
+        Lower and upper bound; NaN where there are no values.
+    """
+    if np.isnan(scores).all():
+        return float("nan"), float("nan")
+    runs, tasks = scores.shape
+    draws = np.random.default_rng(seed).integers(0, runs, (resamples, runs, tasks))
+    spread = interquartile_mean(scores[draws, np.arange(tasks)].reshape(resamples, -1))
+    tail = 50 * (1 - confidence)
+    low, high = np.nanpercentile(spread, [tail, 100 - tail])
+    return float(low), float(high)
 
 
 def bootstrap_interval(

@@ -1,0 +1,251 @@
+"""`coachable report`: everything that was measured of an agent on one page, with intervals over seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from coachable import __version__
+from coachable.domain import Domain, load_domain
+from coachable.evaluation.figures import readable
+from coachable.evaluation.report_figures import draw_metrics, draw_requests, draw_switches, draw_tradeoffs
+from coachable.evaluation.report_page import Page, paragraph, picture, shown, table
+from coachable.evaluation.runs import (
+    SWITCH_PERIOD,
+    Run,
+    StyleTable,
+    estimate,
+    evaluate_run,
+    flat_row,
+    response_rows,
+)
+from coachable.evaluation.style_grid import mean_of, write_csv
+from coachable.evaluation.sweep import STYLE_SCORE
+from coachable.styles import Choice
+from coachable.training.weights import LoadedPolicy, load_policy
+
+__all__ = ["report", "write_report"]
+
+
+def report(sources: Sequence[str | Path], out: Path, **settings: Any) -> str:
+    """Evaluate an agent, or several trained with different seeds, and write the report.
+
+    Args:
+        sources: checkpoints, run folders, weights files, or names of domains that ship with weights.
+        out: folder for `report.html`, its figures (PNG) and tables (CSV), created if missing.
+        **settings: see `write_report`.
+
+    Returns:
+        A short summary, text.
+
+    Raises:
+        ValueError: if the agents belong to different domains or styles.
+    """
+    agents = [load_policy(source) for source in sources]
+    first = agents[0]
+    for agent, source in zip(agents, sources, strict=True):
+        same = agent.metadata["domain"] == first.metadata["domain"] and first.space.encodes_like(agent.space)
+        if not same:
+            differences = " ".join(first.space.difference(agent.space)) or "they belong to different domains."
+            raise ValueError(f"{source} cannot share a report with {sources[0]}: {differences}")
+    domain = load_domain(first.metadata["domain"])
+    return write_report(domain, dict(zip(map(str, sources), agents, strict=True)), out, **settings)
+
+
+def write_report(
+    domain: Domain,
+    agents: Mapping[str, LoadedPolicy],
+    out: Path,
+    *,
+    seeds: int = 5,
+    episodes: int = 4,
+    switch_episodes: int = 20,
+    sweep_points: int = 5,
+    steps: int | None = None,
+    seed: int = 0,
+    num_threads: int | None = None,
+    progress: bool = True,
+) -> str:
+    """Evaluate the agents and write `report.html` with its figures and tables.
+
+    A *run* is one evaluation of everything. One agent is evaluated with several seeds of the initial states; several
+    agents once each. Values are interquartile means over the runs' mean values, intervals stratified bootstrap over the
+    runs.
+
+    Args:
+        domain: what to run in.
+        agents: policies by name, of one style space.
+        out: folder, created if missing.
+        seeds: runs of a single agent.
+        episodes: per run and style, and per run and value of a weight.
+        switch_episodes: per run, with styles that switch.
+        sweep_points: values of each weight.
+        steps: length of an episode; default: the domain's.
+        seed: of the first run; the next ones follow. The same seed gives the same files.
+        num_threads: physics threads.
+        progress: show progress bars.
+
+    Returns:
+        A short summary, text.
+    """
+    if len(agents) == 1:
+        (only,) = agents.values()
+        planned = [(f"seed {seed + i}", only, seed + i) for i in range(seeds)]
+    else:
+        planned = [(name, agent, seed) for name, agent in agents.items()]
+    if not planned:
+        raise ValueError(f"seeds must be at least 1, got {seeds}")
+    out.mkdir(parents=True, exist_ok=True)
+    options: dict[str, Any] = {"steps": steps, "num_threads": num_threads, "progress": progress}
+    options |= {"episodes": episodes, "switch_episodes": switch_episodes, "sweep_points": sweep_points}
+    bar = tqdm(planned, desc="evaluating", unit="run", disable=None if progress else True)
+    runs = [evaluate_run(label, domain, agent, seed=number, **options) for label, agent, number in bar]
+    agent = next(iter(agents.values()))
+    styles = StyleTable(runs)
+    formats = _formats(styles, domain)
+    page = Page(f"{domain.name}: what was asked, and what was done", _lead(agents, runs, episodes))
+    _styles(page, styles, formats, agent, out)
+    _requests(page, styles, agent, runs, out)
+    _switches(page, domain, runs, switch_episodes, formats, out)
+    _tradeoffs(page, styles, runs, formats, out)
+    footer = (
+        f"coachable {__version__}; made by: coachable report {' '.join(agents)} --seed {seed} --episodes {episodes}"
+    )
+    footer += f" --seeds {seeds}" if len(agents) == 1 else ""
+    (out / "report.html").write_text(page.text(footer + (f" --steps {steps}" if steps else "")), encoding="utf-8")
+    return _text(styles, runs, formats, out)
+
+
+def _formats(styles: StyleTable, domain: Domain) -> dict[str, str]:
+    """Metrics to show, with the format of their values: the domain's published columns, or everything measured."""
+    published = {
+        name: domain.columns[styles.column(name)] for name in styles.scores if styles.column(name) in domain.columns
+    }
+    order = list(domain.columns)
+    if published:
+        return dict(sorted(published.items(), key=lambda item: order.index(styles.column(item[0]))))
+    return {name: ".0%" if name == "survived" else ".3g" for name in styles.scores}
+
+
+def _lead(agents: Mapping[str, LoadedPolicy], runs: Sequence[Run], episodes: int) -> str:
+    known = [
+        f"{agent.metadata[name]:,} {name}"
+        for agent in agents.values()
+        for name in ("frames", "updates")
+        if agent.metadata.get(name)
+    ]
+    trained = f", trained for {', '.join(known)}" if len(agents) == 1 and known else ""
+    subject = f"The deterministic policy of {next(iter(agents))}{trained}" if len(agents) == 1 else "Several agents"
+    grid = runs[0].grid
+    return (
+        f"{subject}. {len(runs)} runs ({', '.join(run.label for run in runs)}) of {episodes} episodes in each of "
+        f"{len(grid.cells)} styles, up to {grid.steps} steps each. Values are interquartile means over the runs, each "
+        "run counting with the mean of its episodes; in brackets 95 % intervals, by stratified bootstrap over the runs."
+    )
+
+
+def _styles(page: Page, styles: StyleTable, formats: Mapping[str, str], agent: LoadedPolicy, out: Path) -> None:
+    metrics = list(formats)
+    by_column = {styles.column(name): form for name, form in formats.items()}
+    summary, rows = styles.summary(metrics), styles.rows(metrics)
+    write_csv([flat_row(row) for row in summary], out / "summary.csv")
+    write_csv([flat_row(row) for row in styles.rows(list(styles.scores))], out / "styles.csv")
+    free = [name for name in metrics if name not in styles.cells[0]] or metrics
+    draw_metrics(styles, agent.space, free, by_column, out / "styles.png")
+    page.section("Summary", table(summary, by_column))
+    page.section(
+        "Every style",
+        picture(out / "styles.png", "metrics per style, with intervals"),
+        table(rows, by_column, colour=True),
+    )
+
+
+def _requests(page: Page, styles: StyleTable, agent: LoadedPolicy, runs: Sequence[Run], out: Path) -> None:
+    numeric = [p.name for p in agent.space.parameters if not isinstance(p, Choice)]
+    measured = [
+        name for name in numeric if name in styles.cells[0] and not np.isnan(styles.scores.get(name, np.nan)).all()
+    ]
+    if not measured:
+        return
+    draw_requests(styles, agent.space, measured, out / "requests.png")
+    parts = [picture(out / "requests.png", "requested against measured values")]
+    rows = response_rows(runs, agent.space)
+    if rows:
+        write_csv([flat_row(row) for row in rows], out / "requests.csv")
+        parts.append(paragraph("Slope and rank correlation of the measured over the requested value; 1 is ideal."))
+        parts.append(table(rows, {}))
+    page.section("Requested and measured", *parts)
+
+
+def _switches(
+    page: Page, domain: Domain, runs: Sequence[Run], episodes: int, formats: Mapping[str, str], out: Path
+) -> None:
+    period = SWITCH_PERIOD * domain.control_step
+    draw_switches(runs, period, out / "switches.png")
+    waits = [run.switching.comply_seconds for run in runs]
+    row: dict[str, Any] = {
+        "complied": estimate(np.array([run.switching.complied for run in runs])),
+        "median_seconds": estimate(np.array([wait.median().item() if len(wait) else np.nan for wait in waits])),
+    }
+    for name in runs[0].switching.metrics:
+        row[name] = estimate(np.array([run.switching.metrics[name] for run in runs]))
+    row["switches"] = sum(run.switching.switches for run in runs)
+    write_csv([flat_row(row)], out / "switches.csv")
+    page.section(
+        "Styles that change while the agent acts",
+        paragraph(
+            f"{episodes} episodes per run, a new style every {SWITCH_PERIOD} steps ({period:g} s). Complied: the agent "
+            "did what was asked before the next switch."
+        ),
+        picture(out / "switches.png", "share of switches complied with over time"),
+        table([row], {**formats, "complied": ".0%", "median_seconds": ".2f"}),
+    )
+
+
+def _tradeoffs(page: Page, styles: StyleTable, runs: Sequence[Run], formats: Mapping[str, str], out: Path) -> None:
+    if not runs[0].sweeps:
+        return
+    success = _success(runs, formats)
+    draw_tradeoffs(runs, success, formats.get(success, ""), out / "tradeoffs.png")
+    rows = [
+        {
+            "weight": sweeps[0].weight,
+            "value": float(value),
+            **{
+                name: estimate(np.array([mean_of(sweep.episodes[name][i]) for sweep in sweeps]))
+                for name in sweeps[0].episodes
+            },
+        }
+        for sweeps in zip(*(run.sweeps for run in runs), strict=True)
+        for i, value in enumerate(sweeps[0].values)
+    ]
+    write_csv([flat_row(row) for row in rows], out / "tradeoffs.csv")
+    kept = ("weight", "value", STYLE_SCORE, *(name for name in formats if name in rows[0]))
+    page.section(
+        "What a style costs",
+        paragraph(
+            "Each weight from neutral to its maximum, the other parameters at their defaults. The style score is what "
+            f"the weight rewards per step, at weight 1; task success is {readable(success)}."
+        ),
+        picture(out / "tradeoffs.png", "task success against style score along each weight"),
+        table([{name: row[name] for name in kept} for row in rows], formats),
+    )
+
+
+def _success(runs: Sequence[Run], formats: Mapping[str, str]) -> str:
+    """The first published metric says whether the task was done."""
+    return next((name for name in formats if name in runs[0].sweeps[0].episodes), "survived")
+
+
+def _text(styles: StyleTable, runs: Sequence[Run], formats: Mapping[str, str], out: Path) -> str:
+    lines = []
+    for row, form in zip(styles.summary(list(formats)), formats.values(), strict=True):
+        extremes = "; ".join(f"{t} {shown(row[t], form)} at {row[f'{t} at']}" for t in ("lowest", "highest"))
+        lines.append(f"{readable(row['metric'])}: {shown(row['all styles'], form)}; {extremes}")
+    complied = estimate(np.array([run.switching.complied for run in runs]))
+    lines.append(f"switches complied with: {shown(complied, '.0%')}")
+    return "\n".join([*lines, f"wrote {out / 'report.html'}"])

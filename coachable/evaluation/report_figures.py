@@ -1,0 +1,205 @@
+"""Figures of a report: metrics per style, requested against measured, switches, Pareto curves."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
+
+from coachable.evaluation.figures import readable
+from coachable.evaluation.runs import Estimate, Run, StyleTable, describe, estimate
+from coachable.evaluation.style_grid import mean_of
+from coachable.evaluation.sweep import STYLE_SCORE
+from coachable.styles import Choice, StyleSpace
+
+__all__ = ["draw_metrics", "draw_requests", "draw_switches", "draw_tradeoffs"]
+
+_COLUMNS = 3
+_MARKERS = "osD^vP*X"  # distinguishable without colour as well
+_MOST_LINES = len(_MARKERS)
+_GROWTH_POINTS = 200
+
+
+def draw_metrics(
+    table: StyleTable, space: StyleSpace, metrics: Sequence[str], formats: Mapping[str, str], path: Path
+) -> None:
+    """Each metric in every style: lines over a numeric parameter where the grid has one, else one point per style."""
+    axis, lines = _lines(table.cells, space)
+    if axis is None:
+        _draw_points(table, metrics, formats, path)
+        return
+    figure, panels = _panels(len(metrics))
+    for panel, metric in zip(panels, metrics, strict=False):
+        for index, (label, cells) in enumerate(lines.items()):
+            estimates = [table.of(metric, [i]) for i in cells]
+            _line(panel, [table.cells[i][axis] for i in cells], estimates, index, label, len(lines))
+        panel.set_xlabel(_named(space, axis, "requested "))
+        panel.set_ylabel(readable(metric))
+        _as_share(panel, formats.get(table.column(metric), ""))
+    _legend(figure, panels[0], len(lines))
+    _save(figure, path)
+
+
+def draw_requests(table: StyleTable, space: StyleSpace, parameters: Sequence[str], path: Path) -> None:
+    """Requested against measured value of each measured parameter, one line per option of the first choice."""
+    choice = next((p for p in space.parameters if isinstance(p, Choice) and p.name in table.cells[0]), None)
+    options: Sequence[Any] = choice.options if choice else (None,)
+    figure, panels = _panels(len(parameters))
+    for panel, name in zip(panels, parameters, strict=False):
+        values = sorted({cell[name] for cell in table.cells})
+        panel.plot(values, values, color="0.6", ls="--", lw=1, label="as requested")
+        for index, option in enumerate(options):
+            members = [
+                [i for i, c in enumerate(table.cells) if c[name] == value and (not choice or c[choice.name] == option)]
+                for value in values
+            ]
+            shown = [(value, table.of(name, cells)) for value, cells in zip(values, members, strict=True) if cells]
+            label = readable(option) if choice else "measured"
+            _line(panel, [x for x, _ in shown], [y for _, y in shown], index, label, len(options))
+        panel.set_xlabel(_named(space, name, "requested "))
+        panel.set_ylabel(_named(space, name, "measured "))
+    _legend(figure, panels[0], len(options) + 1)
+    _save(figure, path)
+
+
+def draw_switches(runs: Sequence[Run], period_seconds: float, path: Path) -> None:
+    """Share of the switches that were complied with, over the time since the switch."""
+    figure, (panel,) = _panels(1)
+    times = np.linspace(0.0, period_seconds, _GROWTH_POINTS)
+    shares = np.array(
+        [
+            (run.switching.comply_seconds.double().numpy()[:, None] <= times + 1e-9).sum(0) / run.switching.switches
+            if run.switching.switches
+            else np.full(len(times), np.nan)
+            for run in runs
+        ]
+    )
+    estimates = [estimate(column) for column in shares.T]
+    panel.plot(times, [e.value for e in estimates])
+    panel.fill_between(times, [e.low for e in estimates], [e.high for e in estimates], alpha=0.25, lw=0)
+    panel.set_xlabel("time since the switch [s]")
+    panel.set_ylabel("switches complied with")
+    panel.set_xlim(0, period_seconds)
+    _as_share(panel, ".0%")
+    panel.grid(alpha=0.3)
+    _save(figure, path)
+
+
+def draw_tradeoffs(runs: Sequence[Run], success: str, form: str, path: Path) -> None:
+    """Task success against style score along each weight, neutral to maximum (paper, Pareto curves)."""
+    figure, panels = _panels(len(runs[0].sweeps))
+    for panel, sweeps in zip(panels, zip(*(run.sweeps for run in runs), strict=True), strict=False):
+        x, y = ([_point(sweeps, metric, i) for i in range(len(sweeps[0].values))] for metric in (STYLE_SCORE, success))
+        panel.errorbar(
+            [e.value for e in x], [e.value for e in y], _reach(y), _reach(x), marker="o", ms=5, capsize=2, lw=1
+        )
+        for position, (value, at, height) in enumerate(zip(sweeps[0].values, x, y, strict=True)):
+            if position in (0, len(x) - 1) and not np.isnan(at.value + height.value):
+                panel.annotate(f"{value:g}", (at.value, height.value), (5, 5), textcoords="offset points", fontsize=8)
+        panel.set_title(readable(sweeps[0].weight), fontsize=10)
+        panel.set_xlabel("style score per step")
+        panel.set_ylabel(readable(success))
+        _as_share(panel, form)
+        panel.grid(alpha=0.3)
+    _save(figure, path)
+
+
+def _point(sweeps: Sequence[Any], metric: str, position: int) -> Estimate:
+    return estimate(np.array([mean_of(sweep.episodes[metric][position]) for sweep in sweeps]))
+
+
+def _draw_points(table: StyleTable, metrics: Sequence[str], formats: Mapping[str, str], path: Path) -> None:
+    height = 0.9 + 0.22 * len(table.cells)
+    figure, panels = plt.subplots(
+        1, len(metrics), figsize=(2.2 + 2.6 * len(metrics), height), sharey=True, squeeze=False, layout="constrained"
+    )
+    rows = list(range(len(table.cells)))
+    for panel, metric in zip(panels[0], metrics, strict=True):
+        estimates = [table.of(metric, [i]) for i in rows]
+        panel.errorbar([e.value for e in estimates], rows, xerr=_reach(estimates), fmt="o", ms=4, capsize=2)
+        panel.set_xlabel(readable(metric))
+        panel.grid(alpha=0.3)
+        if formats.get(table.column(metric), "").endswith("%"):
+            panel.set_xlim(-0.03, 1.03)
+            panel.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+    panels[0, 0].set_yticks(rows, [describe(cell) for cell in table.cells], fontsize=8)
+    panels[0, 0].invert_yaxis()
+    _save(figure, path)
+
+
+def _lines(cells: Sequence[dict[str, Any]], space: StyleSpace) -> tuple[str | None, dict[str, list[int]]]:
+    """The numeric parameter with most values, and the cells of each combination of the others."""
+    counts = {name: len({c[name] for c in cells}) for name in cells[0] if not isinstance(space[name], Choice)}
+    axis = max(counts, key=lambda name: counts[name], default=None)
+    if axis is None or counts[axis] < 3:
+        return None, {}
+    lines: dict[str, list[int]] = {}
+    for i, cell in sorted(enumerate(cells), key=lambda pair: pair[1][axis]):
+        lines.setdefault(describe({k: v for k, v in cell.items() if k != axis}), []).append(i)
+    return (axis, lines) if len(lines) <= _MOST_LINES else (None, {})
+
+
+def _line(panel: Axes, x: Sequence[float], estimates: Sequence[Estimate], index: int, label: str, lines: int) -> None:
+    span = max(x) - min(x) if len(x) > 1 else 1.0
+    offset = (index - (lines - 1) / 2) * 0.012 * span  # so that intervals do not cover each other
+    y = [e.value for e in estimates]
+    panel.errorbar(
+        np.array(x) + offset,
+        y,
+        _reach(estimates),
+        marker=_MARKERS[index % len(_MARKERS)],
+        color=f"C{index}",
+        label=label,
+        capsize=2,
+        ms=5,
+        lw=1.2,
+    )
+    panel.grid(alpha=0.3)
+
+
+def _reach(estimates: Sequence[Estimate]) -> np.ndarray:
+    """(2, n) lengths of the error bars; at least 0, because an interquartile mean may leave its percentile interval."""
+    return np.array([[e.value - e.low for e in estimates], [e.high - e.value for e in estimates]]).clip(min=0)
+
+
+def _panels(count: int) -> tuple[Figure, list[Axes]]:
+    columns = min(count, _COLUMNS)
+    rows = -(-count // columns)
+    size = (4.0 * columns if count > 1 else 5.4, 3.3 * rows)
+    figure, grid = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
+    panels = list(itertools.chain.from_iterable(grid))
+    for panel in panels[count:]:
+        panel.set_visible(False)
+    return figure, panels[:count]
+
+
+def _legend(figure: Figure, panel: Axes, entries: int) -> None:
+    handles, labels = panel.get_legend_handles_labels()
+    if any(labels):
+        figure.legend(handles, labels, loc="outside lower center", ncols=min(entries, 4), fontsize=8, frameon=False)
+
+
+def _as_share(panel: Axes, form: str) -> None:
+    if form.endswith("%"):
+        panel.set_ylim(-0.03, 1.05)
+        panel.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+
+
+def _named(space: StyleSpace, name: str, prefix: str) -> str:
+    unit = space[name].unit
+    return f"{prefix}{readable(name)}{f' [{unit}]' if unit else ''}"
+
+
+def _save(figure: Figure, path: Path) -> None:
+    figure.savefig(path, dpi=130, metadata={"Software": None})
+    plt.close(figure)

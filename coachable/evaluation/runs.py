@@ -1,0 +1,169 @@
+"""Several evaluations of the same styles, one per seed or per trained agent, and what they say together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from coachable.domain import Domain
+from coachable.evaluation.statistics import interquartile_mean, stratified_interval
+from coachable.evaluation.style_grid import StyleGrid, evaluate_grid, mean_of, measured_column
+from coachable.evaluation.sweep import WeightSweep, sweep_weights
+from coachable.evaluation.switching import SwitchReport, evaluate_switching
+from coachable.styles import StyleSpace
+from coachable.training.weights import LoadedPolicy
+
+__all__ = [
+    "SWITCH_PERIOD",
+    "Estimate",
+    "Run",
+    "StyleTable",
+    "describe",
+    "estimate",
+    "evaluate_run",
+    "flat_row",
+    "response_rows",
+]
+
+SWITCH_PERIOD = 100
+"""Env steps between switches of the style."""
+
+
+class Estimate(NamedTuple):
+    """Interquartile mean over runs and tasks, with its 95 % stratified bootstrap interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Run:
+    """One evaluation.
+
+    Attributes:
+        label: "seed 3", or the agent's name.
+        grid: episodes in every style of the grid.
+        switching: episodes with changing styles.
+        sweeps: episodes along each weight.
+    """
+
+    label: str
+    grid: StyleGrid
+    switching: SwitchReport
+    sweeps: list[WeightSweep]
+
+
+def evaluate_run(
+    label: str,
+    domain: Domain,
+    agent: LoadedPolicy,
+    *,
+    episodes: int,
+    switch_episodes: int,
+    sweep_points: int,
+    **options: Any,
+) -> Run:
+    """Evaluate one agent with one seed.
+
+    Args:
+        label: of the run.
+        domain: what to run in.
+        agent: its policy and styles.
+        episodes: per style and per value of a weight.
+        switch_episodes: episodes with a style that switches every `SWITCH_PERIOD` steps.
+        sweep_points: values of each weight.
+        **options: `steps`, `seed`, `num_threads` and `progress`, see `evaluate_grid`.
+    """
+    return Run(
+        label,
+        evaluate_grid(domain, agent.actor, agent.space, episodes=episodes, **options),
+        evaluate_switching(domain, agent.actor, agent.space, episodes=switch_episodes, period=SWITCH_PERIOD, **options),
+        sweep_weights(domain, agent.actor, agent.space, points=sweep_points, episodes=episodes, **options),
+    )
+
+
+def estimate(scores: np.ndarray) -> Estimate:
+    """Aggregate (runs, tasks), or (runs,) of one task."""
+    table = scores[:, None] if scores.ndim == 1 else scores
+    return Estimate(float(interquartile_mean(table.ravel())), *stratified_interval(table))
+
+
+class StyleTable:
+    """What the runs measured in each style.
+
+    Attributes:
+        cells: the styles, by parameter name.
+        scores: metric to (runs, cells), each the mean of a run's episodes.
+    """
+
+    def __init__(self, runs: Sequence[Run]) -> None:
+        self.cells = runs[0].grid.cells
+        self.scores = {
+            name: np.array([[mean_of(cell) for cell in run.grid.episodes[name]] for run in runs])
+            for name in runs[0].grid.episodes
+        }
+
+    def column(self, metric: str) -> str:
+        """Name of a metric in tables, see `measured_column`."""
+        return measured_column(metric, self.cells[0])
+
+    def of(self, metric: str, cells: Sequence[int]) -> Estimate:
+        """A metric over some of the cells."""
+        return estimate(self.scores[metric][:, list(cells)])
+
+    def rows(self, metrics: Sequence[str]) -> list[dict[str, Any]]:
+        """One row per style: its values, and an `Estimate` of each metric."""
+        return [
+            {**cell, **{self.column(metric): self.of(metric, [i]) for metric in metrics}}
+            for i, cell in enumerate(self.cells)
+        ]
+
+    def summary(self, metrics: Sequence[str]) -> list[dict[str, Any]]:
+        """One row per metric: all styles together, and the styles where it is lowest and highest."""
+        rows = []
+        everywhere = range(len(self.cells))
+        for metric in metrics:
+            per_cell = [self.of(metric, [i]) for i in everywhere]
+            values = np.array([cell.value for cell in per_cell])
+            row: dict[str, Any] = {"metric": self.column(metric), "all styles": self.of(metric, everywhere)}
+            if not np.isnan(values).all():
+                for title, i in (("lowest", int(np.nanargmin(values))), ("highest", int(np.nanargmax(values)))):
+                    row |= {title: per_cell[i], f"{title} at": describe(self.cells[i])}
+            else:
+                nothing = Estimate(float("nan"), float("nan"), float("nan"))
+                row |= {"lowest": nothing, "lowest at": "", "highest": nothing, "highest at": ""}
+            rows.append(row)
+        return rows
+
+
+def response_rows(runs: Sequence[Run], space: StyleSpace) -> list[dict[str, Any]]:
+    """How measured set-points follow their requests (`StyleGrid.response`), over the runs."""
+    per_run = [run.grid.response(space) for run in runs]
+    rows = []
+    for entries in zip(*per_run, strict=True):
+        row: dict[str, Any] = {}
+        for name, value in entries[0].items():
+            numeric = name in ("slope", "rank_correlation", "mean_error")
+            row[name] = estimate(np.array([entry[name] for entry in entries])) if numeric else value
+        rows.append(row)
+    return rows
+
+
+def describe(cell: dict[str, Any]) -> str:
+    """A style as people write it."""
+    return ", ".join(f"{k} {v:g}" if isinstance(v, float | int) else f"{v}" for k, v in cell.items()).replace("_", " ")
+
+
+def flat_row(row: dict[str, Any]) -> dict[str, Any]:
+    """A row with every `Estimate` spread over three columns, for CSV."""
+    flat: dict[str, Any] = {}
+    for name, value in row.items():
+        if isinstance(value, Estimate):
+            flat |= {name: value.value, f"{name}_low": value.low, f"{name}_high": value.high}
+        else:
+            flat[name] = value
+    return flat

@@ -1,0 +1,126 @@
+"""One style weight from neutral to its maximum: what the style gains and what the task pays (paper, Pareto curves)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from coachable.domain import Domain, StyleMeasures
+from coachable.evaluation.rollouts import record_episodes
+from coachable.keys import STYLE_FEATURES
+from coachable.styles import StyleReward, StyleSpace, Weight
+from coachable.transforms import coachable_env
+
+__all__ = ["STYLE_SCORE", "WeightSweep", "sweep_weights"]
+
+STYLE_SCORE = "style_score"
+
+
+@dataclass(frozen=True)
+class WeightSweep:
+    """Episodes along one weight, the other parameters at their defaults.
+
+    Attributes:
+        weight: name of the parameter.
+        values: (P,) requested.
+        episodes: name to (P, episodes); `style_score` is what the weight rewards, per step and at weight 1.
+    """
+
+    weight: str
+    values: np.ndarray
+    episodes: dict[str, np.ndarray]
+
+
+def sweep_weights(
+    domain: Domain,
+    policy: TensorDictModuleBase,
+    space: StyleSpace,
+    *,
+    points: int = 5,
+    episodes: int = 4,
+    steps: int | None = None,
+    seed: int = 0,
+    num_threads: int | None = None,
+    progress: bool = True,
+) -> list[WeightSweep]:
+    """Run `episodes` episodes at `points` values of every `Weight` of the space, all of them in one batch.
+
+    Args:
+        domain: what to run in.
+        policy: reads `observation` and `style`.
+        space: the policy's style space.
+        points: values from neutral to the upper end of the range that reports sweep (the lower one if that is 0).
+        episodes: per value.
+        steps: length of an episode; default: the domain's.
+        seed: of the initial states.
+        num_threads: physics threads.
+        progress: show a bar.
+
+    Returns:
+        One sweep per weight; empty without weights.
+    """
+    weights = [p for p in space.parameters if isinstance(p, Weight)]
+    if not weights or points < 2:
+        return []
+    requests = [np.linspace(0.0, _far_end(weight), points) for weight in weights]
+    rows = [(weight.name, value) for weight, values in zip(weights, requests, strict=True) for value in values]
+    theta = torch.stack([space.make(strict=True, **{name: value}) for name, value in rows])
+    theta = theta.repeat_interleave(episodes, 0)
+    reward = domain.make_reward(space)
+    unit = space.default.repeat(len(rows), 1)
+    for row, (name, _) in enumerate(rows):
+        unit[row, space.slices[name]] = 1.0
+    measures = _WithStyleScore(domain.measures, reward, unit.repeat_interleave(episodes, 0))
+    env = coachable_env(domain.make_env(num_envs=len(theta), num_threads=num_threads), space, reward, seed=seed)
+    record = record_episodes(
+        env,
+        policy,
+        theta,
+        measures,
+        steps=steps or domain.episode_steps,
+        seed=seed,
+        progress=f"{len(weights)} weights x {points} values" if progress else None,
+    )
+    env.close()
+    values = {"survived": record.survived.float(), "task_return": record.task_return}
+    values |= measures.summarise(record.measures, record.alive)
+    shape = (len(weights), points, episodes)
+    shaped = {name: value.reshape(shape).double().numpy() for name, value in values.items()}
+    return [
+        WeightSweep(weight.name, requests[i], {name: value[i] for name, value in shaped.items()})
+        for i, weight in enumerate(weights)
+    ]
+
+
+class _WithStyleScore:
+    """A domain's measures, and what one style term pays per step at weight 1, whatever weight was requested."""
+
+    def __init__(self, measures: StyleMeasures, reward: StyleReward, unit: Tensor) -> None:
+        self._measures = measures
+        self._reward = reward
+        self._unit = unit  # (N, d) the default style with the row's weight at 1
+        self._neutral = reward.space.default.expand_as(unit)
+
+    def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
+        features = transition.get(("next", STYLE_FEATURES))
+        score = self._reward(features, self._unit) - self._reward(features, self._neutral)
+        return {**self._measures.step(transition), STYLE_SCORE: score.squeeze(-1)}
+
+    def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
+        own = {name: values for name, values in record.items() if name != STYLE_SCORE}
+        score = torch.where(alive, record[STYLE_SCORE], torch.nan).nanmean(0)
+        return {**self._measures.summarise(own, alive), STYLE_SCORE: score}
+
+    def complies(self, record: Mapping[str, Tensor]) -> Tensor:
+        return self._measures.complies(record)
+
+
+def _far_end(weight: Weight) -> float:
+    low, high = weight.evaluation_range
+    return high if high > 0 else low
