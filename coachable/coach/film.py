@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,7 @@ def film(
     *,
     last: float | None = None,
     size: tuple[int, int] = (640, 480),
+    on_progress: Callable[[float], None] = lambda share: None,
 ) -> Path:
     """Replays a recording beside its session, which may go on meanwhile, and writes what it looked like.
 
@@ -29,6 +30,7 @@ def film(
         out: `.mp4` or `.gif`.
         last: only the last so many seconds.
         size: width and height [px].
+        on_progress: called with the share that is done, from 0 to 1.
 
     Returns:
         `out`.
@@ -44,14 +46,18 @@ def film(
     out.parent.mkdir(parents=True, exist_ok=True)
     replica = session.replica()
     try:
-        write_video(_frames(replica, recording, last, size), out, round(1 / session.domain.control_step))
+        write_video(_frames(replica, recording, last, size, on_progress), out, round(1 / session.domain.control_step))
     finally:
         replica.close()
     return out
 
 
 def _frames(
-    session: CoachSession, recording: Recording, last: float | None, size: tuple[int, int]
+    session: CoachSession,
+    recording: Recording,
+    last: float | None,
+    size: tuple[int, int],
+    on_progress: Callable[[float], None],
 ) -> Iterator[np.ndarray]:
     first = 0 if last is None else recording.steps - round(last / session.domain.control_step)
     renderer = session.domain.make_renderer(*size)
@@ -59,6 +65,7 @@ def _frames(
     try:
         for step in range(recording.steps):
             session.step()
+            on_progress((step + 1) / recording.steps)
             if step >= first:
                 yield caption(renderer.draw(session.env), _lines(session))
     finally:

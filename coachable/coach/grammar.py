@@ -87,7 +87,7 @@ class StyleGrammar:
         >>> from coachable.styles import Setpoint
         >>> grammar = StyleGrammar([Setpoint("gap", 0.0, 2.0, unit="m")])
         >>> print(grammar.read("a bit more gap", {"gap": 1.0}))
-        gap 1 -> 1.2 m
+        gap 1 → 1.2 m
         >>> print(grammar.read("sing louder", {"gap": 1.0}))
         not understood: 'sing louder' (unknown: sing, louder)
     """
@@ -332,7 +332,7 @@ class StyleGrammar:
         was = f"{before:.3g}" if number else _shown(parameter, before)
         outside = number and not parameter.low <= float(value) <= parameter.high
         trained = f", outside the trained range {parameter.low:g} to {parameter.high:g}" if outside else ""
-        reading.said.append(f"{name} {was} -> {_shown(parameter, value)}{trained}")
+        reading.said.append(f"{name} {was} → {_shown(parameter, value)}{trained}")
         reading.values[name] = reading.changes[name] = value
 
     @staticmethod

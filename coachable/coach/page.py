@@ -15,8 +15,9 @@ from coachable.coach.plan import read_plan
 from coachable.coach.recording import Recording
 from coachable.coach.report import StyleReport, measures_by_parameter
 from coachable.coach.session import CoachSession
-from coachable.coach.views import make_view
+from coachable.coach.views import View, make_view
 from coachable.coach.widgets import Chart, MeasuredText, ParameterWidget, number, write
+from coachable.styles import Parameter
 
 if TYPE_CHECKING:
     import viser
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 _FRAMES_PER_SECOND = 30.0
 _REPORTS_PER_SECOND = 5.0
 _FILM_SECONDS = 10.0
+_PAUSE, _RESUME, _STEP, _RESET = "Pause", "Resume", "Step", "Reset"
 
 
 class CoachPage:
@@ -44,27 +46,20 @@ class CoachPage:
     def __init__(self, server: viser.ViserServer, session: CoachSession) -> None:
         self.server, self.session = server, session
         self.loop = LiveLoop(session, self._on_step)
-        self._view = None
+        self._view: View | None = None
         self._frame_due = self._report_due = 0.0
-        self.status = server.gui.add_markdown("")
-        self._add_phrase_box()
         self.widgets: dict[str, ParameterWidget] = {}
         self.measured: dict[str, MeasuredText] = {}
-        with server.gui.add_folder("Style"):
-            for parameter in session.space.parameters:
-                self._add_widget(parameter, session.style[parameter.name], self._set)
-                self.measured[parameter.name] = MeasuredText(server, parameter)
-            self.others = server.gui.add_markdown("")
-        with server.gui.add_folder("Requested and measured"):
-            self.chart = Chart(server, session.space, 1.0 / _REPORTS_PER_SECOND)
+        self.status = server.gui.add_markdown("")
         self._add_run()
-        if session.coaching.controls:
-            with server.gui.add_folder("Steering"):
-                for control in session.coaching.controls:
-                    name = control.parameter.name
-                    self._add_widget(control.parameter, session.controls[name], self._steer)
-        self._add_presets()
-        self._add_recording()
+        tabs = server.gui.add_tab_group()
+        with tabs.add_tab("Coach"):
+            self._add_phrase_box()
+            self._add_style()
+        with tabs.add_tab("Plan"):
+            self._add_presets()
+        with tabs.add_tab("Session"):
+            self._add_session()
 
     def start(self) -> None:
         """Begins to act."""
@@ -78,9 +73,23 @@ class CoachPage:
 
     # -- widgets ---------------------------------------------------------------------------------------------------
 
-    def _add_widget(self, parameter: Any, value: float | str, write: Callable[[ParameterWidget], None]) -> None:
+    def _add_style(self) -> None:
+        with self.server.gui.add_folder("Style"):
+            for parameter in self.session.space.parameters:
+                self._add_widget(parameter, self.session.style[parameter.name], self._set)
+                self.measured[parameter.name] = MeasuredText(self.server, parameter)
+            self.others = self.server.gui.add_markdown("")
+        if self.session.coaching.controls:
+            with self.server.gui.add_folder("Steering"):
+                for control in self.session.coaching.controls:
+                    name = control.parameter.name
+                    self._add_widget(control.parameter, self.session.controls[name], self._steer)
+        with self.server.gui.add_folder("Requested and measured"):
+            self.chart = Chart(self.server, self.session.space)
+
+    def _add_widget(self, parameter: Parameter, value: float | str, request: Callable[[ParameterWidget], None]) -> None:
         name = parameter.name
-        self.widgets[name] = ParameterWidget(self.server, parameter, value, lambda: write(self.widgets[name]))
+        self.widgets[name] = ParameterWidget(self.server, parameter, value, lambda: request(self.widgets[name]))
 
     def _set(self, widget: ParameterWidget) -> None:
         self.loop.submit(lambda session: session.set(**widget.take()))
@@ -90,11 +99,11 @@ class CoachPage:
 
     def _add_phrase_box(self) -> None:
         gui = self.server.gui
-        with gui.add_form("Say it") as form:
+        with gui.add_form("In words") as form:
             self.phrase = gui.add_text("phrase", "", hint="such as: shorter steps, arms up; a bit more; 0.4 m")
-            say = gui.add_button("Apply")
+            self.say = gui.add_button("Apply")
             self.answer = gui.add_markdown("")
-        say.on_click(lambda _: form.submit())
+        self.say.on_click(lambda _: form.submit())
 
         @form.on_submit
         def _(_: Any) -> None:
@@ -103,46 +112,42 @@ class CoachPage:
 
     def _add_run(self) -> None:
         gui = self.server.gui
-        with gui.add_folder("Run"):
-            self.pause = gui.add_button("Pause")
-            self.step = gui.add_button("Single step")
-            self.reset = gui.add_button("Reset")
-            self.speed = gui.add_slider("speed (1 is real time)", 0.1, 4.0, 0.1, 1.0)
-            self.seed = gui.add_number("seed", self.session.recording().seed, min=0, step=1)
-            reseed = gui.add_button("Start over with seed", hint="also begins a new recording")
-            self.hold = gui.add_checkbox(
-                "hold the style", True, hint="otherwise each episode draws one, as in training"
-            )
-
-        self.pause.on_click(lambda _: self._pause(not self.loop.paused))
-        self.step.on_click(lambda _: self.loop.single_step())
-        self.reset.on_click(lambda _: self.loop.submit(lambda session: session.reset()))
-        reseed.on_click(lambda _: self.loop.submit(lambda session: session.reset(int(self.seed.value))))
-        self.hold.on_update(lambda _: self.loop.submit(lambda session: setattr(session, "hold", self.hold.value)))
+        self.run = gui.add_button_group("run", (_PAUSE, _STEP, _RESET))
+        self.speed = gui.add_slider("speed", 0.1, 4.0, 0.1, 1.0, hint="simulated seconds per second; 1 is real time")
+        self.run.on_click(lambda _: self._press(self.run.value))
         self.speed.on_update(lambda _: self._change_speed())
+
+    def _press(self, button: str) -> None:
+        if button == _STEP:
+            self.loop.single_step()
+        elif button == _RESET:
+            self.loop.submit(lambda session: session.reset())
+        else:
+            self.loop.paused = button == _PAUSE
+            self.loop.submit(lambda _: None)  # shows the state
 
     def _change_speed(self) -> None:
         if self.speed.value > 0:  # false for NaN
             self.loop.speed = float(self.speed.value)
 
-    def _pause(self, paused: bool) -> None:
-        self.loop.paused = paused
-        self.loop.submit(lambda _: None)  # shows the state
-
     def _add_presets(self) -> None:
         gui = self.server.gui
-        with gui.add_folder("Presets and schedule"):
+        with gui.add_folder("Presets"):
             self.preset = gui.add_dropdown("preset", list(self.session.presets))
             apply = gui.add_button("Apply preset")
             self.preset_name = gui.add_text("new name", "")
             keep = gui.add_button("Save style as preset")
-            self.plan = gui.add_text("schedule", "", multiline=True, hint="SECONDS: PHRASE or preset; one per line")
-            run = gui.add_button("Run schedule")
-            cancel = gui.add_button("Stop schedule or replay")
+        with gui.add_folder("Schedule"):
+            gui.add_markdown("One `SECONDS: PHRASE` or `SECONDS: PRESET` per line, such as `3: arms up`.")
+            self.plan = gui.add_text("plan", "", multiline=True)
+            self.run_plan = gui.add_button("Run schedule")
+            cancel = gui.add_button("Stop schedule")
 
         apply.on_click(lambda _: self.loop.submit(lambda session: session.apply(self.preset.value)))
         keep.on_click(lambda _: self.loop.submit(self._save_preset))
-        run.on_click(lambda _: self.loop.submit(lambda session: session.schedule(read_plan(self.plan.value, session))))
+        self.run_plan.on_click(
+            lambda _: self.loop.submit(lambda session: session.schedule(read_plan(self.plan.value, session)))
+        )
         cancel.on_click(lambda _: self.loop.submit(lambda session: session.cancel()))
 
     def _save_preset(self, session: CoachSession) -> None:
@@ -153,18 +158,28 @@ class CoachPage:
         self.preset.options = tuple(session.presets)
         self.preset.value = name
 
-    def _add_recording(self) -> None:
+    def _add_session(self) -> None:
         gui = self.server.gui
-        with gui.add_folder("Recording", expand_by_default=False):
+        with gui.add_folder("Episodes"):
+            self.hold = gui.add_checkbox(
+                "hold the style", True, hint="otherwise each episode draws one, as in training"
+            )
+            self.seed = gui.add_number("seed", self.session.recording().seed, min=0, step=1)
+            reseed = gui.add_button("Start over with seed", hint="also begins a new recording")
+        with gui.add_folder("Recording"):
             save = gui.add_button("Download JSON", hint="everything since the last seed; replays exactly")
             again = gui.add_button("Replay from the start")
             load = gui.add_upload_button("Replay a JSON file", mime_type="application/json")
+            stop = gui.add_button("Stop replay")
             shoot = gui.add_button(f"Film the last {_FILM_SECONDS:g} s (mp4)")
             self.film_note = gui.add_markdown("")
 
+        self.hold.on_update(lambda _: self.loop.submit(lambda session: setattr(session, "hold", self.hold.value)))
+        reseed.on_click(lambda _: self.loop.submit(lambda session: session.reset(int(self.seed.value))))
         save.on_click(lambda _: self.loop.submit(self._send_recording))
         again.on_click(lambda _: self.loop.submit(lambda session: session.replay(session.recording())))
         load.on_upload(lambda _: self.loop.submit(lambda session: session.replay(_read(load.value.content))))
+        stop.on_click(lambda _: self.loop.submit(lambda session: session.cancel()))
         shoot.on_click(lambda _: self.loop.submit(self._shoot))
 
     def _send_recording(self, session: CoachSession) -> None:
@@ -172,17 +187,24 @@ class CoachPage:
 
     def _shoot(self, session: CoachSession) -> None:
         recording = session.recording()
-        self.film_note.content = "drawing, the agent goes on meanwhile ..."
         threading.Thread(target=self._film, args=(recording,), name="filming", daemon=True).start()
 
     def _film(self, recording: Recording) -> None:
         try:
             with tempfile.TemporaryDirectory() as folder:
-                file = film(recording, self.session, Path(folder) / "film.mp4", last=_FILM_SECONDS)
+                file = film(
+                    recording,
+                    self.session,
+                    Path(folder) / "film.mp4",
+                    last=_FILM_SECONDS,
+                    on_progress=lambda share: write(
+                        self.film_note, f"drawing: {share:.0%}, the agent goes on meanwhile"
+                    ),
+                )
                 self.server.send_file_download(f"{recording.domain}.mp4", file.read_bytes())
             self.film_note.content = "drawn"
         except Exception as error:  # this thread has nobody else to tell
-            self.film_note.content = f"⚠ {_escaped(str(error))}"
+            self.film_note.content = f"**Problem:** {_escaped(str(error))}"
 
     # -- read-outs, in the loop's thread ---------------------------------------------------------------------------
 
@@ -202,7 +224,9 @@ class CoachPage:
     def _show(self, report: StyleReport) -> None:
         with self.server.atomic():
             write(self.status, self._status(report))
-            self.pause.label = "Resume" if self.loop.paused else "Pause"
+            buttons = (_RESUME if self.loop.paused else _PAUSE, _STEP, _RESET)
+            if self.run.options != buttons:
+                self.run.options = buttons
             groups = measures_by_parameter(self.session.space, report.measured)
             for name, text in self.measured.items():
                 text.update(report, groups[name])
@@ -212,14 +236,14 @@ class CoachPage:
 
     def _status(self, report: StyleReport) -> str:
         if self.loop.problem:
-            first = f"⚠ **{_escaped(self.loop.problem)}**"
+            first = f"**Problem:** {_escaped(self.loop.problem)}"
         elif report.ended is not None:
-            first = f"🔄 **The agent {report.ended}** after {report.episode_time:.1f} s; a new episode begins."
+            first = f"**The agent {report.ended}** after {report.episode_time:.1f} s; a new episode begins."
         elif report.complied_after is not None:
-            first = f"✅ **Does what was asked**, {report.complied_after:.1f} s after the request."
+            first = f"**Request met**, after {report.complied_after:.1f} s."
         else:
-            first = f"⏳ Asked {report.since_request:.1f} s ago, not yet met."
-        state = "paused" if self.loop.paused else f"{self.loop.factor:.2f} of real time"
+            first = f"Request not yet met, after {report.since_request:.1f} s."
+        state = "**paused**" if self.loop.paused else f"{self.loop.factor:.2f} of real time"
         if self.session.replaying:
             state += " · replaying"
         elif self.session.scheduled:

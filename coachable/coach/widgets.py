@@ -41,7 +41,7 @@ class ParameterWidget:
                 label(parameter), options, initial_value=_words(str(value)), hint=hint
             )
         else:
-            step = float(f"{(parameter.high - parameter.low) / _SLIDER_STEPS:.1g}")
+            step = 10.0 ** math.floor(math.log10((parameter.high - parameter.low) / _SLIDER_STEPS))
             self.handle = server.gui.add_slider(
                 label(parameter), parameter.low, parameter.high, step, self._inside(float(value)), hint=hint
             )
@@ -67,8 +67,8 @@ class ParameterWidget:
         self.handle.value = _words(value) if isinstance(value, str) else self._inside(value)
 
     def _inside(self, value: float) -> float:
-        """Float32 rounds to just beyond the bounds."""
-        return min(max(value, self.parameter.low), self.parameter.high)
+        """Float32 has digits that nobody asked for, and rounds to just beyond the bounds."""
+        return min(max(float(f"{value:.6g}"), self.parameter.low), self.parameter.high)
 
     def _same(self, value: float | str) -> bool:
         if isinstance(value, str) or isinstance(self._shown, str):
@@ -81,78 +81,90 @@ class MeasuredText:
 
     def __init__(self, server: viser.ViserServer, parameter: Parameter) -> None:
         self.parameter = parameter
-        self.handle = server.gui.add_markdown("measured: nothing yet")
+        self.handle = server.gui.add_markdown(trained(parameter))
 
     def update(self, report: StyleReport, measures: list[str]) -> None:
         """Shows the report's values of `measures`."""
-        shown = [f"{self._name(m)} **{number(report.measured[m])}**" for m in measures if m in report.measured]
-        text = "measured: " + (", ".join(shown) or "nothing yet")
+        shown = [f"{self._name(m)}**{number(report.measured[m])}{self._unit(m)}**" for m in measures]
+        text = " · ".join(filter(None, [f"measured {', '.join(shown) or 'nothing yet'}", trained(self.parameter)]))
         outside = report.outside.get(self.parameter.name)
         if outside is not None:
-            used = report.requested[self.parameter.name]
-            text += (
-                f"\n\n⚠ **{outside:g} {self.parameter.unit} was never trained**: {used:g} {self.parameter.unit} is used"
-            )
+            used, unit = report.requested[self.parameter.name], f" {self.parameter.unit}".rstrip()
+            text += f"\n\n**Outside the trained range:** {outside:g}{unit} was asked for, {used:.3g}{unit} is used."
         write(self.handle, text)
 
     def _name(self, measure: str) -> str:
+        """Without the parameter's own name."""
         rest = f"_{measure}_".replace(f"_{self.parameter.name}_", "_").strip("_")
-        return _words(rest or measure)
+        return f"{_words(rest)} " if rest else ""
+
+    def _unit(self, measure: str) -> str:
+        return f" {self.parameter.unit}" if self.parameter.unit and measure == self.parameter.name else ""
 
 
 class Chart:
     """Requested against measured over the last seconds, of one parameter at a time."""
 
-    def __init__(self, server: viser.ViserServer, space: StyleSpace, period: float) -> None:
+    def __init__(self, server: viser.ViserServer, space: StyleSpace) -> None:
         import viser.uplot as uplot
 
-        self._space, self._period = space, period
+        self._space = space
         self._history: deque[tuple[float, StyleReport]] = deque(maxlen=_HISTORY)
-        names = [p.name for p in space.parameters]
-        numeric = [p.name for p in space.parameters if not isinstance(p, Choice)]
-        self.choice = server.gui.add_dropdown("show", names, initial_value=(numeric or names)[0])
+        self._names = {_words(name): name for name in space.names}
+        numeric = [_words(p.name) for p in space.parameters if not isinstance(p, Choice)]
+        self.choice = server.gui.add_dropdown("show", list(self._names), initial_value=[*numeric, *self._names][0])
         self.plot = server.gui.add_uplot(
-            data=(np.zeros(1), np.full(1, np.nan), np.full(1, np.nan)),
+            data=(np.zeros(1), np.zeros(1), np.zeros(1)),
             series=(
                 uplot.Series(label="time [s]"),
                 uplot.Series(label="requested", stroke="#d62728", width=2),
                 uplot.Series(label="measured", stroke="#1f77b4", width=2),
             ),
             scales={"x": uplot.Scale(time=False)},
-            axes=(uplot.Axis(size=26), uplot.Axis(size=44)),
-            height=180,
+            axes=(uplot.Axis(size=34), uplot.Axis(size=48)),
+            height=190,
         )
 
     def add(self, time: float, report: StyleReport) -> None:
         """A further point."""
-        if self._history and time <= self._history[-1][0]:
+        if self._history and time < self._history[-1][0]:
             self._history.clear()  # the session started over
+        elif self._history and time == self._history[-1][0]:
+            self._history.pop()  # shown again, for example while paused
         self._history.append((time, report))
         self.draw()
 
     def draw(self) -> None:
         """Shows the chosen parameter: a number as it is; of a choice, the share of time in which it was met."""
-        name = self.choice.value
-        rows = [(t, self._requested(r, name), self._measured(r, name)) for t, r in self._history]
+        name = self._names[self.choice.value]
+        rows, seen = [], math.nan
+        for moment, report in self._history:
+            seen = self._measured(report, name, otherwise=seen)
+            if math.isfinite(seen):  # uPlot draws nothing at all if there are NaN
+                rows.append((moment, self._requested(report, name), seen))
         if rows:
-            times, asked, seen = np.array(rows, dtype=float).T
-            self.plot.data = (times, asked, seen)
+            times, asked, measured = np.array(rows, dtype=float).T
+            self.plot.data = (times, asked, measured)
 
     def _requested(self, report: StyleReport, name: str) -> float:
         value = report.requested[name]
         return 1.0 if isinstance(value, str) else value
 
-    def _measured(self, report: StyleReport, name: str) -> float:
+    def _measured(self, report: StyleReport, name: str, otherwise: float) -> float:
         measures = measures_by_parameter(self._space, report.measured)[name]
-        return report.measured[measures[0]] if measures else math.nan
+        return report.measured[measures[0]] if measures else otherwise
 
 
 def label(parameter: Parameter) -> str:
-    """Name, unit and trained range."""
+    """Name and unit."""
+    return _words(parameter.name) + (f" [{parameter.unit}]" if parameter.unit else "")
+
+
+def trained(parameter: Parameter) -> str:
+    """The trained range, of a number."""
     if isinstance(parameter, Choice):
-        return _words(parameter.name)
-    unit = f" {parameter.unit}" if parameter.unit else ""
-    return f"{_words(parameter.name)} ({parameter.low:g} to {parameter.high:g}{unit})"
+        return ""
+    return f"trained {parameter.low:g} to {parameter.high:g} {parameter.unit}".rstrip()
 
 
 def number(value: float) -> str:
