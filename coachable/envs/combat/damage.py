@@ -1,0 +1,278 @@
+"""Hits on the machine: shots at body and parts, the spear, elements, and who gets the credit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from coachable.envs.combat import constants as c
+from coachable.envs.combat.player import Intent, rows_where
+from coachable.envs.combat.state import FIRE, MELEE, NO_SHOT, NO_SWING, RELOAD, State, nearest, pick
+from coachable.envs.combat.tables import ELEMENTS, PART_TYPES, load_table
+from coachable.envs.combat.traits import BLAST, INTERVAL, RANGE, SPEED, SPREAD, Traits
+from coachable.envs.combat.traits import RELOAD as RELOAD_FRAMES
+
+ACID, PURGEWATER, FROST, SHOCK, PLASMA, BURNING, ADHESIVE = range(len(ELEMENTS))
+_CANISTER = PART_TYPES.index("canister")
+_FAR = 1e6  # [m], further than anything
+
+# Rows of `Totals.dealt`.
+BY_SHOT, BY_SPEAR, BY_TRAP, BY_ACID, BY_FIRE, BY_PLASMA = range(6)
+
+
+@dataclass
+class Totals:
+    """What a step did to the machines, summed over its frames.
+
+    Attributes:
+        dealt: (6, E, N) damage by what did it, clipped to the health left [HP]; rows above.
+        in_state: (7, E, N) damage while each elemental state was active [HP].
+        buildup: (7, E, N) gauge gained less decay.
+        part_dealt: (12, E, N) damage to parts, clipped to the unit's health [HP].
+        removed: (12, E, N) units removed.
+        taken: (N,) damage to the player [HP].
+    """
+
+    dealt: Tensor
+    in_state: Tensor
+    buildup: Tensor
+    part_dealt: Tensor
+    removed: Tensor
+    taken: Tensor
+
+    @classmethod
+    def zeros(cls, like: Tensor, slots: int) -> Totals:
+        """Nothing yet; `like` is (E, N)."""
+        shapes = (6, len(ELEMENTS), len(ELEMENTS), slots, slots)
+        return cls(*(like.new_zeros((rows, *like.shape)) for rows in shapes), taken=like.new_zeros(like.shape[-1]))
+
+
+@dataclass
+class ElementNumbers:
+    """elements.csv as columns (7, 1, 1): duration [frames], damage per frame [HP], factor less 1 on hits."""
+
+    frames: Tensor
+    damage: Tensor
+    hit_bonus: Tensor
+
+    @classmethod
+    def load(cls, device: torch.device) -> ElementNumbers:
+        """From the data file."""
+        table = load_table("elements")
+
+        def column(name: str) -> Tensor:
+            return torch.tensor([table.number(e, name) for e in ELEMENTS], device=device).view(-1, 1, 1)
+
+        return cls(column("seconds") * c.FPS, column("damage_per_second") * c.DT, column("hit_factor") - 1.0)
+
+
+def shoot(
+    s: State, intent: Intent, traits: Traits, relative: Tensor, distance: Tensor, spread: Tensor, blocked_at: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """One frame of the weapon: whether it fires, what the shot meets first, and the damage to the parts.
+
+    There are no projectiles: everything is shifted by what it will have moved when the shot arrives.
+
+    Args:
+        s: state; magazine timers and technique change.
+        intent: of the step; `loaded` changes.
+        traits: of the machines.
+        relative: (2, E, N) enemies from the player [m].
+        distance: (E, N) their distance [m].
+        spread: (2, N) standard normal numbers.
+        blocked_at: (N,) distance at which a pillar stops the shot [m].
+
+    Returns:
+        Hit (E, N) as 0 or 1, factor of the body's damage (E, N), and of the parts' damage (12, E, N).
+    """
+    fires = intent.shooting & (s.timers[NO_SHOT].amax(0) <= 0) & (intent.loaded > 0)
+    intent.loaded = intent.loaded - 1.0 * fires
+    rows_where(s.timers, FIRE, fires, intent.ammo[INTERVAL])
+    rows_where(s.timers, RELOAD, fires & (intent.loaded <= 0), intent.ammo[RELOAD_FRAMES])
+
+    yaw, pitch = s.yaw + intent.ammo[SPREAD] * spread[0], s.pitch + intent.ammo[SPREAD] * spread[1]
+    flat = pitch.cos()
+    x, y, z = flat * yaw.cos(), flat * yaw.sin(), pitch.sin()
+    centre = relative + s.enemy_velocity * (distance / intent.ammo[SPEED])  # (2, E, N)
+    height = s.enemy_z + traits.radius - c.EYE_HEIGHT
+    along = centre[0] * x + centre[1] * y + height * z
+    squared = centre.square().sum(0) + height.square()
+    body = _entry(along, squared - (c.BODY_SPHERE * traits.radius).square())
+
+    # The same in the machine's frame, where its parts are at rest: (3, E, N) ray and centre.
+    cos, sin = s.enemy_yaw.cos(), s.enemy_yaw.sin()
+    ray = (cos * x + sin * y, cos * y - sin * x, z.expand_as(cos))
+    middle = (cos * centre[0] + sin * centre[1], cos * centre[1] - sin * centre[0], height)
+    part_along, part_across = _dot(traits.offset, ray), _dot(traits.offset, middle)  # (12, E, N)
+    reach = (c.PART_DISTANCE * traits.radius).square()
+    squared_parts = (squared + reach - traits.part_radius.square()) + 2.0 * part_across
+    present = s.count.clamp(max=1.0)
+    entries = _entry(part_along + along, squared_parts) + _FAR * (1.0 - present)
+    first_part = entries.amin(0)  # (E, N)
+
+    first = torch.minimum(first_part, body)
+    limit = torch.minimum(intent.ammo[RANGE], blocked_at)
+    meets = fires & (first <= limit) & (s.enemy_hp > 0)
+    if first.shape[0] > 1:  # the nearest of several
+        alive_first = first + _FAR * (s.enemy_hp <= 0)
+        meets = meets & (alive_first <= alive_first.amin(0))
+    struck = ((entries <= torch.minimum(first_part, body)) & meets).float()  # (12, E, N), at most one part
+
+    # A blast reaches parts near the point of impact.
+    impact = tuple(first * r - m for r, m in zip(ray, middle, strict=True))
+    impact_squared = impact[0].square() + impact[1].square() + impact[2].square()
+    gap = ((impact_squared + reach) - 2.0 * (first * part_along - part_across)).clamp(min=0.0).sqrt()
+    reach_of_blast = intent.ammo[BLAST] + traits.part_radius
+    blast = meets.float() * (intent.ammo[BLAST] > 0)
+    shares = torch.maximum((1.0 - gap / reach_of_blast).clamp(min=0.0) * blast, struck) * present
+
+    # The technique doubles the shot that is fired, hit or miss.
+    technique = 1.0 + (c.TECHNIQUE_FACTOR - 1.0) * s.technique
+    s.technique = torch.where(fires, 0.0, s.technique)
+    hit = meets.float()
+    body_factor = technique * hit * (1.0 + (struck * traits.hit_factor).sum(0))
+    return hit, body_factor, shares * technique
+
+
+def _dot(offset: Tensor, vector: tuple[Tensor, ...]) -> Tensor:
+    """(3, 12, E, N) times three (E, N), summed: (12, E, N)."""
+    total = offset[0] * vector[0]
+    total = torch.addcmul(total, offset[1], vector[1])
+    return torch.addcmul(total, offset[2], vector[2])
+
+
+def _entry(along: Tensor, squared: Tensor) -> Tensor:
+    """Distance at which a ray enters a sphere, `_FAR` or more if it misses.
+
+    Args:
+        along: projection of the centre on the ray [m].
+        squared: squared distance of the centre less the squared radius [m^2].
+    """
+    inside = along.square() - squared
+    # Arithmetic instead of a selection: on the CPU a selection between random elements is ten times slower.
+    missed = (-inside).clamp(min=0.0).sign() + (-along).clamp(min=0.0).sign()
+    return (along - inside.clamp(min=0.0).sqrt()).clamp(min=0.0) + _FAR * missed
+
+
+def damage_parts(s: State, traits: Traits, damage: Tensor, totals: Totals) -> Tensor:
+    """Takes damage (12, E, N) off the parts; at most one unit of each is removed.
+
+    Returns:
+        (E, N) canisters burst, 0 or 1.
+    """
+    applied = torch.minimum(damage, s.part_hp * s.count.clamp(max=1.0))
+    left = s.part_hp - applied
+    gone = (applied > 0).float() * (left <= 0).float()
+    s.count = s.count - gone
+    s.part_hp = left + gone * traits.unit_hp
+    totals.part_dealt = totals.part_dealt + applied
+    totals.removed = totals.removed + gone
+    return (gone * traits.part_type[_CANISTER]).amax(0)
+
+
+def swing(s: State, intent: Intent, traits: Traits) -> Tensor:
+    """One frame of the spear: lunge and damage on the first frame of a swing.
+
+    Returns:
+        (E, N) damage [HP].
+    """
+    wanted = (intent.light | intent.heavy) & (s.timers[NO_SWING].amax(0) <= 0)
+    duration = torch.where(intent.heavy, c.HEAVY_TIME * c.FPS, c.LIGHT_TIME * c.FPS)
+    rows_where(s.timers, MELEE, wanted, duration)
+    second = nearest(s)
+    offset = pick(s.enemy_position, second) - s.position
+    distance = offset.square().sum(0).sqrt().clamp(min=1e-3)
+    radius = pick(traits.radius, second)
+    gap = distance - radius - c.BODY_RADIUS
+    living = pick(s.enemy_hp, second) > 0
+    cosine = (offset[0] * s.yaw.cos() + offset[1] * s.yaw.sin()) / distance
+    aimed = wanted & living & (cosine > _MELEE_COSINE) & (pick(s.enemy_z, second) < c.REACHABLE_HEIGHT)
+    lunge = torch.where(aimed & (gap < c.LUNGE_GAP), gap.clamp(0.0, c.LUNGE), 0.0)
+    s.position = s.position + offset * (lunge / distance)
+    strikes = aimed & (distance - lunge < radius + c.MELEE_REACH)
+    damage = torch.where(intent.heavy, c.HEAVY_DAMAGE, c.LIGHT_DAMAGE) * strikes
+    if s.enemy_hp.shape[0] == 1:
+        return damage.unsqueeze(0)
+    return torch.stack((damage * ~second, damage * second))
+
+
+_MELEE_COSINE = float(torch.tensor(c.MELEE_CONE).cos())
+
+
+def build_up(s: State, gain: Tensor, source: Tensor | float, totals: Totals) -> None:
+    """Adds build-up to the gauges; a running state takes none.
+
+    Args:
+        s: state.
+        gain: (7, E, N) as shares of the threshold, growth of shock's threshold left out.
+        source: what builds up, (N,) or one number.
+        totals: of the step.
+    """
+    idle = 1.0 - s.state_timer.clamp(max=1.0)
+    drenched = 1.0 + (c.DRENCHED_BUILDUP - 1.0) * s.state_timer[PURGEWATER].clamp(max=1.0)
+    added = gain * idle * drenched
+    shock = added[SHOCK] / s.shock_growth
+    added = torch.cat((added[:SHOCK], shock.unsqueeze(0), added[SHOCK + 1 :]))
+    gauge = (s.gauge + added).clamp(max=1.0)
+    totals.buildup = totals.buildup + (gauge - s.gauge)
+    s.gauge = gauge
+    changed = (added > 0).float()
+    s.source = s.source + changed * (source - s.source)
+
+
+def run_elements(
+    s: State, numbers: ElementNumbers, traits: Traits, totals: Totals
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """One frame of the elements: decay, states that start and end, damage over time.
+
+    Returns:
+        Active states (7, E, N) as 0 or 1 before they end, damage over time (7, E, N) [HP], plasma's ending (E, N)
+        and shock's beginning (E, N), 0 or 1.
+    """
+    active = s.state_timer.clamp(max=1.0)
+    timer = (s.state_timer - 1.0).clamp(min=0.0)
+    burning = active * numbers.damage * traits.resistance
+    burst = active[PLASMA] - timer[PLASMA].clamp(max=1.0)
+    decayed = (s.gauge - c.GAUGE_DECAY * c.DT).clamp(min=0.0)
+    full = (s.gauge >= 1.0).float()
+    # A gauge that is full starts its state before it can decay; the reset is no loss of build-up.
+    totals.buildup = totals.buildup + (decayed - s.gauge) * (1.0 - full)
+    s.gauge = decayed * (1.0 - full)
+    s.state_timer = timer + full * numbers.frames
+    s.shock_growth = s.shock_growth * (1.0 + (c.SHOCK_GROWTH - 1.0) * full[SHOCK])
+    return active, burning, burst, full[SHOCK]
+
+
+def hit_factor(s: State, numbers: ElementNumbers) -> Tensor:
+    """(E, N) what frost and acid multiply hits by."""
+    bonus = 1.0 + numbers.hit_bonus * s.state_timer.clamp(max=1.0)
+    return bonus[ACID] * bonus[FROST]
+
+
+def take_damage(s: State, raw: Tensor, active: Tensor, burst: Tensor, totals: Totals) -> Tensor:
+    """Takes damage off the machines, clipped to what is left, and keeps the books.
+
+    Args:
+        s: state.
+        raw: (6, E, N) damage of this frame by what did it [HP]; plasma's row is replaced by the stored damage.
+        active: (7, E, N) states during this frame.
+        burst: (E, N) 1 where plasma ends.
+        totals: of the step.
+
+    Returns:
+        (E, N) damage [HP].
+    """
+    release = s.plasma_store * burst
+    raw = torch.cat((raw[:BY_PLASMA], release.unsqueeze(0)))
+    total = raw.sum(0)
+    applied = torch.minimum(total, s.enemy_hp)
+    dealt = raw * (applied / total.clamp(min=1e-6))
+    totals.dealt = totals.dealt + dealt
+    totals.in_state = totals.in_state + active * applied
+    s.enemy_hp = s.enemy_hp - applied
+    stored = c.PLASMA_SHARE * (applied - dealt[BY_PLASMA]) * active[PLASMA]
+    s.plasma_store = (s.plasma_store + stored) * (1.0 - burst)
+    s.stagger_sum = s.stagger_sum + applied
+    return applied

@@ -1,0 +1,277 @@
+"""What the agent sees: named groups, camera-aligned, everything roughly within [-1, 1] (paper, Appendix C)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from coachable.envs.combat import constants as c
+from coachable.envs.combat.player import facing, wrap
+from coachable.envs.combat.state import (
+    ACTIVE,
+    AIR,
+    DODGE,
+    FIRE,
+    IDLE,
+    NUM_PHASES,
+    RELOAD,
+    STAGGER,
+    STAGGERED,
+    SWAP,
+    State,
+    nearest,
+    pick,
+)
+from coachable.envs.combat.tables import ATTACK_SLOTS, ELEMENTS, PART_SLOTS, SITES, TRAPS, WEAPONS
+from coachable.envs.combat.traits import AMMO_SLOTS, HIDDEN, INTERVAL, MACHINE_NAMES, MAGAZINE, Traits
+from coachable.envs.combat.traits import RELOAD as RELOAD_FRAMES
+
+ENEMY_SLOTS = 2  # in the observation, whatever the number of enemies
+SMALL_PARTS = 4
+_GAME_TIMERS = slice(0, 11)
+_SPEED_SCALE, _TIMER_SCALE = 0.1, 0.5 / c.FPS  # per m/s, per frame
+_HP_MAX = 8500.0  # [HP], the strongest machine of the paper
+_LONGEST_STATE = 14.0 * c.FPS  # [frames]
+_ENCODED = 6
+
+# Name and width; names are the paper's rows of its importance tables.
+_PLAYER = [
+    ("Player health", 1),
+    ("Quick-tool: health bucket", 2),
+    ("Weapon technique stamina", 1),
+    ("Active weapon technique", 1),
+    ("Player stamina", 1),
+    ("Player pose", 7),
+    ("Player game state", 12),
+    ("Active weapon + ammo", 21),
+    ("Weapon wheel open", 2),
+]
+_TRAPS = [("Traps: pose + inventory", c.TRAP_SLOTS * (_ENCODED + 5) + 8)]
+_PLACES = [("Anchor pose", 7), ("Ejectors: pose + duration", c.HAZARD_SLOTS * 8)]
+_TYPE = ("Enemy type", len(MACHINE_NAMES))
+
+
+def _enemy(small: bool) -> list[tuple[str, int]]:
+    parts = SMALL_PARTS if small else PART_SLOTS
+    return [
+        ("Enemy pose", 13),
+        ("Enemy health", 2),
+        *([] if small else [_TYPE]),
+        ("Enemy resistances", len(ELEMENTS)),
+        ("Enemy elemental status", 2 * len(ELEMENTS)),
+        ("Enemy attack state", NUM_PHASES + 1 + ATTACK_SLOTS + 2),
+        ("Enemy game state", 3),
+        ("Enemy parts pose", parts * _ENCODED),
+        ("Enemy parts health", parts * 5),
+    ]
+
+
+def observation_groups(observation: str) -> list[tuple[str, int]]:
+    """Name and width of every group, in order; enemies are sorted by distance, "2" marks the second one's.
+
+    Args:
+        observation: "full" (629 numbers) or "small" (190).
+
+    Raises:
+        ValueError: if it is neither.
+    """
+    if observation == "small":
+        return [*_PLAYER, *_PLACES, *_enemy(True), ("Action history", 24)]
+    if observation != "full":
+        raise ValueError(f"observation is {observation!r}: expected 'full' or 'small'")
+    second = [(f"{name} 2", width) for name, width in _enemy(False)]
+    return [
+        *_PLAYER,
+        *_TRAPS,
+        *_PLACES,
+        *_enemy(False),
+        *second,
+        ("Action history", 72),
+        ("Feature history", 24),
+    ]
+
+
+def observation_size(observation: str) -> int:
+    """Number of numbers."""
+    return sum(width for _, width in observation_groups(observation))
+
+
+def encode_position(offset: Tensor) -> Tensor:
+    """Direction and distance of offsets (3, ..., N) [m] as (6, ..., N): x/d, y/d, z/d, sin d, sin 0.1 d, sin 0.01 d."""
+    distance = offset.square().sum(0, keepdim=True).sqrt().clamp(min=1e-3)
+    return torch.cat([offset / distance, distance.sin(), (0.1 * distance).sin(), (0.01 * distance).sin()])
+
+
+def to_camera(vector: Tensor, axes: Tensor) -> Tensor:
+    """World vectors (2, ..., N) as forward and left of the camera; `axes` is its forward direction (2, N).
+
+    The camera's pitch is left out: up stays up.
+    """
+    x, y = vector
+    fx, fy = axes
+    return torch.stack((fx * x + fy * y, fx * y - fy * x))
+
+
+def _ground(position: Tensor, s: State, axes: Tensor) -> Tensor:
+    """Encoded places on the ground (2, k, N) or (2, N), seen from the eye."""
+    own = s.position.view(2, *[1] * (position.ndim - 2), -1)
+    flat = to_camera(position - own, axes)
+    return encode_position(torch.cat([flat, torch.full_like(flat[:1], -c.EYE_HEIGHT)]))
+
+
+def one_hot_rows(index: Tensor, size: int) -> Tensor:
+    """(..., N) numbers to (size, ..., N) 0 or 1."""
+    return (index == torch.arange(size, device=index.device).view(-1, *[1] * index.ndim)).float()
+
+
+def _body(s: State, traits: Traits, axes: Tensor) -> Tensor:
+    """Body centres from the eye (3, E, N), camera-aligned [m]."""
+    flat = to_camera(s.enemy_position - s.position.unsqueeze(1), axes)
+    return torch.cat([flat, (s.enemy_z + traits.radius - c.EYE_HEIGHT).unsqueeze(0)])
+
+
+def _attack_id(s: State, traits: Traits) -> Tensor:
+    """(4, E, N) one-hot of the running attack; zero when there is none or it cannot be recognised."""
+    hidden = traits.attacks[HIDDEN].gather(0, s.attack.unsqueeze(0))[0]
+    shown = (s.phase > IDLE) & (s.phase < STAGGERED) & (hidden <= 0) & (s.enemy_hp > 0)
+    return one_hot_rows(s.attack, ATTACK_SLOTS) * shown
+
+
+def kept_features(s: State, traits: Traits) -> Tensor:
+    """(12, N) what the feature history keeps of a state: nearest enemy, both healths, the attack."""
+    second = nearest(s)
+    return torch.cat(
+        [
+            encode_position(pick(_body(s, traits, facing(s.yaw)), second)),
+            (s.hp / c.PLAYER_HP).unsqueeze(0),
+            pick(s.enemy_hp / traits.hp, second).unsqueeze(0),
+            pick(_attack_id(s, traits), second),
+        ]
+    )
+
+
+def observe(s: State, traits: Traits, ammo: Tensor, observation: str, episode_steps: int) -> Tensor:
+    """The observation (N, 629) or (N, 190): a function of the state alone.
+
+    Args:
+        s: state.
+        traits: of the machines.
+        ammo: (18, N) rows of `ammo_table` of the ammo in hand.
+        observation: "full" or "small".
+        episode_steps: length of an episode.
+    """
+    axes, small = facing(s.yaw), observation == "small"
+    rows = [_player_rows(s, ammo, axes, episode_steps)]
+    if not small:
+        rows += _trap_rows(s, axes)
+    rows += _place_rows(s, axes)
+    enemies = _enemy_rows(s, traits, axes, small)  # (F, E, N)
+    if enemies.shape[1] > 1:
+        enemies = torch.where(nearest(s), enemies.flip(1), enemies)
+    rows.append(enemies[:, 0])
+    if not small:
+        rows.append(enemies[:, 1] if enemies.shape[1] > 1 else torch.zeros_like(enemies[:, 0]))
+        rows += [s.actions, s.features]
+    else:
+        rows.append(s.actions[:24])
+    return torch.cat(rows).T.contiguous()
+
+
+def _player_rows(s: State, ammo: Tensor, axes: Tensor, episode_steps: int) -> Tensor:
+    timers = s.timers * _TIMER_SCALE
+    magazine = s.magazine.gather(0, (s.weapon * AMMO_SLOTS + s.section).unsqueeze(0))[0]
+    others = [timers[i] for i in range(*_GAME_TIMERS.indices(len(timers))) if i not in (AIR, DODGE, STAGGER)]
+    element = ammo[11:]
+    rows = [
+        s.hp / c.PLAYER_HP,
+        s.berries / c.BERRIES,
+        (s.berries > 0) * (1.0 - s.hp / c.PLAYER_HP),
+        s.weapon_stamina / c.WEAPON_STAMINA,
+        s.technique,
+        s.stamina / c.STAMINA,
+        *(to_camera(s.velocity, axes) * _SPEED_SCALE),
+        s.pitch.sin(),
+        s.pitch.cos(),
+        timers[AIR],
+        timers[DODGE],
+        timers[STAGGER],
+        *others,
+        *one_hot_rows(s.site, len(SITES)),
+        s.steps / episode_steps,
+        *one_hot_rows(s.weapon, len(WEAPONS)),
+        *one_hot_rows(s.section, AMMO_SLOTS),
+        *element,
+        1.0 - element.sum(0),
+        magazine / ammo[MAGAZINE],
+        (s.timers[FIRE] / ammo[INTERVAL]).clamp(max=1.0),  # may be another weapon's
+        s.timers[SWAP] / (c.SWAP_TIME * c.FPS),
+        s.timers[RELOAD] / ammo[RELOAD_FRAMES],
+        s.wheel,
+        s.quick,
+    ]
+    return torch.stack(rows)
+
+
+def _trap_rows(s: State, axes: Tensor) -> list[Tensor]:
+    is_set = (s.trap_type >= 0).float()  # (4, N)
+    place = _ground(s.trap_position, s, axes) * is_set
+    kind = one_hot_rows(s.trap_type, len(TRAPS))
+    armed = (s.trap_arm <= 0) * is_set
+    each = torch.cat([place, kind, armed.unsqueeze(0)])  # (11, 4, N)
+    return [each.transpose(0, 1).flatten(0, 1), s.inventory * 0.1, one_hot_rows(s.tool, len(TRAPS))]
+
+
+def _place_rows(s: State, axes: Tensor) -> list[Tensor]:
+    away = (s.position - s.anchor).square().sum(0, keepdim=True).sqrt() / c.BOUND_RADIUS
+    burning = (s.hazard_timer > 0).float()
+    zones = _ground(s.hazard_position, s, axes) * burning
+    left = (s.hazard_timer / (c.HAZARD_TIME * c.FPS)).unsqueeze(0)
+    each = torch.cat([zones, burning.unsqueeze(0) * (c.HAZARD_RADIUS / 10.0), left])  # (8, 2, N)
+    return [_ground(s.anchor, s, axes), away, each.transpose(0, 1).flatten(0, 1)]
+
+
+def _enemy_rows(s: State, traits: Traits, axes: Tensor, small: bool) -> Tensor:
+    body = _body(s, traits, axes)
+    distance = body[:2].square().sum(0).sqrt()
+    bearing = torch.atan2(body[1], body[0])
+    pitch_error = wrap(torch.atan2(body[2], distance) - s.pitch)
+    living = (s.enemy_hp > 0).float()
+    rows = [
+        encode_position(body),
+        torch.stack((bearing / torch.pi, pitch_error)),
+        to_camera(facing(s.enemy_yaw), axes),
+        to_camera(s.enemy_velocity, axes) * _SPEED_SCALE,
+        traits.radius.unsqueeze(0) / 2.6,
+        torch.stack((s.enemy_hp / traits.hp, (s.enemy_hp / _HP_MAX).sqrt())),
+        *([] if small else [one_hot_rows(s.machine, len(MACHINE_NAMES))]),
+        torch.log2(traits.resistance),
+        s.gauge,
+        s.state_timer / _LONGEST_STATE,
+        one_hot_rows(s.phase, NUM_PHASES) * living,
+        (s.phase_timer.clamp(min=0.0) * (s.phase > IDLE) * _TIMER_SCALE).unsqueeze(0),
+        _attack_id(s, traits),
+        to_camera(s.lock, axes) * (s.phase == ACTIVE),
+        torch.stack((1.0 * (s.phase == STAGGERED), 1.0 * (3.0 * s.enemy_hp < traits.hp), living)),
+    ]
+    return torch.cat([*rows, *_part_rows(s, traits, body, axes, small)])
+
+
+def _part_rows(s: State, traits: Traits, body: Tensor, axes: Tensor, small: bool) -> list[Tensor]:
+    heading = to_camera(facing(s.enemy_yaw), axes)  # (2, E, N)
+    x, y, z = traits.offset
+    place = torch.stack(
+        (
+            body[0] + heading[0] * x - heading[1] * y,
+            body[1] + heading[1] * x + heading[0] * y,
+            body[2] + z,
+        )
+    )
+    present = s.count.clamp(max=1.0)  # (12, E, N)
+    share = present * s.part_hp / traits.unit_hp.clamp(min=1e-6)
+    looks = torch.cat([share.unsqueeze(0), 0.1 * s.count.unsqueeze(0), traits.part_type * present])  # (5, 12, E, N)
+    if small:
+        order = (place.square().sum(0) + 1e6 * (1.0 - present)).topk(SMALL_PARTS, dim=0, largest=False).indices
+        place, looks = (t.gather(1, order.expand(t.shape[0], *order.shape)) for t in (place, looks))
+        present = present.gather(0, order)
+    where = encode_position(place) * present
+    return [where.transpose(0, 1).flatten(0, 1), looks.transpose(0, 1).flatten(0, 1)]

@@ -1,0 +1,275 @@
+"""The machines: choice of attacks, phases, motion, and what hits the player."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from coachable.envs.combat import constants as c
+from coachable.envs.combat.damage import ADHESIVE, PURGEWATER
+from coachable.envs.combat.player import facing, inside_wall, rows_where, wrap
+from coachable.envs.combat.state import (
+    ACTIVE,
+    AIR,
+    IDLE,
+    RECOVER,
+    SAFE,
+    SLIDE,
+    STAGGER,
+    STAGGERED,
+    TELEGRAPH,
+    State,
+)
+from coachable.envs.combat.tables import KINDS, PART_TYPES, load_table
+from coachable.envs.combat.traits import ACTIVE as ACTIVE_FRAMES
+from coachable.envs.combat.traits import (
+    COOLDOWN,
+    DAMAGE,
+    FARTHEST,
+    HAZARD,
+    KIND,
+    NEAREST,
+    SHOTS,
+    Traits,
+)
+from coachable.envs.combat.traits import RECOVER as RECOVER_FRAMES
+from coachable.envs.combat.traits import TELEGRAPH as TELEGRAPH_FRAMES
+
+CONE, CHARGE, RANGED, AREA = range(len(KINDS))
+_WEAPON = PART_TYPES.index("weapon")
+_SHOCK_FRAMES = load_table("elements").number("shock", "seconds") * c.FPS
+
+
+def ranged_strength(s: State, traits: Traits) -> Tensor:
+    """(E, N) share of the weapon parts left; 1 for machines without."""
+    left = (s.count * traits.part_type[_WEAPON]).sum(0)
+    return torch.where(traits.weapon_parts > 0, left / traits.weapon_parts.clamp(min=1.0), 1.0)
+
+
+def decide(
+    s: State, traits: Traits, strength: Tensor, gap: Tensor, shocked: Tensor, choice: Tensor, pause: Tensor
+) -> tuple[Tensor, Tensor]:
+    """One frame of the phases: idle, telegraph, active, recover, and staggered.
+
+    Args:
+        s: state.
+        traits: of the machines.
+        strength: of `ranged_strength`.
+        gap: (E, N) between the bodies [m].
+        shocked: (E, N) 1 where shock begins.
+        choice: (4, E, N) uniform numbers; the attack that can be used with the largest one starts.
+        pause: (E, N) uniform number.
+
+    Returns:
+        Rows of the current attack (11, E, N), and where a zone is left behind (E, N) bool.
+    """
+    living, idle = s.enemy_hp > 0, s.phase == IDLE
+    timer = s.phase_timer - 1.0
+    cooldown = (s.cooldown - 1.0).clamp(min=0.0)
+    waiting = torch.where(idle, s.pause - 1.0, s.pause)
+
+    attacks = traits.attacks
+    usable = (gap >= attacks[NEAREST]) & (gap <= attacks[FARTHEST]) & (cooldown <= 0)
+    usable = usable & ((attacks[KIND] != RANGED) | (strength > 0))
+    best = (choice * usable).amax(0)
+    starts = idle & living & (waiting <= 0) & (best > 0)
+    s.attack = torch.where(starts, (choice * usable).argmax(0), s.attack)
+    blow = attacks.gather(1, s.attack.expand(attacks.shape[0], 1, *s.attack.shape)).squeeze(1)
+
+    over = (timer <= 0) & living
+    to_active, to_recover = over & (s.phase == TELEGRAPH), over & (s.phase == ACTIVE)
+    to_idle = over & (s.phase >= RECOVER)
+    phase = torch.where(starts, TELEGRAPH, s.phase + 1.0 * (to_active | to_recover))
+    phase = torch.where(to_idle, IDLE, phase)
+    glued = 1.0 + (c.GLUED_TELEGRAPH - 1.0) * s.state_timer[ADHESIVE].clamp(max=1.0)
+    timer = torch.where(starts, blow[TELEGRAPH_FRAMES] * glued, timer)
+    timer = torch.where(to_active, blow[ACTIVE_FRAMES], timer)
+    timer = torch.where(to_recover, blow[RECOVER_FRAMES], timer)
+
+    s.lock = torch.where(to_active, facing(s.enemy_yaw), s.lock)
+    s.hits_left = torch.where(to_active, blow[SHOTS], s.hits_left)
+    slots = torch.arange(cooldown.shape[0], device=cooldown.device).view(-1, 1, 1)
+    s.cooldown = torch.where(to_recover & (s.attack == slots), blow[COOLDOWN], cooldown)
+    calm = (c.PAUSE_LOW + (c.PAUSE_HIGH - c.PAUSE_LOW) * pause) * c.FPS
+    rage = 1.0 - c.PAUSE_RAGE * (1.0 - s.enemy_hp / traits.hp)
+    s.pause = torch.where(to_recover, calm * rage, waiting)
+    zone = to_recover & (blow[HAZARD] > 0)
+
+    # Enough damage staggers, shock paralyses; either breaks off what the machine is doing.
+    staggers = (s.stagger_sum >= c.STAGGER_SHARE * traits.hp + c.STAGGER_BASE) & living
+    s.stagger_sum = torch.where(staggers, 0.0, s.stagger_sum)
+    frames = torch.maximum(staggers * (c.MACHINE_STAGGER * c.FPS), shocked * _SHOCK_FRAMES)
+    stopped = (frames > 0) & living
+    still = torch.where(s.phase == STAGGERED, timer, 0.0)
+    s.phase = torch.where(stopped, STAGGERED, phase)
+    s.phase_timer = torch.where(stopped, torch.maximum(frames, still), timer)
+    return blow, zone
+
+
+def move_machines(s: State, traits: Traits, site: Tensor, blow: Tensor, flip: Tensor) -> None:
+    """One frame of motion: approach or strafe, charge, turn, dive; bodies never overlap.
+
+    Args:
+        s: state.
+        traits: of the machines.
+        site: (4, N) rows of `site_table`.
+        blow: rows of the current attack.
+        flip: (E, N) uniform number; turns the strafe round with a small probability.
+    """
+    living, idle = s.enemy_hp > 0, s.phase == IDLE
+    to_player = s.position.unsqueeze(1) - s.enemy_position  # (2, E, N)
+    distance = to_player.square().sum(0).sqrt().clamp(min=1e-3)
+    direction = to_player / distance
+    s.strafe = torch.where(flip < c.STRAFE_FLIP, -s.strafe, s.strafe)
+
+    charging = (s.phase == ACTIVE) & (blow[KIND] == CHARGE)
+    sideways = torch.stack((-direction[1], direction[0])) * (c.STRAFE_FACTOR * s.strafe)
+    wanted = torch.where(distance > traits.approach, direction, sideways)
+    glued = 1.0 - (1.0 - c.GLUED_SPEED) * s.state_timer[ADHESIVE].clamp(max=1.0)
+    speed = traits.speed * glued * living
+    wanted = torch.where(charging, c.CHARGE_FACTOR * s.lock, wanted * idle) * speed
+    s.enemy_velocity = torch.lerp(s.enemy_velocity, wanted, c.MACHINE_LAG)
+    position = inside_wall(s.enemy_position + c.DT * s.enemy_velocity, site)
+    away = position - s.position.unsqueeze(1)
+    gone = away.square().sum(0).sqrt().clamp(min=1e-3)
+    space = (traits.radius + c.BODY_RADIUS) * living
+    s.enemy_position = position + away * (space / gone - 1.0).clamp(min=0.0)
+
+    bearing = torch.atan2(direction[1], direction[0])
+    turns = (s.phase <= TELEGRAPH) & living
+    step = wrap(bearing - s.enemy_yaw).clamp(-c.MACHINE_TURN * c.DT, c.MACHINE_TURN * c.DT)
+    s.enemy_yaw = wrap(s.enemy_yaw + step * turns)
+
+    # Flyers come down to dive and when they are staggered, within a telegraph's time.
+    dives = (blow[KIND] == CHARGE) & (s.phase >= TELEGRAPH) & (s.phase <= ACTIVE)
+    aloft = traits.height * ~(dives | (s.phase == STAGGERED))
+    climb = traits.height / 12.0
+    s.enemy_z = s.enemy_z + torch.maximum(torch.minimum(aloft - s.enemy_z, climb), -climb)
+
+
+def strike_player(
+    s: State,
+    traits: Traits,
+    blow: Tensor,
+    strength: Tensor,
+    self_damage: Tensor,
+    roll: Tensor,
+    shot_roll: Tensor,
+    noise: Tensor,
+    pillars: Tensor | None,
+) -> Tensor:
+    """One frame of the attacks: hits, shots that are fired and that land, and what the player suffers.
+
+    Args:
+        s: state.
+        traits: of the machines.
+        blow: rows of the current attack.
+        strength: of `ranged_strength`.
+        self_damage: (N,) of the player's own traps [HP].
+        roll: (E, N) uniform numbers, damage of hits.
+        shot_roll: (E, N) uniform numbers, damage of shots.
+        noise: (2, E, N) standard normal numbers, aim of the shots.
+        pillars: (N,) bool, sites whose pillars stop shots; None if no fight has any.
+
+    Returns:
+        (N,) damage to the player [HP].
+    """
+    attacking = (s.phase == ACTIVE) & (s.enemy_hp > 0) & (s.hits_left > 0)
+    kind = blow[KIND]
+    to_player = s.position.unsqueeze(1) - s.enemy_position
+    distance = to_player.square().sum(0).sqrt().clamp(min=1e-3)
+    gap = distance - traits.radius - c.BODY_RADIUS
+    ahead = (to_player * s.lock).sum(0) / distance >= c.CONE_COSINE
+    low = s.enemy_z < c.REACHABLE_HEIGHT
+
+    cone = (kind == CONE) & (gap < blow[FARTHEST] + c.CONE_MARGIN) & ahead
+    charge = (kind == CHARGE) & (gap < c.CHARGE_GAP) & low
+    area = (kind == AREA) & (gap < blow[FARTHEST] + c.AREA_MARGIN) & (s.timers[AIR] <= 0)
+    safe = s.timers[SAFE] > 0
+    connects = attacking & (cone | charge | area) & ~safe
+    weak = 1.0 - (1.0 - c.DRENCHED_DAMAGE) * s.state_timer[PURGEWATER].clamp(max=1.0)
+    damage = traits.hit * blow[DAMAGE]
+    direct = connects * damage * _spread(roll) * torch.where(kind == AREA, weak, 1.0)
+
+    fires = _fire_shots(s, blow, attacking & (kind == RANGED), distance, noise, pillars)
+    ranged = damage * _spread(shot_roll) * weak * (c.RANGED_REST + (1.0 - c.RANGED_REST) * strength)
+    s.shot_damage = torch.where(fires, ranged, s.shot_damage)
+    s.hits_left = s.hits_left - 1.0 * (connects | fires.any(0))
+
+    landing = s.land_timer == 1.0  # in this frame
+    s.land_timer = (s.land_timer - 1.0).clamp(min=0.0)
+    miss = (s.shot_point - s.position.view(2, 1, 1, -1)).square().sum(0)
+    exposed = ~safe & (s.timers[SLIDE] <= 0)
+    shots = s.shot_damage * (landing & (miss < c.SHOT_RADIUS**2) & exposed)
+
+    # Only the worst hit of a frame counts: it makes the player safe from the others.
+    worst = torch.maximum(direct.amax(0), shots.amax((0, 1)))
+    worst = torch.maximum(worst, self_damage * ~safe)
+    charged = ((direct >= worst) & charge).any(0)
+    _suffer(s, worst, charged)
+    return worst
+
+
+def _spread(roll: Tensor) -> Tensor:
+    return c.DAMAGE_LOW + (c.DAMAGE_HIGH - c.DAMAGE_LOW) * roll
+
+
+def _fire_shots(
+    s: State, blow: Tensor, firing: Tensor, distance: Tensor, noise: Tensor, pillars: Tensor | None
+) -> Tensor:
+    """Starts the shots that are due in this frame, spread evenly over the active phase.
+
+    Returns:
+        (4, E, N) bool, slots that were filled.
+    """
+    shot = blow[SHOTS] - s.hits_left  # number of the next one
+    elapsed = blow[ACTIVE_FRAMES] - s.phase_timer
+    due = firing & (elapsed * blow[SHOTS] >= shot * blow[ACTIVE_FRAMES])
+    flight = distance / c.SHOT_SPEED  # [s]
+    lead = s.velocity.unsqueeze(1) * (c.SHOT_LEAD * flight)
+    point = s.position.unsqueeze(1) + lead + c.SHOT_NOISE * noise  # (2, E, N)
+    slots = torch.arange(c.SHOT_SLOTS, device=shot.device).view(-1, 1, 1)
+    filled = due & (shot == slots)  # (4, E, N)
+    s.shot_point = torch.where(filled, point.unsqueeze(1), s.shot_point)
+    # Rounded up to whole frames, at least one.
+    s.land_timer = torch.where(filled, (flight * c.FPS).ceil() + 1.0, s.land_timer)
+    if pillars is not None:
+        stopped = segment_blocked(s.enemy_position, point) & pillars
+        s.land_timer = torch.where(filled & stopped, 0.0, s.land_timer)
+    return filled
+
+
+def segment_blocked(start: Tensor, end: Tensor) -> Tensor:
+    """Whether a pillar stands between points (2, ..., N): (..., N) bool."""
+    along = end - start
+    length = along.square().sum(0).clamp(min=1e-6)
+    blocked = torch.zeros_like(length, dtype=torch.bool)
+    for x, y in c.PILLARS:
+        offset_x, offset_y = x - start[0], y - start[1]
+        share = ((offset_x * along[0] + offset_y * along[1]) / length).clamp(0.0, 1.0)
+        miss = (offset_x - share * along[0]).square() + (offset_y - share * along[1]).square()
+        blocked = blocked | (miss < c.PILLAR_RADIUS**2)
+    return blocked
+
+
+def ray_blocked_at(position: Tensor, yaw: Tensor) -> Tensor:
+    """Distance at which a level ray from (2, N) meets a pillar, (N,) [m]; infinite if none."""
+    x, y = facing(yaw)
+    nearest_entry = torch.full_like(yaw, torch.inf)
+    for pillar_x, pillar_y in c.PILLARS:
+        offset_x, offset_y = pillar_x - position[0], pillar_y - position[1]
+        along = offset_x * x + offset_y * y
+        inside = c.PILLAR_RADIUS**2 - (offset_x.square() + offset_y.square() - along.square())
+        entry = torch.where((inside > 0) & (along > 0), along - inside.clamp(min=0.0).sqrt(), torch.inf)
+        nearest_entry = torch.minimum(nearest_entry, entry)
+    return nearest_entry
+
+
+def _suffer(s: State, hit: Tensor, charged: Tensor) -> None:
+    """The player takes a hit (N,) [HP]: health, stagger and a moment of safety."""
+    s.hp = (s.hp - hit).clamp(min=0.0)
+    heavy = hit > c.HEAVY_HIT
+    stagger = torch.where(charged, c.CHARGE_STAGGER_TIME * c.FPS, c.STAGGER_TIME * c.FPS) * heavy
+    safe = torch.where(heavy, c.HEAVY_SAFE * c.FPS, c.LIGHT_SAFE * c.FPS) * (hit > 0)
+    rows_where(s.timers, STAGGER, stagger > s.timers[STAGGER], stagger)
+    rows_where(s.timers, SAFE, safe > s.timers[SAFE], safe)

@@ -1,0 +1,273 @@
+"""The player: what the pad asks for in a step, and motion and camera of each frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from coachable.envs.combat import constants as c
+from coachable.envs.combat.state import (
+    AIR,
+    BERRY,
+    DODGE,
+    HELPLESS,
+    MELEE,
+    NO_MOVE,
+    RELOAD,
+    ROOT,
+    SAFE,
+    SLIDE,
+    SWAP,
+    State,
+    nearest,
+    pick,
+)
+from coachable.envs.combat.tables import TRAPS, WEAPONS
+from coachable.envs.combat.traits import (
+    AMMO_SLOTS,
+    BUILDUP,
+    ELEMENTAL,
+    IMPACT,
+    MAGAZINE,
+    TEAR,
+    Traits,
+)
+from coachable.envs.combat.traits import RELOAD as RELOAD_FRAMES
+from coachable.transforms.gamepad import Pad
+
+
+@dataclass
+class Intent:
+    """What holds for all six frames of a step.
+
+    Attributes:
+        move: (2, N) left stick, at most of length 1.
+        speed: (N,) of a full stick [m/s].
+        turn, tilt: (N,) of the camera per frame [rad].
+        aiming, shooting, light, heavy, sprint: (N,) bool.
+        ammo: (11, N) numbers of the ammo in hand, rows of `traits`.
+        element: (7, N) one-hot of its element.
+        damage: (E, N) of one shot to the body, resistance included [HP].
+        tear: (N,) added to the damage of parts [HP].
+        buildup: (7, E, N) share of the threshold that one shot builds up, growth of shock's threshold left out.
+        loaded: (N,) rounds in the magazine in use; changes from frame to frame.
+    """
+
+    move: Tensor
+    speed: Tensor
+    turn: Tensor
+    tilt: Tensor
+    aiming: Tensor
+    shooting: Tensor
+    light: Tensor
+    heavy: Tensor
+    sprint: Tensor
+    ammo: Tensor
+    element: Tensor
+    damage: Tensor
+    tear: Tensor
+    buildup: Tensor
+    loaded: Tensor
+
+
+def rows_where(timers: Tensor, row: int, mask: Tensor, value: Tensor | float) -> None:
+    """Writes one row of a tensor that nobody else holds, where `mask` (N,)."""
+    timers[row] = torch.where(mask, value, timers[row])
+
+
+def facing(yaw: Tensor) -> Tensor:
+    """Unit vectors (2, ...) of angles (...,)."""
+    return torch.stack((yaw.cos(), yaw.sin()))
+
+
+def from_stick(stick: Tensor, forward: Tensor) -> Tensor:
+    """Stick (2, N), x right and y forward, as a direction of the world (2, N)."""
+    x, y = stick
+    fx, fy = forward
+    return torch.stack((fx * y + fy * x, fy * y - fx * x))
+
+
+def element_of(section: Tensor, ammo_table: Tensor) -> Tensor:
+    """One-hot of the element of wheel sections (N,), (7, N)."""
+    return ammo_table[:, 11:].index_select(0, section).T
+
+
+def command(s: State, pad: Pad, traits: Traits, site: Tensor, ammo_table: Tensor, sections: Tensor) -> Intent:
+    """Acts on the pad at the start of a step: wheel, berries, tools, traps, evasions. Changes `s`.
+
+    Args:
+        s: state.
+        pad: canonical, fields (N,) float and sticks (2, N).
+        traits: of the machines.
+        site: (4, N) rows of `site_table`.
+        ammo_table: of `ammo_table`.
+        sections: of `ammo_sections`.
+    """
+    timers = s.timers.clone()
+    wheel, aiming = pad.l1 > 0, pad.l2 > 0
+    _choose_weapon(s, wheel, pad.right_stick, timers, sections)
+    forward = facing(s.yaw)
+    able = (timers[HELPLESS].amax(0) <= 0) & (s.hp > 0)
+    _use_tools(s, pad, able, timers, forward)
+    _evade(s, pad, able, timers, forward)
+
+    row = s.weapon * AMMO_SLOTS + s.section
+    ammo = ammo_table.index_select(0, row).T.contiguous()
+    loaded = s.magazine.gather(0, row.unsqueeze(0))[0]
+    empty = (loaded <= 0) & (timers[RELOAD] <= 0)
+    rows_where(timers, RELOAD, empty, ammo[RELOAD_FRAMES])
+    s.timers = timers
+
+    length = pad.left_stick.square().sum(0).sqrt()
+    sprint = (pad.l3 > 0) & ~aiming & (s.stamina > 0) & (length > c.STICK_REST)
+    speed = torch.where(aiming, c.AIM_WALK, torch.where(sprint, c.SPRINT, c.RUN)) * site[1]
+    rate = torch.where(aiming, c.AIM_TURN_RATE, c.TURN_RATE) * (1.0 - pad.l1) * c.DT
+    curve = pad.right_stick.sign() * pad.right_stick.abs().pow(c.STICK_EXPONENT)
+    element = ammo[11:]
+    resisted = (element.unsqueeze(1) * traits.resistance).sum(0)  # (E, N)
+    buildup = element.unsqueeze(1) * traits.resistance * (ammo[BUILDUP] / traits.threshold)
+
+    technique = aiming & (pad.r1 > 0) & (s.weapon_stamina >= c.TECHNIQUE_COST) & (s.technique <= 0)
+    s.technique = torch.where(technique, 1.0, s.technique)
+    s.weapon_stamina = s.weapon_stamina - c.TECHNIQUE_COST * technique
+    free = ~aiming & ~wheel & (s.hp > 0)
+    return Intent(
+        move=pad.left_stick / length.clamp(min=1.0),
+        speed=speed,
+        turn=-rate * curve[0],
+        tilt=rate * c.PITCH_FACTOR * curve[1],
+        aiming=aiming,
+        shooting=aiming & (pad.r2 > 0) & (s.hp > 0),
+        light=free & (pad.r1 > 0),
+        heavy=free & (pad.r2 > 0),
+        sprint=sprint,
+        ammo=ammo,
+        element=element,
+        damage=ammo[IMPACT] + ammo[ELEMENTAL] * resisted,
+        tear=c.TEAR_FACTOR * ammo[TEAR],
+        buildup=buildup,
+        loaded=loaded,
+    )
+
+
+def _choose_weapon(s: State, wheel: Tensor, stick: Tensor, timers: Tensor, sections: Tensor) -> None:
+    """The wheel: six sectors of 60 degrees, counter-clockwise from the right, each cut into its ammo sections."""
+    x, y = stick
+    pointing = wheel & (stick.square().sum(0) > c.WHEEL_REACH**2)
+    turns = torch.remainder(torch.atan2(y, x) / (2.0 * torch.pi), 1.0) * len(WEAPONS)
+    sector = turns.floor().clamp(0, len(WEAPONS) - 1)
+    weapon = torch.where(pointing, sector.long(), s.weapon)
+    offered = sections[weapon]
+    section = torch.minimum(((turns - sector) * offered).floor().long(), offered - 1)
+    section = torch.where(pointing, section, s.section)
+    changed = (weapon != s.weapon) | (section != s.section)
+    rows_where(timers, SWAP, changed, c.SWAP_TIME * c.FPS)
+    rows_where(timers, RELOAD, changed, 0.0)
+    s.weapon, s.section = weapon, section
+
+
+def _use_tools(s: State, pad: Pad, able: Tensor, timers: Tensor, forward: Tensor) -> None:
+    """Berries, the tool menu, and traps set ahead of the player."""
+    eats = able & (pad.up > 0) & (s.hp < c.PLAYER_HP) & (s.berries > 0) & (timers[BERRY] <= 0)
+    s.hp = torch.where(eats, (s.hp + c.BERRY_HP).clamp(max=c.PLAYER_HP), s.hp)
+    s.berries = s.berries - 1.0 * eats
+    rows_where(timers, BERRY, eats, c.BERRY_COOLDOWN * c.FPS)
+
+    s.tool = torch.remainder(s.tool + pad.right.long() - pad.left.long(), len(TRAPS))
+    selected = s.tool == torch.arange(len(TRAPS), device=s.tool.device).unsqueeze(1)  # (4, N)
+    free = s.trap_type < 0
+    slot = free & (free.cumsum(0) == 1)  # the first free one
+    in_stock = (s.inventory * selected).sum(0) > 0
+    sets = able & (pad.down > 0) & (timers[NO_MOVE].amax(0) <= 0) & in_stock & free.any(0)
+    s.inventory = s.inventory - 1.0 * (selected & sets)
+    place = slot & sets
+    s.trap_position = torch.where(place, (s.position + c.TRAP_AHEAD * forward).unsqueeze(1), s.trap_position)
+    s.trap_type = torch.where(place, s.tool.float(), s.trap_type)
+    s.trap_arm = torch.where(place, c.TRAP_ARM * c.FPS, s.trap_arm)
+    rows_where(timers, ROOT, sets, c.TRAP_ROOT * c.FPS)
+
+
+def _evade(s: State, pad: Pad, able: Tensor, timers: Tensor, forward: Tensor) -> None:
+    """Dodge (square), slide (circle) and jump (cross), one at a time."""
+    ready = able & (timers[NO_MOVE].amax(0) <= 0)
+    dodges = ready & (pad.square > 0) & (s.stamina >= c.DODGE_COST)
+    slides = ready & (pad.circle > 0)
+    jumps = ready & (pad.cross > 0)
+    length = pad.left_stick.square().sum(0).sqrt()
+    steered = from_stick(pad.left_stick / length.clamp(min=c.STICK_REST), forward)
+    # Without a direction a dodge goes backwards and a slide forwards.
+    neutral = torch.where(dodges, -forward, forward)
+    direction = torch.where(length > c.STICK_REST, steered, neutral)
+    s.dodge = torch.where(dodges | slides, direction, s.dodge)
+    s.stamina = s.stamina - c.DODGE_COST * dodges
+    rows_where(timers, DODGE, dodges, c.DODGE_TIME * c.FPS)
+    rows_where(timers, SLIDE, slides, c.SLIDE_TIME * c.FPS)
+    rows_where(timers, AIR, jumps, c.JUMP_TIME * c.FPS)
+    rows_where(timers, SAFE, dodges, timers[SAFE].clamp(min=c.DODGE_SAFE * c.FPS))
+
+
+def run_timers(s: State, intent: Intent) -> None:
+    """One frame of the timers, a finished reload, and regeneration."""
+    reloading = s.timers[RELOAD] > 0
+    s.timers = (s.timers - 1.0).clamp(min=0.0)
+    finished = reloading & (s.timers[RELOAD] <= 0)
+    intent.loaded = torch.where(finished, intent.ammo[MAGAZINE], intent.loaded)
+    gain = torch.where(intent.sprint, -c.SPRINT_COST * c.DT, c.STAMINA_GAIN * c.DT)
+    s.stamina = (s.stamina + gain).clamp(0.0, c.STAMINA)
+    s.weapon_stamina = (s.weapon_stamina + c.WEAPON_STAMINA_GAIN * c.DT).clamp(max=c.WEAPON_STAMINA)
+
+
+def move_player(s: State, intent: Intent, traits: Traits, site: Tensor) -> None:
+    """One frame of walking, dodging or sliding; walls and bodies stop it."""
+    direction = from_stick(intent.move, facing(s.yaw))
+    swinging, helpless = s.timers[MELEE] > 0, s.timers[HELPLESS].amax(0) > 0
+    speed = intent.speed * torch.where(swinging, c.SWING_FACTOR, 1.0)
+    wanted = direction * torch.where(helpless, 0.0, speed)
+    velocity = torch.lerp(s.velocity, wanted, site[0])
+    evading = torch.where(s.timers[DODGE] > 0, c.DODGE_SPEED, c.SLIDE_SPEED) * s.dodge
+    in_motion = (s.timers[DODGE] > 0) | (s.timers[SLIDE] > 0)
+    s.velocity = torch.where(in_motion, evading, velocity)
+    s.position = keep_out(inside_wall(s.position + c.DT * s.velocity, site), s, traits)
+
+
+def inside_wall(position: Tensor, site: Tensor) -> Tensor:
+    """Positions (2, ..., N) brought inside the site's wall."""
+    return position * (site[3] / position.square().sum(0).sqrt().clamp(min=1.0)).clamp(max=1.0)
+
+
+def keep_out(position: Tensor, s: State, traits: Traits) -> Tensor:
+    """Player positions (2, N) moved out of the body of the nearest living enemy."""
+    second = nearest(s)
+    centre, space = pick(s.enemy_position, second), pick(traits.radius, second) + c.BODY_RADIUS
+    solid = pick(s.enemy_hp, second) > 0
+    offset = position - centre
+    distance = offset.square().sum(0).sqrt().clamp(min=1e-3)
+    push = torch.where(solid, (space / distance - 1.0).clamp(min=0.0), 0.0)
+    return position + offset * push
+
+
+def turn_camera(s: State, intent: Intent, cone: float, share: float, bearing: Tensor, elevation: Tensor) -> None:
+    """One frame of the camera, with the aim assist.
+
+    Args:
+        s: state.
+        intent: of the step.
+        cone: yaw error within which the assist pulls [rad].
+        share: of the error that it takes away per frame; 0 is off.
+        bearing: (N,) of the nearest enemy's body centre, in the world [rad].
+        elevation: (N,) of it above the horizon, from the eye [rad].
+    """
+    yaw, pitch = s.yaw + intent.turn, s.pitch + intent.tilt
+    if share > 0:
+        error = wrap(bearing - yaw)
+        pull = torch.where(intent.aiming & (error.abs() < cone), share, 0.0)
+        yaw = yaw + pull * error
+        pitch = pitch + pull * (elevation - pitch)
+    s.yaw, s.pitch = yaw, pitch.clamp(-c.PITCH_MAX, c.PITCH_MAX)
+
+
+def wrap(angle: Tensor) -> Tensor:
+    """Angle in [-pi, pi)."""
+    return torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi

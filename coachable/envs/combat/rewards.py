@@ -1,0 +1,130 @@
+"""What a step is worth: raw components, task reward, style features and events, all free of the style."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from coachable.envs.combat.tables import ELEMENTS, PART_TYPES, STYLES, WEAPONS, load_table
+
+# Components of a step, the rows that evaluation may ask for.
+COMPONENTS: dict[str, int] = {
+    "damage": 1,
+    "weapon_damage": len(WEAPONS),
+    "melee_damage": 1,
+    "trap_damage": 1,
+    "state_damage": len(ELEMENTS),
+    "part_damage": len(PART_TYPES),
+    "removals": len(PART_TYPES),
+    "buildup": len(ELEMENTS),
+    "ammo_change": len(ELEMENTS),
+    "lure": 1,
+    "proximity": 1,
+    "wheel": 1,
+    "quick": 1,
+    "off_screen": 1,
+    "smoothness": 1,
+    "death": 1,
+    "out_of_bounds": 1,
+}
+"""Name and width; weapons in wheel order, parts as shield, weapon, canister, elements in their usual order."""
+
+COMPONENT_SLICES: dict[str, slice] = {}
+for _name, _width in COMPONENTS.items():
+    _first = sum(s.stop - s.start for s in COMPONENT_SLICES.values())
+    COMPONENT_SLICES[_name] = slice(_first, _first + _width)
+NUM_COMPONENTS = sum(COMPONENTS.values())
+
+# Styles in the order of theta: which weapon, part type or element each one is about.
+_WEAPON_OF = {
+    "ancestors_return": "Ancestor's Return",
+    "corrosive_blastsling": "Corrosive Blastsling",
+    "carjas_bane": "Carja's Bane",
+    "sunscourge": "Sunscourge",
+    "icestorm_boltblaster": "Icestorm",
+    "skykiller": "Skykiller",
+}
+_GENEROUS = ("fire", "adhesive")  # the elements whose build-up counts 35, not 15
+
+REWARD_SCALES = ("sim", "paper")
+
+
+def pack_components(**parts: Tensor) -> Tensor:
+    """Components (44, N) from named rows, `(width, N)` or `(N,)`.
+
+    Raises:
+        ValueError: if the names are not those of `COMPONENTS`.
+    """
+    if set(parts) != set(COMPONENTS):
+        raise ValueError(f"components are {sorted(parts)}, expected {sorted(COMPONENTS)}")
+    return torch.cat([parts[name].reshape(width, -1) for name, width in COMPONENTS.items()])
+
+
+def _selection(sources: dict[str, list[tuple[int, float]]]) -> Tensor:
+    """(rows, 44) from `{row name: [(component, weight), ...]}`."""
+    matrix = torch.zeros(len(sources), NUM_COMPONENTS)
+    for row, entries in enumerate(sources.values()):
+        for component, weight in entries:
+            matrix[row, component] = weight
+    return matrix
+
+
+def task_weights() -> Tensor:
+    """(44,) what each component adds to the task reward (paper)."""
+    table, weights = load_table("task_rewards"), torch.zeros(NUM_COMPONENTS)
+    for name in table.rows:
+        weights[COMPONENT_SLICES[name]] = table.number(name, "weight")
+    return weights
+
+
+def style_weights(reward_scale: str) -> Tensor:
+    """(18, 44) the inner weights: row i is g_i as a sum of components (paper; `sim` scales removals down).
+
+    Raises:
+        ValueError: if the scale is unknown.
+    """
+    if reward_scale not in REWARD_SCALES:
+        raise ValueError(f"reward_scale is {reward_scale!r}: expected one of {REWARD_SCALES}")
+    table = load_table("style_terms")
+
+    def weight(term: str) -> float:
+        return table.number(term, f"{reward_scale}_weight")
+
+    def at(name: str, offset: int = 0) -> int:
+        return COMPONENT_SLICES[name].start + offset
+
+    sources: dict[str, list[tuple[int, float]]] = {}
+    for style in STYLES:
+        if style == "melee":
+            entries = [(at("melee_damage"), weight("melee damage"))]
+        elif style == "traps":
+            entries = [
+                (at("trap_damage"), weight("trap damage")),
+                (at("proximity"), weight("trap proximity")),
+                (at("lure"), weight("trap lure")),
+            ]
+        elif style in _WEAPON_OF:
+            entries = [(at("weapon_damage", WEAPONS.index(_WEAPON_OF[style])), weight("weapon damage"))]
+        elif style in ELEMENTS:
+            e = ELEMENTS.index(style)
+            buildup = "build-up of fire and adhesive" if style in _GENEROUS else "build-up"
+            entries = [
+                (at("state_damage", e), weight("damage in the state")),
+                (at("ammo_change", e), weight("ammo selected")),
+                (at("buildup", e), weight(buildup)),
+            ]
+        else:
+            p = PART_TYPES.index(style.removeprefix("part_"))
+            entries = [(at("part_damage", p), weight("part damage")), (at("removals", p), weight("part removal"))]
+        sources[style] = entries
+    return _selection(sources)
+
+
+def event_components() -> Tensor:
+    """(18, 44) 0 or 1: an event fires where one of its components is above 0."""
+    weights = style_weights("paper")
+    quiet = [COMPONENT_SLICES[name] for name in ("proximity", "lure", "ammo_change", "buildup")]
+    fires = (weights != 0).float()
+    for piece in quiet:
+        fires[:, piece] = 0.0
+    return fires

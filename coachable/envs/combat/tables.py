@@ -1,0 +1,212 @@
+"""The domain's tables (`data/*.csv`), read and checked. The second row of each file says where each column is from.
+
+Origins: `paper` (tables of Appendix C and D) or `ours`.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+
+ELEMENTS = ("acid", "purgewater", "frost", "shock", "plasma", "fire", "adhesive")
+PART_TYPES = ("shield", "weapon", "canister")
+KINDS = ("cone", "charge", "ranged", "area")
+CLASSES = ("small", "charger", "brute", "titan", "stalker")
+PART_SLOTS = 12
+ATTACK_SLOTS = 4
+
+
+@dataclass(frozen=True)
+class Table:
+    """One data file.
+
+    Attributes:
+        file: its name.
+        origin: where the numbers of each column are from, "paper" or "ours".
+        rows: by the first column, each a mapping from column to text.
+    """
+
+    file: str
+    origin: Mapping[str, str]
+    rows: Mapping[str, Mapping[str, str]]
+
+    def fail(self, row: str, problem: str) -> ValueError:
+        """The error for a row."""
+        return ValueError(f"coachable/envs/combat/data/{self.file}, row {row!r}: {problem}")
+
+    def number(self, row: str, column: str) -> float:
+        """A finite or infinite number of the table.
+
+        Raises:
+            ValueError: if it is none; names file, row and column.
+        """
+        text = self.rows[row][column]
+        try:
+            value = float(text)
+        except ValueError:
+            raise self.fail(row, f"{column} is {text!r}, expected a number") from None
+        if value != value:
+            raise self.fail(row, f"{column} is NaN, expected a number")
+        return value
+
+    def column(self, name: str) -> list[float]:
+        """All numbers of a column, in the order of the rows."""
+        return [self.number(row, name) for row in self.rows]
+
+    def words(self, row: str, column: str, allowed: tuple[str, ...]) -> tuple[str, ...]:
+        """Space-separated names of a cell, checked.
+
+        Raises:
+            ValueError: if one is not allowed; names file, row and column.
+        """
+        found = tuple(self.rows[row][column].split())
+        for word in found:
+            if word not in allowed:
+                raise self.fail(row, f"{column} has {word!r}, expected some of {allowed}")
+        return found
+
+
+def parse_table(file: str, text: str) -> Table:
+    """Reads the text of a data file: a line of column names, a line of origins, one line per row.
+
+    Raises:
+        ValueError: if a row is incomplete or repeated, or an origin is unknown; names file and row.
+    """
+    lines = list(csv.reader(text.splitlines()))
+    names, origin, rows = lines[0], dict(zip(lines[0][1:], lines[1][1:], strict=False)), {}
+    table = Table(file, origin, rows)
+    if lines[1][0] != "origin" or set(origin) != set(names[1:]) or not set(origin.values()) <= {"paper", "ours"}:
+        raise table.fail("origin", f"expected 'paper' or 'ours' for each of {names[1:]}")
+    for cells in lines[2:]:
+        if len(cells) != len(names):
+            raise table.fail(cells[0] if cells else "", f"{len(cells)} cells, expected {len(names)}: {names}")
+        if cells[0] in rows:
+            raise table.fail(cells[0], "appears twice")
+        rows[cells[0]] = dict(zip(names[1:], cells[1:], strict=True))
+    if not rows:
+        raise ValueError(f"coachable/envs/combat/data/{file} has no rows")
+    return table
+
+
+@cache
+def load_table(name: str) -> Table:
+    """A table of `data/`, such as "machines"."""
+    file = f"{name}.csv"
+    return parse_table(file, resources.files(__package__).joinpath("data", file).read_text(encoding="utf-8"))
+
+
+@dataclass(frozen=True)
+class Machine:
+    """One machine type; see machines.csv.
+
+    Attributes:
+        name: as in the paper.
+        hp: health [HP].
+        strong: elements of which it takes half the damage.
+        weak: elements of which it takes twice the damage.
+        parts: removable shields, weapons and canisters.
+        kind: class that gives its attacks.
+        radius: of the body [m].
+        speed: [m/s].
+        threat: factor of its hits.
+        height: at which it flies [m].
+    """
+
+    name: str
+    hp: float
+    strong: tuple[str, ...]
+    weak: tuple[str, ...]
+    parts: tuple[int, int, int]
+    kind: str
+    radius: float
+    speed: float
+    threat: float
+    height: float
+
+    @property
+    def hit(self) -> float:
+        """Damage of its unscaled attack [HP]."""
+        return 6.0 * self.hp**0.36 * self.threat
+
+    def slots(self) -> tuple[int, int, int]:
+        """Part slots of each type: one if present, then each free slot to the type with most units per slot."""
+        slots = [int(count > 0) for count in self.parts]
+        while sum(slots) < PART_SLOTS:
+            load = [count / slot if slot else 0.0 for count, slot in zip(self.parts, slots, strict=True)]
+            if max(load) <= 1:
+                break
+            slots[load.index(max(load))] += 1
+        return slots[0], slots[1], slots[2]
+
+
+def machines_of(table: Table) -> dict[str, Machine]:
+    """Checked machines of a table.
+
+    Raises:
+        ValueError: if a row contradicts itself; names file and row.
+    """
+    found = {}
+    for name in table.rows:
+        strong, weak = (table.words(name, column, ELEMENTS) for column in ("strong", "weak"))
+        if set(strong) & set(weak):
+            raise table.fail(name, f"strong and weak share {sorted(set(strong) & set(weak))}")
+        counts = [table.number(name, f"{part}s") for part in PART_TYPES]
+        if any(count < 0 or count != int(count) for count in counts):
+            raise table.fail(name, f"parts are {counts}, expected whole numbers from 0")
+        kinds = table.words(name, "class", CLASSES)
+        if len(kinds) != 1:
+            raise table.fail(name, f"class is {kinds}, expected one of {CLASSES}")
+        values = {column: table.number(name, column) for column in ("hp", "radius", "speed", "threat")}
+        for column, value in values.items():
+            if not 0 < value < float("inf"):
+                raise table.fail(name, f"{column} is {value}, expected a positive number")
+        parts = (int(counts[0]), int(counts[1]), int(counts[2]))
+        height = table.number(name, "height")
+        found[name] = Machine(name, strong=strong, weak=weak, parts=parts, kind=kinds[0], height=height, **values)
+    return found
+
+
+MACHINES: dict[str, Machine] = machines_of(load_table("machines"))
+"""The paper's 19 training machines, from the weakest to the strongest."""
+
+UNSEEN_MACHINES: dict[str, Machine] = machines_of(load_table("unseen_machines"))
+"""Three machines that are never trained on."""
+
+ALL_MACHINES: dict[str, Machine] = MACHINES | UNSEEN_MACHINES
+
+WEAPONS: tuple[str, ...] = tuple(dict.fromkeys(row["weapon"] for row in load_table("weapons").rows.values()))
+"""The six weapons, in the order of the wheel, counter-clockwise from the right."""
+
+AMMO: tuple[tuple[str, ...], ...] = tuple(
+    tuple(name for name, row in load_table("weapons").rows.items() if row["weapon"] == weapon) for weapon in WEAPONS
+)
+"""Ammo of each weapon, in the order of the wheel's sections."""
+
+TRAPS: tuple[str, ...] = tuple(load_table("traps").rows)
+SITES: tuple[str, ...] = tuple(load_table("sites").rows)
+STYLES: tuple[str, ...] = tuple(load_table("styles").rows)
+"""The 18 style weights, in the order of theta, `style_features` and `events`."""
+
+
+def resistance(machine: Machine) -> list[float]:
+    """Factor on damage and build-up of each element: 2 weak, 0.5 strong, 1 otherwise."""
+    return [2.0 if e in machine.weak else 0.5 if e in machine.strong else 1.0 for e in ELEMENTS]
+
+
+def attacks_of(kind: str) -> list[str]:
+    """Attacks of a class, at most four.
+
+    Raises:
+        ValueError: if there are none or more.
+    """
+    table = load_table("attacks")
+    found = [name for name, row in table.rows.items() if row["class"] == kind]
+    if not 1 <= len(found) <= ATTACK_SLOTS:
+        raise ValueError(f"coachable/envs/combat/data/{table.file}: class {kind!r} has {len(found)} attacks")
+    for name in found:
+        if len(table.words(name, "kind", KINDS)) != 1:
+            raise table.fail(name, f"expected one kind of {KINDS}")
+    return found

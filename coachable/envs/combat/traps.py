@@ -1,0 +1,95 @@
+"""Traps that the player sets, and the zones that a machine leaves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from coachable.envs.combat import constants as c
+from coachable.envs.combat.state import State, nearest, pick
+from coachable.envs.combat.tables import ELEMENTS, TRAPS, load_table
+from coachable.envs.combat.traits import Traits
+
+
+@dataclass
+class TrapNumbers:
+    """traps.csv for the machines of the fights.
+
+    Attributes:
+        damage: (4, E, N) of each trap type, resistance included [HP].
+        gain: (4, E, N) build-up as a share of the threshold, growth of shock's threshold left out.
+        element: (7, 4) one-hot columns, zero for a trap without element.
+    """
+
+    damage: Tensor
+    gain: Tensor
+    element: Tensor
+
+    @classmethod
+    def of(cls, traits: Traits) -> TrapNumbers:
+        """Looks the numbers up."""
+        table, device = load_table("traps"), traits.hp.device
+        element = torch.zeros((len(ELEMENTS), len(TRAPS)), device=device)
+        for i, trap in enumerate(TRAPS):
+            for name in table.words(trap, "element", ELEMENTS):
+                element[ELEMENTS.index(name), i] = 1.0
+        resisted = torch.tensordot(element.T, traits.resistance, dims=1)  # (4, E, N), 0 without element
+        plain = (1.0 - element.sum(0)).view(-1, 1, 1)
+
+        def column(name: str) -> Tensor:
+            return torch.tensor(table.column(name), device=device).view(-1, 1, 1)
+
+        return cls(column("damage") * (resisted + plain), column("buildup") * resisted / traits.threshold, element)
+
+
+def spring_traps(s: State, traits: Traits, numbers: TrapNumbers) -> tuple[Tensor, Tensor, Tensor]:
+    """One frame of the traps: an armed one fires when a machine is near, and is gone.
+
+    Returns:
+        (E, N) damage [HP], (7, E, N) build-up, (N,) damage to the player [HP].
+    """
+    s.trap_arm = (s.trap_arm - 1.0).clamp(min=0.0)
+    offset = s.enemy_position.unsqueeze(1) - s.trap_position.unsqueeze(2)  # (2, 4, E, N)
+    within = offset.square().sum(0) < (traits.radius + c.TRAP_TRIGGER).square()
+    near = within & (s.enemy_hp > 0) & (s.enemy_z < c.REACHABLE_HEIGHT)  # (4, E, N)
+    fires = near.any(1) & (s.trap_type >= 0) & (s.trap_arm <= 0)  # (4, N)
+    hits = near & fires.unsqueeze(1)
+    types = torch.arange(len(TRAPS), device=fires.device).view(-1, 1, 1)
+    of_type = s.trap_type.unsqueeze(0) == types  # (types, 4, N)
+    hit = (hits.unsqueeze(0) & of_type.unsqueeze(2)).sum(1).float()  # (types, E, N)
+    to_player = (s.position.unsqueeze(1) - s.trap_position).square().sum(0) < c.TRAP_BLAST**2
+    self_damage = c.TRAP_SELF_DAMAGE * (fires & to_player).any(0)
+    s.trap_type = torch.where(fires, -1.0, s.trap_type)
+    gain = torch.tensordot(numbers.element, hit * numbers.gain, dims=1)
+    return (hit * numbers.damage).sum(0), gain, self_damage
+
+
+def closeness(s: State, trap_type: Tensor) -> Tensor:
+    """How close the nearest enemy and the player are to a set trap, (2, N) in [0, 1].
+
+    Args:
+        s: state.
+        trap_type: (4, N) of the traps that count, -1 where none is.
+    """
+    bodies = torch.stack((pick(s.enemy_position, nearest(s)), s.position), 1)  # (2 coordinates, 2 bodies, N)
+    distance = (bodies.unsqueeze(2) - s.trap_position.unsqueeze(1)).square().sum(0).sqrt()  # (2, 4, N)
+    near = (1.0 - distance / c.CLOSENESS_SCALE).clamp(min=0.0)
+    return (near * (trap_type >= 0)).amax(1)
+
+
+def burn_player(s: State) -> Tensor:
+    """One frame of the zones: (N,) damage to the player [HP]."""
+    s.hazard_timer = (s.hazard_timer - 1.0).clamp(min=0.0)
+    inside = (s.position.unsqueeze(1) - s.hazard_position).square().sum(0) < c.HAZARD_RADIUS**2
+    return (inside & (s.hazard_timer > 0)).any(0) * (c.HAZARD_DPS * c.DT)
+
+
+def leave_zone(s: State, left: Tensor) -> None:
+    """New zones under the machines where `left` (E, N); each takes the place of the one with least time."""
+    for enemy, leaves in enumerate(left):
+        oldest = s.hazard_timer[0] > s.hazard_timer[1]  # (N,) the second slot
+        slot = torch.stack((~oldest, oldest)) & leaves
+        s.hazard_position = torch.where(slot, s.enemy_position[:, enemy].unsqueeze(1), s.hazard_position)
+        s.hazard_timer = torch.where(slot, c.HAZARD_TIME * c.FPS, s.hazard_timer)
