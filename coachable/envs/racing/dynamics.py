@@ -237,9 +237,7 @@ def substep(
             yaw_rate + hit.yaw_rate,
         ]
     )
-    middle = torch.stack(
-        [steer, s.ax + filtered * (total.x / mass - s.ax), s.ay + filtered * (total.y / mass - s.ay)]
-    )
+    middle = torch.stack([steer, s.ax + filtered * (total.x / mass - s.ax), s.ay + filtered * (total.y / mass - s.ay)])
     last = torch.stack(
         [
             drive.fuel,

@@ -1,0 +1,310 @@
+"""`RacingEnv`: B races of A cars as one TorchRL environment with a row per car."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from coachable.envs.racing.circuits import load_track
+from coachable.envs.racing.garage import Garage
+from coachable.envs.racing.observation import COURSE_POINTS, observation_groups
+from coachable.envs.racing.parameters import Resources, compound_table
+from coachable.envs.racing.profile import Envelope, speed_profile
+from coachable.envs.racing.referee import TELEMETRY, Referee
+from coachable.envs.racing.run import RUN_ROWS, Run
+from coachable.envs.racing.scenarios import Conditions, Scenario, Starter, race_scenarios
+from coachable.envs.racing.simulation import SUBSTEPS, Simulation, compiled
+from coachable.envs.racing.state import STATE_ROWS
+from coachable.envs.racing.styles import style_features_size
+from coachable.envs.racing.task import TaskWeights
+from coachable.envs.racing.track import Course, Track
+from coachable.keys import STYLE_FEATURES, TASK_REWARD
+
+EPISODE_STEPS = 1500  # 150 s
+SCENARIO = "scenario"
+TELEMETRY_KEY = "telemetry"
+
+Driver = Callable[["RacingEnv", Tensor], Tensor]
+"""Drives cars that the agent does not: (env, observations (M, D)) to actions (M, 2), of the last M rows of `env.all_rows`."""
+
+
+class RacingEnv(EnvBase):
+    """B races of A cars; a row is a car, and row k * B + b is car k of race b.
+
+    Rows, not nested agents: styles, rewards, replay and losses then treat a car like any other environment. Cars of a
+    race start together and end together: when one terminates (wrong way, stopped, outside the walls), the others of
+    its race are truncated. None of this depends on the style.
+
+    Args:
+        num_envs: rows, the cars that the agent drives: races times `controlled`.
+        cars: A, in each race.
+        controlled: cars of each race that the agent drives, the first ones; default all. The others are driven by
+            `driver`.
+        driver: of the other cars.
+        track: name of a shipped circuit, or a `Track`.
+        car: name of a shipped car, or "pool" for cars drawn from a pool, one model per race.
+        scenarios: how episodes start; default the mixture of `race_scenarios`.
+        conditions: tyres and fuel at the start.
+        resources: wear and fuel rates.
+        weights: of the task reward.
+        course_points: points of each edge of the track that a driver sees.
+        episode_steps: control steps (0.1 s) after which an episode is truncated.
+        substeps: of physics in a control step; 40 for accurate runs.
+        compile: whether to compile the physics and the task: minutes at first, then several times faster.
+        device: where everything runs.
+        seed: of the starts; race b gets a stream of its own.
+        num_threads: ignored; torch's own threads are used.
+
+    Keys written: `observation` (N, D), `task_reward` (N, 1), `style_features` (N, 8 + 3 (A - 1)), `telemetry` (N, 11),
+    `scenario` (N, 1) int64, `done`, `terminated`, `truncated` (N, 1).
+
+    Raises:
+        ValueError: for an unknown car or track, or numbers of cars that do not fit.
+
+    Example:
+        >>> env = RacingEnv(num_envs=2, track="ring", seed=0)
+        >>> env.rollout(3)["next", "style_features"].shape
+        torch.Size([2, 3, 8])
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 64,
+        *,
+        cars: int = 1,
+        controlled: int | None = None,
+        driver: Driver | None = None,
+        track: str | Track = "lakeside",
+        car: str = "gt3",
+        scenarios: Sequence[Scenario] | None = None,
+        conditions: Conditions | None = None,
+        resources: Resources | None = None,
+        weights: TaskWeights | None = None,
+        course_points: int = COURSE_POINTS,
+        episode_steps: int = EPISODE_STEPS,
+        substeps: int = SUBSTEPS,
+        compile: bool = False,
+        device: torch.device | str = "cpu",
+        seed: int | None = None,
+        num_threads: int | None = None,
+    ) -> None:
+        controlled = cars if controlled is None else controlled
+        if not 1 <= controlled <= cars:
+            raise ValueError(f"controlled is {controlled}: expected 1 to {cars}, the cars of a race")
+        if num_envs < 1 or num_envs % controlled:
+            raise ValueError(
+                f"num_envs is {num_envs}: expected a positive multiple of the {controlled} controlled cars"
+            )
+        if controlled < cars and driver is None:
+            raise ValueError(f"{cars - controlled} cars of each race have no driver: pass driver=")
+        super().__init__(device=device, batch_size=torch.Size((num_envs,)))
+        self.num_envs, self.cars, self.controlled = num_envs, cars, controlled
+        self.races, self.driver, self.episode_steps = num_envs // controlled, driver, episode_steps
+        self.track = load_track(track) if isinstance(track, str) else track
+        place = torch.device(device)
+        self.course = Course(self.track, place)
+        self.garage = Garage(car, cars, self.races, place)
+        self.simulation = Simulation(
+            self.garage.car, resources or Resources(), cars=cars, substeps=substeps, compile=compile, device=place
+        )
+        self.referee = Referee(
+            self.course, weights or TaskWeights(), cars, substeps, course_points, pool=self.garage.pooled
+        )
+        profile = speed_profile(Envelope(self.garage.typical), self.track.table[:, 4].numpy(), self.track.spacing)
+        self.starter = Starter(
+            self.course, scenarios or race_scenarios(cars), conditions or Conditions(), torch.tensor(profile), cars
+        )
+        self._command = compiled(self.referee.command, place, compile)
+        self._judge = compiled(self.referee.judge, place, compile)
+        self._compounds = compound_table().to(place)
+        rows = cars * self.races
+        self.state = torch.zeros(STATE_ROWS, rows, device=place)
+        self.run = torch.zeros(RUN_ROWS, rows, device=place)
+        self.compound = torch.zeros(2 + len(self._compounds), rows, device=place)
+        self.group = torch.zeros(cars, self.races, dtype=torch.int64, device=place)
+        self.scenario = torch.zeros(self.races, dtype=torch.int64, device=place)
+        self.episode = torch.zeros(self.races, dtype=torch.int64, device=place)
+        self.seeds = torch.zeros(self.races, dtype=torch.int64, device=place)
+        self.observation_size = sum(width for _, width in observation_groups(cars, self.garage.pooled, course_points))
+        self._observation = torch.zeros(rows, self.observation_size, device=place)
+        self._set_seed(seed)
+        self._make_specs()
+
+    # -- TorchRL ---------------------------------------------------------------------------------------------------
+
+    def _make_specs(self) -> None:
+        device = self.device
+
+        def rows(width: int) -> torch.Size:
+            return torch.Size((self.num_envs, width))
+
+        def unbounded(width: int) -> Unbounded:
+            return Unbounded(shape=rows(width), dtype=torch.float32, device=device)
+
+        self.action_spec = Bounded(-1.0, 1.0, shape=rows(2), dtype=torch.float32, device=device)
+        self.observation_spec = Composite(
+            {
+                "observation": unbounded(self.observation_size),
+                TASK_REWARD: unbounded(1),
+                STYLE_FEATURES: unbounded(style_features_size(self.cars)),
+                TELEMETRY_KEY: unbounded(len(TELEMETRY)),
+                SCENARIO: Unbounded(shape=rows(1), dtype=torch.int64, device=device),
+            },
+            shape=self.batch_size,
+            device=device,
+        )
+        self.reward_spec = unbounded(1)
+        self.done_spec = Composite(
+            {
+                name: Binary(n=1, shape=rows(1), dtype=torch.bool, device=device)
+                for name in ("done", "terminated", "truncated")
+            },
+            shape=self.batch_size,
+            device=device,
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        start = int(torch.randint(2**31, ()).item()) if seed is None else seed
+        self.seeds = start * 1_000_003 + torch.arange(self.races, device=self.seeds.device)
+        self.episode = torch.zeros_like(self.episode)
+        self.garage.reset(start)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
+        partial = None if tensordict is None else tensordict.get("_reset", None)
+        if partial is None:
+            races = torch.ones(self.races, dtype=torch.bool, device=self.device)
+        else:
+            wanted = partial.reshape(self.controlled, self.races)
+            races = wanted.any(0)
+            if bool((wanted != races).any()):
+                raise ValueError("a race starts anew with all of its cars: reset all rows of a race together")
+        self._start_races(races)
+        self._observation = self.referee.observe(
+            self.state, self.run, self.compound, self.garage.car, self.simulation.wheels, self._groups
+        )
+        zero = torch.zeros(self.num_envs, 1, device=self.device)
+        done = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
+        return TensorDict(
+            {
+                "observation": self._observation[: self.num_envs].clone(),
+                TASK_REWARD: zero,
+                STYLE_FEATURES: zero.expand(-1, style_features_size(self.cars)).clone(),
+                TELEMETRY_KEY: zero.expand(-1, len(TELEMETRY)).clone(),
+                SCENARIO: self._scenario_rows(),
+                "done": done,
+                "terminated": done.clone(),
+                "truncated": done.clone(),
+            },
+            batch_size=self.batch_size,
+            device=self.device,
+        )
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict.get("action").detach()
+        if action.shape != (self.num_envs, 2):
+            raise ValueError(f"action has shape {tuple(action.shape)}: expected ({self.num_envs}, 2), steer and pedals")
+        if torch.isnan(action).any():
+            raise ValueError("action contains NaN: the policy has diverged")
+        action = action.clamp(-1.0, 1.0).to(torch.float32)
+        if self.driver is not None and self.controlled < self.cars:
+            driven = self.driver(self, self._observation[self.num_envs :])
+            action = torch.cat([action, driven.detach().clamp(-1.0, 1.0).to(action)])
+        old, inputs = self._command(self.state, self.run, action, self.compound)
+        new, impact = self.simulation.step(old, inputs, self.group)
+        several = () if impact is None else (self.group, impact)
+        verdict = self._judge(
+            old, new, self.run, action, self.compound, self.garage.car, self.simulation.wheels, *several
+        )
+        self.state, self.run, self._observation = verdict.state, verdict.run, verdict.observation
+        n = self.num_envs
+        terminated = verdict.terminated[:n, None]
+        over = (verdict.terminated.reshape(self.cars, -1).any(0)) | (self._steps >= self.episode_steps)
+        truncated = over.repeat(self.controlled)[:, None] & ~terminated
+        reward = verdict.reward[:n, None]
+        return TensorDict(
+            {
+                "observation": verdict.observation[:n].clone(),
+                TASK_REWARD: reward,
+                "reward": reward.clone(),
+                STYLE_FEATURES: verdict.features[:n],
+                TELEMETRY_KEY: verdict.telemetry[:n],
+                SCENARIO: self._scenario_rows(),
+                "done": terminated | truncated,
+                "terminated": terminated,
+                "truncated": truncated,
+            },
+            batch_size=self.batch_size,
+            device=self.device,
+        )
+
+    # -- state -----------------------------------------------------------------------------------------------------
+
+    def simulator_state(self) -> dict[str, Any]:
+        """Everything that the next step depends on, as tensors, for exact resumption."""
+        tensors = {name: getattr(self, name).clone() for name in _STATE}
+        return tensors | {"observation_now": self._observation.clone()} | self.garage.state()
+
+    def load_simulator_state(self, state: dict[str, Any]) -> None:
+        """Restores what `simulator_state` returned.
+
+        Raises:
+            ValueError: if it comes from other numbers of races or cars.
+        """
+        if state["group"].shape != self.group.shape:
+            cars, races = state["group"].shape
+            raise ValueError(f"state of {races} races of {cars} cars given, this env has {self.races} of {self.cars}")
+        for name in _STATE:
+            setattr(self, name, state[name].to(self.device, copy=True))
+        self._observation = state["observation_now"].to(self.device, copy=True)
+        self.garage.load_state(state)
+        self.simulation.set_cars(self.garage.car)
+
+    @property
+    def telemetry_names(self) -> tuple[str, ...]:
+        """Columns of `telemetry`."""
+        return TELEMETRY
+
+    @property
+    def scenario_names(self) -> tuple[str, ...]:
+        """What the numbers of `scenario` mean."""
+        return tuple(scenario.name for scenario in self.starter.scenarios)
+
+    @property
+    def _groups(self) -> Tensor | None:
+        return self.group if self.cars > 1 else None
+
+    @property
+    def _steps(self) -> Tensor:
+        return Run(*self.run.unbind(0)).steps[: self.races]
+
+    def _scenario_rows(self) -> Tensor:
+        return self.scenario.repeat(self.controlled)[:, None]
+
+    def _start_races(self, races: Tensor) -> None:
+        """New episodes of the races (B,) bool; the others stay as they are."""
+        self.episode = self.episode + races
+        if self.garage.pooled:
+            self.garage.draw(races, self.seeds, self.episode, Run(*self.run.unbind(0)).spins)
+            self.simulation.set_cars(self.garage.car)
+        starts = self.starter.draw(self.seeds, self.episode, self.garage.car)
+        rows = races.repeat(self.cars)
+        self.state = torch.where(rows, starts.state.reshape(STATE_ROWS, -1), self.state)
+        self.group = torch.where(races, starts.group, self.group)
+        self.scenario = torch.where(races, starts.scenario, self.scenario)
+        kind = starts.compound.reshape(-1)
+        one_hot = torch.nn.functional.one_hot(kind, len(self._compounds)).to(self.compound)
+        compound = torch.cat([self._compounds[kind], one_hot], dim=1).T
+        self.compound = torch.where(rows, compound, self.compound)
+        run = self.referee.begin(
+            self.state, starts.s.reshape(-1), starts.distance.reshape(-1), self.garage.car, self._groups
+        )
+        self.run = torch.where(rows, run, self.run)
+
+
+_STATE = ("state", "run", "compound", "group", "scenario", "episode", "seeds")

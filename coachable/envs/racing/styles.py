@@ -1,0 +1,159 @@
+"""Styles of racing: drift, tyre and fuel saving, aggressiveness. Ranges and laws are the paper's (Appendix C)."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+
+import torch
+from torch import Tensor
+
+from coachable.styles import (
+    Mixture,
+    PointMass,
+    Product,
+    Sampler,
+    Setpoint,
+    StyleReward,
+    StyleSpace,
+    Term,
+    Uniform,
+    Weight,
+    WeightedSum,
+)
+
+# Columns of `style_features`. Then three per opponent: longitudinal and lateral gap [m], near.
+DRIFT_NAMES = ("slip_angle_front", "slip_angle_rear", "slip_ratio_front", "slip_ratio_rear")
+RESOURCE_NAMES = ("overtake", "defend", "tire", "fuel")
+DRIFT = slice(0, 4)
+RESOURCES = slice(4, 8)
+GAPS = 8
+GAP_COLUMNS = ("longitudinal", "lateral", "near")
+
+NEAR_DISTANCE = 10.0  # [m] between centres; the paper leaves "nearby" open
+DRIFT_SPEED_MIN = 5.0  # [m/s], below which slip counts as none
+
+_DRIFT_BOUNDS = (-0.4, 5.0)
+_TIRE_BOUNDS = (-60.0, 12000.0)
+_FUEL_BOUNDS = (-3.0, 105.0)
+
+
+def style_features_size(cars: int) -> int:
+    """Columns of `style_features` in races of so many cars."""
+    return GAPS + len(GAP_COLUMNS) * (cars - 1)
+
+
+def _three_way(neutral: float, bounds: tuple[float, float]) -> Mixture:
+    """Neutral with a probability, otherwise negative or positive, equally likely."""
+    low, high = bounds
+    side = (1.0 - neutral) / 2
+    return Mixture([PointMass(0.0), Uniform(low, 0.0), Uniform(0.0, high)], [neutral, side, side])
+
+
+def drift_style_space() -> StyleSpace:
+    """Weights of slip angle and slip ratio, front and rear: 0.5 δ(0) + 0.25 U(-0.4, 0) + 0.25 U(0, 5) each."""
+    low, high = _DRIFT_BOUNDS
+    helps = ("front tyres sideways", "rear tyres sideways", "front wheels locking or spinning", "rear wheels spinning")
+    parameters = [Weight(name, low, high, help=text) for name, text in zip(DRIFT_NAMES, helps, strict=True)]
+    return StyleSpace(parameters, Product([_three_way(0.5, _DRIFT_BOUNDS)] * 4), name="racing_drift")
+
+
+def resource_style_space() -> StyleSpace:
+    """Overtake and defend U(0, 2); tire 0.1 δ(0) + 0.45 U(-60, 0) + 0.45 U(0, 12000); fuel likewise with -3 and 105."""
+    parameters = [
+        Weight("overtake", 0.0, 2.0, help="gain on cars ahead"),
+        Weight("defend", 0.0, 2.0, help="keep cars behind"),
+        Weight("tire", *_TIRE_BOUNDS, help="save tyres"),
+        Weight("fuel", *_FUEL_BOUNDS, help="save fuel"),
+    ]
+    laws = [Uniform(0.0, 2.0), Uniform(0.0, 2.0), _three_way(0.1, _TIRE_BOUNDS), _three_way(0.1, _FUEL_BOUNDS)]
+    return StyleSpace(parameters, Product(laws), name="racing_resources")
+
+
+def aggressiveness_style_space(cars: int = 1) -> StyleSpace:
+    """Margins to other cars: longitudinal U(0, 2) m, lateral U(0, 1) m.
+
+    Args:
+        cars: of a race, if all of them are to get the same style, as in the paper; they then have to be the rows of a
+            `RacingEnv` in which every car is controlled.
+    """
+    parameters = [
+        Setpoint("longitudinal", 0.0, 2.0, unit="m", help="distance to keep ahead and behind"),
+        Setpoint("lateral", 0.0, 1.0, unit="m", help="distance to keep beside"),
+    ]
+    law: Sampler = Uniform((0.0, 0.0), (2.0, 1.0))
+    return StyleSpace(parameters, law if cars == 1 else SharedByRace(law, cars), name="racing_aggressiveness")
+
+
+@dataclass(frozen=True)
+class SharedByRace(Sampler):
+    """One style per race for all of its cars, of a batch `(cars * races,)` with the first cars of all races first.
+
+    Args:
+        sampler: distribution of the shared style.
+        cars: of a race.
+    """
+
+    sampler: Sampler
+    cars: int
+
+    @property
+    def dim(self) -> int:
+        """Number of entries."""
+        return self.sampler.dim
+
+    def _draw(self, shape: tuple[int, ...], generator: torch.Generator | None, device: torch.device) -> Tensor:
+        if not shape:
+            return self.sampler._draw(shape, generator, device)
+        races = -(-shape[-1] // self.cars)
+        drawn = self.sampler._draw((*shape[:-1], races), generator, device)
+        return drawn.repeat(*(1 for _ in shape[:-1]), self.cars, 1)[..., : shape[-1], :].clone()
+
+    def support(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Bounds of the shared style."""
+        return self.sampler.support()
+
+
+def drift_style_reward(space: StyleSpace) -> StyleReward:
+    """Σ w_i g_i over mean slip angles [rad] and slip ratios of the axles."""
+    return StyleReward(space, {"drift": WeightedSum(DRIFT_NAMES, DRIFT)})
+
+
+def resource_style_reward(space: StyleSpace) -> StyleReward:
+    """Σ w_i g_i: metres gained ahead and behind, minus mean wear, minus fuel [l]."""
+    return StyleReward(space, {"resources": WeightedSum(RESOURCE_NAMES, RESOURCES)})
+
+
+def aggressiveness_style_reward(space: StyleSpace, *, gate: str = "radius") -> StyleReward:
+    """Σ over near opponents of min(0, d_lon - ξ_lon) + min(0, d_lat - ξ_lat).
+
+    Args:
+        space: `aggressiveness_style_space`.
+        gate: "radius" charges both gaps of every near car, literally; "overlap" charges a gap only where the cars
+            overlap along the other axis, so that a car straight ahead costs no lateral margin.
+
+    Raises:
+        ValueError: if the gate is unknown.
+    """
+    if gate not in ("radius", "overlap"):
+        raise ValueError(f"gate is {gate!r}: expected 'radius' or 'overlap'")
+
+    def margins(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
+        parts: list[Tensor] = []
+        for column in range(GAPS, features.shape[-1], len(GAP_COLUMNS)):
+            long, lat, near = features[..., column], features[..., column + 1], features[..., column + 2]
+            too_long = torch.clamp(long - style["longitudinal"], max=0.0)
+            too_lat = torch.clamp(lat - style["lateral"], max=0.0)
+            if gate == "overlap":
+                too_long, too_lat = torch.where(lat == 0.0, too_long, 0.0), torch.where(long == 0.0, too_lat, 0.0)
+            parts.append(near * (too_long + too_lat))
+        return reduce(operator.add, parts) if parts else torch.zeros_like(style["lateral"])
+
+    return StyleReward(space, {"margins": Term(margins, parameters=("longitudinal", "lateral"))})
+
+
+def pack_style_features(drift: Sequence[Tensor], resources: Sequence[Tensor], gaps: Sequence[Tensor]) -> Tensor:
+    """Columns in the order above, (N, F), from tensors (N,)."""
+    return torch.stack([*drift, *resources, *gaps], dim=-1)
