@@ -33,7 +33,7 @@ _NEAR_MARGIN, _FAR_MARGIN = 0.25, 0.5  # [m], of the gait's guide
 STRIDE_FRACTION_BOUNDS = (1 / 3, 2 / 3)
 _STRIDE_FRACTION_MARGIN = 1 / 6
 KNEE_RANGE_DEG = (-145.0, 0.0)
-_KNEE_MARGIN_DEG = 10.0
+_KNEE_MARGIN_DEG = 30.0
 
 # Layout of `style_features`: six arm angles [rad], then these.
 NUM_ARM_JOINTS = 6
@@ -133,8 +133,8 @@ def humanoid_style_reward(
         )
         knee_low, knee_high = (math.radians(angle) for angle in KNEE_RANGE_DEG)
         knee_margin = math.radians(_KNEE_MARGIN_DEG)
-        score = score * tolerance(features[..., KNEE_MIN], knee_low, math.inf, knee_margin, "long_tail")
-        score = score * tolerance(features[..., KNEE_MAX], -math.inf, knee_high, knee_margin, "long_tail")
+        score = score * tolerance(features[..., KNEE_MIN], knee_low, math.inf, knee_margin, "linear", 0.0)
+        score = score * tolerance(features[..., KNEE_MAX], -math.inf, knee_high, knee_margin, "linear", 0.0)
         return _per_control_step(features, score) - timeout_penalty * features[..., TIMED_OUT]
 
     def gait_guide(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:

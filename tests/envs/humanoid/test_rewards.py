@@ -16,16 +16,18 @@ def reward(speed=1.0, head=1.5, upright=1.0, facing=1.0, control=0.0):
     ("change", "expected"),
     [
         ({}, 1.0),
-        ({"speed": 2.0}, 1.0),  # faster earns no more
+        ({"speed": 1.2}, 1.0),
+        ({"speed": 1.7}, 0.5),  # running earns less
         ({"speed": 0.5}, 0.5),
         ({"speed": 0.0}, 0.0),
-        ({"speed": -1.0}, 0.0),  # nothing for moving backwards
+        ({"speed": -0.5}, -0.5),  # walking backwards costs
+        ({"speed": -3.0}, -1.0),
         ({"head": 1.4 - 0.35}, 0.1),  # a Gaussian's value at its margin
         ({"upright": 0.7}, 0.5),
         ({"facing": 0.45}, 0.5),
         ({"facing": -0.5}, 0.0),
-        ({"control": 1.0}, 0.8),
-        ({"control": 0.5}, 0.8 + 0.2 * 0.75),
+        ({"control": 1.0}, 0.5),
+        ({"control": 0.5}, 0.5 + 0.5 * 0.75),
     ],
 )
 def test_each_factor(change, expected):

@@ -118,8 +118,8 @@ def test_gait_terms_at_the_papers_margin_of_five_centimetres():
 def test_uneven_strides_and_bent_or_overstretched_knees_cost():
     assert terms(a_step(0.5, fraction=2 / 3))["gait"] == pytest.approx(20)
     assert terms(a_step(0.5, fraction=5 / 6))["gait"] == pytest.approx(0, abs=1e-5)
-    assert terms(a_step(0.5, knee_min=math.radians(-155)))["gait"] == pytest.approx(2, rel=1e-4)
-    assert terms(a_step(0.5, knee_max=math.radians(10)))["gait"] == pytest.approx(2, rel=1e-4)
+    assert terms(a_step(0.5, knee_min=math.radians(-160)))["gait"] == pytest.approx(10, rel=1e-4)
+    assert terms(a_step(0.5, knee_max=math.radians(10)))["gait"] == pytest.approx(40 / 3, rel=1e-4)
 
 
 def test_a_foot_that_lands_behind_gains_by_landing_less_far_behind():
