@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -27,7 +29,8 @@ def make_server(host: str = "127.0.0.1", port: int = 8080) -> viser.ViserServer:
         def request_share_url(self, verbose: bool = True) -> None:
             """Refuses viser's tunnel through a public host, which any browser could ask for."""
 
-    server = LocalServer(host=host, port=port, label="coachable", verbose=False)
+    with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
+        server = LocalServer(host=host, port=port, label="coachable", verbose=False)
     server.gui.configure_theme(
         show_logo=False, show_share_button=False, control_width="large", brand_color=(31, 119, 180)
     )

@@ -49,7 +49,7 @@ class HumanoidView:
         self._scene.camera_tracking_enabled = False  # it would also follow the bobbing of the torso
         self._torso = self._model.body("torso").id
         server.scene.set_up_direction("+z")
-        server.initial_camera.position = (2.4, -2.4, 1.5)
+        server.initial_camera.position = (2.0, -2.0, 1.3)
         server.initial_camera.look_at = (0.0, 0.0, 0.85)
         self._arrow: Any = None
         self._course: float | None = None
