@@ -140,9 +140,9 @@ def check_relabelling(config: dict[str, Any]) -> None:
     """
     replay, n = config["replay"], config["impersonation"]["n"]
     if "events" in replay and replay["events"] is None:
-        raise ValueError(f"replay=event_tables: {config['domain']} names no events; expected replay=uniform or n_step")
-    if n and replay.get("n_steps", 1) > 1:
+        raise ValueError(f"replay=event_tables: {config['domain']} names no events; expected replay=uniform")
+    if n and config["n_steps"] > 1:
         raise ValueError(
-            f"impersonation.n={n} with replay.n_steps={replay['n_steps']}: the reward of another style needs the "
-            "features of every step summed; expected replay.n_steps=1 or impersonation.n=0"
+            f"impersonation.n={n} with n_steps={config['n_steps']}: the reward of another style needs the features of "
+            "every step summed; expected n_steps=1 or impersonation.n=0"
         )

@@ -7,7 +7,6 @@ import pytest
 import torch
 from recipe_config import compose_config, config_groups
 
-from coachable.replay import EventTableBuffer
 from coachable.training.checkpoint import find_checkpoint, read_state
 from coachable.training.loop import REPLAY_KEYS
 
@@ -35,7 +34,7 @@ def test_recipes_were_found():
 
 @pytest.mark.parametrize("recipe, loss", _choices("loss"))
 def test_every_loss_trains(recipe, loss, tmp_path):
-    train = _train(recipe, tmp_path, f"loss={loss}", "impersonation.n=1", "replay=uniform")
+    train = _train(recipe, tmp_path, f"loss={loss}", "impersonation.n=1", "n_steps=1")
     assert train.learner.updates == 2
     assert train.learner.update_order == ("policy_first" if loss in POLICY_FIRST else "simultaneous")
     for name, value in train.learner.loss_module.named_parameters():
@@ -48,7 +47,7 @@ def test_every_replay_buffer_trains(recipe, replay, tmp_path):
     assert train.learner.updates >= 2
     sample = train.replay.sample(8)
     assert set(REPLAY_KEYS) - {("next", "style_features")} <= set(sample.keys(True))
-    assert isinstance(train.replay, EventTableBuffer) == (replay != "uniform")
+    assert ("default",) == train.replay.names[:1] and (len(train.replay.names) > 1) == (replay == "event_tables")
 
 
 @pytest.mark.parametrize("group", ["sampler", "collector", "network", "preset"])
@@ -59,11 +58,9 @@ def test_every_choice_composes(recipe, group):
         assert config["preset"] != "auto", "auto was replaced by what it chose"
 
 
-@pytest.mark.parametrize("loss, replay", [("sac", "n_step"), ("cat_rac", "event_tables")])
+@pytest.mark.parametrize("loss, replay", [("sac", "uniform"), ("cat_rac", "event_tables")])
 def test_runs_with_tables_resume_bit_for_bit(loss, replay, tmp_path):
-    choice = [f"loss={loss}", f"replay={replay}"]
-    if replay == "event_tables":
-        choice += ["replay.n_steps=3", "replay.prioritized=true"]
+    choice = [f"loss={loss}", f"replay={replay}", "n_steps=3", "replay.prioritized=true"]
     _train("humanoid_sac", tmp_path / "whole", *choice, "train.total_frames=120")
     _train("humanoid_sac", tmp_path / "half", *choice, "train.total_frames=60")
     rest = compose_config("humanoid_sac", [f"resume={tmp_path / 'half'}", "train.total_frames=120"])
@@ -77,14 +74,18 @@ def test_runs_with_tables_resume_bit_for_bit(loss, replay, tmp_path):
     "recipe, arguments, message",
     [
         ("humanoid_sac", ["sampler=one_hot"], r"pose, step_length .* cannot be \(not a weight\)"),
-        ("humanoid_sac", ["replay=n_step", "impersonation.n=4"], r"impersonation.n=4 with replay.n_steps=3"),
+        ("humanoid_sac", ["n_steps=3", "impersonation.n=4"], r"impersonation.n=4 with n_steps=3"),
         ("humanoid_sac", ["replay=event_tables", "events=null"], r"replay=event_tables: humanoid names no events"),
         (
             "humanoid_sac",
             ["replay=event_tables", "train.batch_size=2"],
             r"train.batch_size=2: every batch .* 3 tables \(default, step, fall\)",
         ),
-        ("humanoid_sac", ["loss=cat_rac", "critic_support.v_min=600"], r"v_min"),
+        (
+            "humanoid_sac",
+            ["loss=cat_rac", "critic_support.v_min=100"],
+            r"initial_value must lie in \[100.0, 650.0\], got 0.0",
+        ),
         ("humanoid_sac", ["init_from=nowhere"], r"nowhere"),
         ("cheetah_speed", ["mirror=0.5"], r"cheetah has no mirror images, expected mirror=0"),
     ],

@@ -95,7 +95,7 @@ def humanoid_style_reward(
     space: StyleSpace,
     *,
     pose_scale: float = 1.0,
-    pose_guide_scale: float = 1.0,
+    pose_guide_scale: float = 2.0,
     gait_scale: float = 1.0,
     gait_guide_scale: float = 1.5,
     timeout_penalty: float = 0.1,
