@@ -4,8 +4,8 @@ python recipes/rare_targets.py                            both on, a minute on o
 python recipes/rare_targets.py replay=uniform impersonation.n=0
 python recipes/rare_targets.py preset=smoke
 
-Chance seldom leads to a target, and seldom to the right one. Event tables keep what led there; impersonation asks of each
-such path what it would have been worth to somebody who wanted that target.
+Chance seldom leads to a target, and seldom to the right one. Event tables keep what led there; impersonation asks what
+each such path would have been worth to somebody who wanted that target.
 """
 
 import math

@@ -98,6 +98,7 @@ class StyleGrammar:
         declared = parameters.parameters if isinstance(parameters, StyleSpace) else tuple(parameters)
         self.parameters: dict[str, Parameter] = {p.name: p for p in declared}
         self.lexicon: dict[tuple[str, ...], Mention] = {}
+        self._context = {p.name: {stem(w) for w in tokenise(f"{p.help} {p.name}")} for p in declared}
         self._add_help()
         self._add_names()
         for meaning, phrases in (vocabulary or {}).items():
@@ -181,6 +182,8 @@ class StyleGrammar:
     # -- meaning ---------------------------------------------------------------------------------------------------
 
     def _interpret(self, segment: Segment, reading: _Reading) -> None:
+        for mention in segment.mentions:  # "the warrior bow": one word names it, the other describes it
+            segment.unknown = [word for word in segment.unknown if stem(word) not in self._context[mention.name]]
         if segment.negated and segment.unknown:  # what is denied is not known
             reading.failed.append(f"'{segment.text}' (unknown: {', '.join(segment.unknown)})")
             return
@@ -198,7 +201,7 @@ class StyleGrammar:
                 self._change(reading, name, parameter.default if segment.default else reading.values[name])
             else:
                 unknown = f"unknown: {', '.join(segment.unknown)}; " if segment.unknown else ""
-                reading.failed.append(f"'{segment.text}' ({unknown}{name} can be {_listed(parameter.options)})")
+                reading.failed.append(f"'{segment.text}' ({unknown}{_words(name)} can be {_listed(parameter.options)})")
             return
         value = self._number(parameter, segment, float(reading.values[name]), reading.last)
         if isinstance(value, str):
@@ -218,7 +221,7 @@ class StyleGrammar:
             parameter = self.parameters[mention.name]
             others = [o for o in parameter.options if o != mention.value] if isinstance(parameter, Choice) else []
             if isinstance(parameter, Choice) and reading.values[mention.name] != mention.value:
-                reading.said.append(f"{mention.name} stays {_shown(parameter, reading.values[mention.name])}")
+                reading.said.append(f"{_words(mention.name)} stays {_shown(parameter, reading.values[mention.name])}")
             elif len(others) == 1:
                 self._change(reading, mention.name, others[0])
             else:
@@ -279,7 +282,7 @@ class StyleGrammar:
                 return p.high / 4
             if segment.preferred or not segment.unknown:
                 return p.high
-        return f"how much? {p.name} goes from {p.low:g} to {p.high:g} {p.unit}".rstrip()
+        return f"how much? {_words(p.name)} goes from {p.low:g} to {p.high:g} {p.unit}".rstrip()
 
     def _sign(self, segment: Segment, p: Parameter, last: tuple[str, float] | None) -> float | None:
         """+1 or -1 for a change relative to the value in force."""
@@ -305,7 +308,7 @@ class StyleGrammar:
             return p.low + (p.high - p.low) * number / 100
         if unit:
             if _dimension(p) != UNITS[unit][0]:
-                return f"{p.name} is no {UNITS[unit][0]}" + (f", it is in {p.unit}" if p.unit else "")
+                return f"{_words(p.name)} is no {UNITS[unit][0]}" + (f", it is in {p.unit}" if p.unit else "")
             number = number * UNITS[unit][1] / UNITS[stem(p.unit)][1]
         if segment.signed or (number < 0 and p.low >= 0):
             return now + number
@@ -322,17 +325,17 @@ class StyleGrammar:
             if abs(value - before) <= 1e-6 * (parameter.high - parameter.low):
                 at = "already at its " + ("highest" if value >= parameter.high else "lowest")
                 ends = not parameter.low < value < parameter.high
-                reading.said.append(f"{name} stays {_shown(parameter, before)}" + (f", {at}" if ends else ""))
+                reading.said.append(f"{_words(name)} stays {_shown(parameter, before)}" + (f", {at}" if ends else ""))
                 return
             reading.last = (name, 1.0 if value > before else -1.0)
         if value == before:
-            reading.said.append(f"{name} stays {_shown(parameter, value)}")
+            reading.said.append(f"{_words(name)} stays {_shown(parameter, value)}")
             return
         number = isinstance(before, float)
         was = f"{before:.3g}" if number else _shown(parameter, before)
         outside = number and not parameter.low <= float(value) <= parameter.high
         trained = f", outside the trained range {parameter.low:g} to {parameter.high:g}" if outside else ""
-        reading.said.append(f"{name} {was} → {_shown(parameter, value)}{trained}")
+        reading.said.append(f"{_words(name)} {was} → {_shown(parameter, value)}{trained}")
         reading.values[name] = reading.changes[name] = value
 
     @staticmethod
@@ -345,11 +348,15 @@ def _dimension(parameter: Parameter) -> str:
     return UNITS.get(stem(parameter.unit), (ANY, 1.0))[0] if parameter.unit else ANY
 
 
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
 def _listed(names: Sequence[str]) -> str:
-    return " or ".join(name.replace("_", " ") for name in names)
+    return " or ".join(map(_words, names))
 
 
 def _shown(parameter: Parameter, value: Value) -> str:
     if isinstance(value, str):
-        return value.replace("_", " ")
+        return _words(value)
     return f"{value:.3g} {parameter.unit}".rstrip()

@@ -25,7 +25,7 @@ from coachable.evaluation.runs import (
 )
 from coachable.evaluation.style_grid import mean_of, write_csv
 from coachable.evaluation.sweep import STYLE_SCORE
-from coachable.styles import Choice
+from coachable.styles import Setpoint
 from coachable.training.weights import LoadedPolicy, load_policy
 
 __all__ = ["report", "write_report"]
@@ -105,7 +105,7 @@ def write_report(
     bar = tqdm(planned, desc="evaluating", unit="run", disable=None if progress else True)
     runs = [evaluate_run(label, domain, agent, seed=number, **options) for label, agent, number in bar]
     agent = next(iter(agents.values()))
-    styles = StyleTable(runs)
+    styles = StyleTable(runs, agent.space)
     formats = _formats(styles, domain)
     page = Page(f"{domain.name}: what was asked, and what was done", _lead(agents, runs, episodes))
     _styles(page, styles, formats, agent, out)
@@ -144,7 +144,9 @@ def _lead(agents: Mapping[str, LoadedPolicy], runs: Sequence[Run], episodes: int
     return (
         f"{subject}. {len(runs)} runs ({', '.join(run.label for run in runs)}) of {episodes} episodes in each of "
         f"{len(grid.cells)} styles, up to {grid.steps} steps each. Values are interquartile means over the runs, each "
-        "run counting with the mean of its episodes; in brackets 95 % intervals, by stratified bootstrap over the runs."
+        "run counting with the mean of its episodes; in brackets 95 % intervals, by stratified bootstrap over runs. "
+        "An interquartile mean leaves out the lowest and the highest quarter: of shares it tells the typical style, so "
+        "the summary also has the plain mean."
     )
 
 
@@ -165,10 +167,8 @@ def _styles(page: Page, styles: StyleTable, formats: Mapping[str, str], agent: L
 
 
 def _requests(page: Page, styles: StyleTable, agent: LoadedPolicy, runs: Sequence[Run], out: Path) -> None:
-    numeric = [p.name for p in agent.space.parameters if not isinstance(p, Choice)]
-    measured = [
-        name for name in numeric if name in styles.cells[0] and not np.isnan(styles.scores.get(name, np.nan)).all()
-    ]
+    requested = [p.name for p in agent.space.parameters if isinstance(p, Setpoint) and p.name in styles.cells[0]]
+    measured = [name for name in requested if not np.isnan(styles.scores.get(name, np.nan)).all()]
     if not measured:
         return
     draw_requests(styles, agent.space, measured, out / "requests.png")
@@ -177,7 +177,7 @@ def _requests(page: Page, styles: StyleTable, agent: LoadedPolicy, runs: Sequenc
     if rows:
         write_csv([flat_row(row) for row in rows], out / "requests.csv")
         parts.append(paragraph("Slope and rank correlation of the measured over the requested value; 1 is ideal."))
-        parts.append(table(rows, {}))
+        parts.append(table(rows, {"slope": ".2f", "rank_correlation": ".2f", "mean_error": ".3f"}))
     page.section("Requested and measured", *parts)
 
 

@@ -132,7 +132,7 @@ def _draw_points(table: StyleTable, metrics: Sequence[str], formats: Mapping[str
         if formats.get(table.column(metric), "").endswith("%"):
             panel.set_xlim(-0.03, 1.03)
             panel.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-    panels[0, 0].set_yticks(rows, [describe(cell) for cell in table.cells], fontsize=8)
+    panels[0, 0].set_yticks(rows, table.labels, fontsize=8)
     panels[0, 0].invert_yaxis()
     _save(figure, path)
 

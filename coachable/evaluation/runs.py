@@ -31,6 +31,8 @@ __all__ = [
 SWITCH_PERIOD = 100
 """Env steps between switches of the style."""
 
+_MOST_COLUMNS = 3  # of style parameters in a table
+
 
 class Estimate(NamedTuple):
     """Interquartile mean over runs and tasks, with its 95 % stratified bootstrap interval."""
@@ -97,11 +99,14 @@ class StyleTable:
 
     Attributes:
         cells: the styles, by parameter name.
+        labels: the styles in words; of many parameters only those that differ from the default.
         scores: metric to (runs, cells), each the mean of a run's episodes.
     """
 
-    def __init__(self, runs: Sequence[Run]) -> None:
+    def __init__(self, runs: Sequence[Run], space: StyleSpace) -> None:
         self.cells = runs[0].grid.cells
+        self._wide = len(self.cells[0]) > _MOST_COLUMNS
+        self.labels = [describe(_requested(cell, space) if self._wide else cell) for cell in self.cells]
         self.scores = {
             name: np.array([[mean_of(cell) for cell in run.grid.episodes[name]] for run in runs])
             for name in runs[0].grid.episodes
@@ -118,21 +123,28 @@ class StyleTable:
     def rows(self, metrics: Sequence[str]) -> list[dict[str, Any]]:
         """One row per style: its values, and an `Estimate` of each metric."""
         return [
-            {**cell, **{self.column(metric): self.of(metric, [i]) for metric in metrics}}
+            {
+                **({"style": self.labels[i]} if self._wide else cell),
+                **{self.column(metric): self.of(metric, [i]) for metric in metrics},
+            }
             for i, cell in enumerate(self.cells)
         ]
 
     def summary(self, metrics: Sequence[str]) -> list[dict[str, Any]]:
-        """One row per metric: all styles together, and the styles where it is lowest and highest."""
+        """One row per metric: all styles together, the plain mean, and the styles where it is lowest and highest."""
         rows = []
         everywhere = range(len(self.cells))
         for metric in metrics:
             per_cell = [self.of(metric, [i]) for i in everywhere]
             values = np.array([cell.value for cell in per_cell])
-            row: dict[str, Any] = {"metric": self.column(metric), "all styles": self.of(metric, everywhere)}
+            row: dict[str, Any] = {
+                "metric": self.column(metric),
+                "all styles": self.of(metric, everywhere),
+                "mean": mean_of(self.scores[metric]),
+            }
             if not np.isnan(values).all():
                 for title, i in (("lowest", int(np.nanargmin(values))), ("highest", int(np.nanargmax(values)))):
-                    row |= {title: per_cell[i], f"{title} at": describe(self.cells[i])}
+                    row |= {title: per_cell[i], f"{title} at": self.labels[i]}
             else:
                 nothing = Estimate(float("nan"), float("nan"), float("nan"))
                 row |= {"lowest": nothing, "lowest at": "", "highest": nothing, "highest at": ""}
@@ -155,7 +167,13 @@ def response_rows(runs: Sequence[Run], space: StyleSpace) -> list[dict[str, Any]
 
 def describe(cell: dict[str, Any]) -> str:
     """A style as people write it."""
+    if not cell:
+        return "default"
     return ", ".join(f"{k} {v:g}" if isinstance(v, float | int) else f"{v}" for k, v in cell.items()).replace("_", " ")
+
+
+def _requested(cell: dict[str, Any], space: StyleSpace) -> dict[str, Any]:
+    return {name: value for name, value in cell.items() if value != space[name].default}
 
 
 def flat_row(row: dict[str, Any]) -> dict[str, Any]:

@@ -15,8 +15,10 @@ from coachable.cli import main
 from coachable.domain import Domain
 from coachable.evaluation.report import report, write_report
 from coachable.evaluation.report_page import shown, table
-from coachable.evaluation.runs import Estimate, describe, estimate
+from coachable.evaluation.runs import Estimate, Run, StyleTable, describe, estimate
+from coachable.evaluation.style_grid import StyleGrid
 from coachable.evaluation.sweep import sweep_weights
+from coachable.evaluation.switching import SwitchReport
 from coachable.styles import Choice, Setpoint, StyleReward, StyleSpace, Term, Weight, WeightedFeature
 from coachable.training.weights import LoadedPolicy, load_policy
 
@@ -130,6 +132,7 @@ def test_the_summary_names_the_extremes(folder):
     # One of eight styles ends early: the middle half of 3 runs x 8 styles is all ones.
     assert (survived["metric"], survived["all styles"], survived["lowest"]) == ("survived", "1", "0")
     assert survived["lowest at"] == "red, speed 2"
+    assert float(survived["mean"]) == 7 / 8
     assert (speed["metric"], speed["highest"], speed["highest at"]) == ("measured_speed", "2", "red, speed 2")
 
 
@@ -198,6 +201,15 @@ def test_another_kind_of_grid(tmp_path):
     page = (tmp_path / "report.html").read_text()
     assert "task return" in page and "Requested and measured" not in page
     assert "n/a" in page
+
+
+def test_of_many_parameters_only_what_is_asked_for_is_named():
+    space = StyleSpace([Weight(name, 0.0, 5.0) for name in ("melee", "fire", "frost", "lure")])
+    cells = [dict.fromkeys(space.names, 0.0), {**dict.fromkeys(space.names, 0.0), "fire": 5.0}]
+    grid = StyleGrid(cells, {"survived": np.ones((2, 3))}, 0, 10)
+    table = StyleTable([Run("seed 0", grid, SwitchReport({}, torch.empty(0), 0.0, 0), [])], space)
+    assert table.rows(["survived"])[1] == {"style": "fire 5", "survived": (1.0, 1.0, 1.0)}
+    assert table.labels[0] == "default"
 
 
 def test_agents_of_different_kinds_are_refused(make_train, tmp_path):
