@@ -47,7 +47,7 @@ def test_every_replay_buffer_trains(recipe, replay, tmp_path):
     assert train.learner.updates >= 2
     sample = train.replay.sample(8)
     assert set(REPLAY_KEYS) - {("next", "style_features")} <= set(sample.keys(True))
-    assert ("default",) == train.replay.names[:1] and (len(train.replay.names) > 1) == (replay == "event_tables")
+    assert train.replay.names[:1] == ("default",) and (len(train.replay.names) > 1) == (replay == "event_tables")
 
 
 @pytest.mark.parametrize("group", ["sampler", "collector", "network", "preset"])
