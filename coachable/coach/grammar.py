@@ -121,7 +121,7 @@ class StyleGrammar:
         for segment in split:
             if segment.default and not segment.unknown and not segment.mentions:
                 for name, parameter in self.parameters.items():
-                    self._change(reading, name, parameter.default)
+                    self._change(reading, name, _default(parameter))
             else:
                 self._interpret(segment, reading)
         reading.failed += [text for name, text in reading.excluded.items() if name not in reading.changes]
@@ -198,7 +198,7 @@ class StyleGrammar:
         parameter = self.parameters[name]
         if isinstance(parameter, Choice):
             if segment.keep or segment.default:
-                self._change(reading, name, parameter.default if segment.default else reading.values[name])
+                self._change(reading, name, _default(parameter) if segment.default else reading.values[name])
             else:
                 unknown = f"unknown: {', '.join(segment.unknown)}; " if segment.unknown else ""
                 reading.failed.append(f"'{segment.text}' ({unknown}{_words(name)} can be {_listed(parameter.options)})")
@@ -274,7 +274,7 @@ class StyleGrammar:
             step = TURNS[degree] * 360.0 if p.unit == "deg" else degree * span
             return min(max(now + sign * step, p.low), p.high) if p.unit != "deg" else now + sign * step
         if segment.default:
-            return float(cast(float, p.default))
+            return float(_default(p))
         if isinstance(p, Weight):
             if segment.negated:
                 return p.low
@@ -346,6 +346,11 @@ class StyleGrammar:
 
 def _dimension(parameter: Parameter) -> str:
     return UNITS.get(stem(parameter.unit), (ANY, 1.0))[0] if parameter.unit else ANY
+
+
+def _default(parameter: Parameter) -> Value:
+    """Declared or derived, it is never None once the parameter exists."""
+    return cast(Value, parameter.default)
 
 
 def _words(name: str) -> str:
