@@ -145,7 +145,8 @@ def _lines(cells: Sequence[dict[str, Any]], space: StyleSpace) -> tuple[str | No
         return None, {}
     lines: dict[str, list[int]] = {}
     for i, cell in sorted(enumerate(cells), key=lambda pair: pair[1][axis]):
-        lines.setdefault(describe({k: v for k, v in cell.items() if k != axis}), []).append(i)
+        others = {k: v for k, v in cell.items() if k != axis}
+        lines.setdefault(describe(others) if others else "", []).append(i)
     return (axis, lines) if len(lines) <= _MOST_LINES else (None, {})
 
 
