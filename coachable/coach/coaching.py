@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from torchrl.envs import EnvBase
 
-from coachable.styles import Setpoint
+from coachable.styles import Choice, Setpoint, StyleSpace
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,20 @@ class Coaching:
     vocabulary: Mapping[str, Sequence[str]] = field(default_factory=dict)
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     terminated: str = "ended"
+
+    def fitting(self, space: StyleSpace) -> Coaching:
+        """Without words and presets for what a style space lacks: an agent may have been trained on a smaller one."""
+        options = {p.name: p.options for p in space.parameters if isinstance(p, Choice)}
+        names = {*space.names, *(control.parameter.name for control in self.controls)}
+
+        def known(name: str, value: Any) -> bool:
+            return name in names and (name not in options or value in ("", *options[name]))
+
+        vocabulary = {
+            meaning: words for meaning, words in self.vocabulary.items() if known(*meaning.partition("=")[::2])
+        }
+        presets = {name: style for name, style in self.presets.items() if all(known(*item) for item in style.items())}
+        return replace(self, vocabulary=vocabulary, presets=presets)
 
 
 def _steer(env: EnvBase, course_deg: float) -> None:

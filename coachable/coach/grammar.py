@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from typing import cast
 
 from coachable.coach import segments
+from coachable.coach.amounts import amount, dimension_of
 from coachable.coach.segments import Mention, Segment
 from coachable.coach.vocabulary import (
-    ANY,
     DEFAULTS,
     DIRECTIONS,
     FACTORS,
@@ -22,17 +22,13 @@ from coachable.coach.vocabulary import (
     LEVELS,
     NEGATIONS,
     PERCENT,
-    PLAINLY,
     PREFERENCES,
     SEPARATORS,
-    SLIGHTLY,
-    STRONGLY,
-    TURNS,
     UNITS,
     stem,
     tokenise,
 )
-from coachable.styles import Choice, Parameter, StyleSpace, Weight
+from coachable.styles import Choice, Parameter, StyleSpace
 
 Value = float | str
 _ENDS = {"low": 0.0, "high": 1.0}
@@ -121,7 +117,7 @@ class StyleGrammar:
         for segment in split:
             if segment.default and not segment.unknown and not segment.mentions:
                 for name, parameter in self.parameters.items():
-                    self._change(reading, name, _default(parameter))
+                    self._change(reading, name, cast(Value, parameter.default))
             else:
                 self._interpret(segment, reading)
         reading.failed += [text for name, text in reading.excluded.items() if name not in reading.changes]
@@ -198,12 +194,12 @@ class StyleGrammar:
         parameter = self.parameters[name]
         if isinstance(parameter, Choice):
             if segment.keep or segment.default:
-                self._change(reading, name, _default(parameter) if segment.default else reading.values[name])
+                self._change(reading, name, cast(Value, parameter.default) if segment.default else reading.values[name])
             else:
                 unknown = f"unknown: {', '.join(segment.unknown)}; " if segment.unknown else ""
                 reading.failed.append(f"'{segment.text}' ({unknown}{_words(name)} can be {_listed(parameter.options)})")
             return
-        value = self._number(parameter, segment, float(reading.values[name]), reading.last)
+        value = amount(parameter, segment, float(reading.values[name]), reading.last)
         if isinstance(value, str):
             reading.failed.append(f"'{segment.text}' ({value})")
             return
@@ -239,82 +235,16 @@ class StyleGrammar:
         dimension = segment.dimension
         numeric = [n for n, p in self.parameters.items() if not isinstance(p, Choice)]
         if dimension:
-            fitting = [n for n in numeric if _dimension(self.parameters[n]) == dimension]
+            fitting = [n for n in numeric if dimension_of(self.parameters[n]) == dimension]
             if not fitting:
                 return None, f" (nothing here has a {dimension})"
         else:
-            fitting = [n for n in numeric if _dimension(self.parameters[n]) != "angle"]
+            fitting = [n for n in numeric if dimension_of(self.parameters[n]) != "angle"]
         if reading.last is not None and (reading.last[0] in fitting or not dimension):
             return reading.last[0], ""
         if len(fitting) == 1:
             return fitting[0], ""
         return None, f" (of what: {_listed(fitting)}?)"
-
-    def _number(self, p: Parameter, segment: Segment, now: float, last: tuple[str, float] | None) -> float | str:
-        """The value that a segment asks of a numeric parameter, or what is missing."""
-        span = p.high - p.low
-        sign = self._sign(segment, p, last)
-        if segment.keep and sign is None and segment.only_degree:
-            return now
-        if segment.number is not None:
-            return self._given_number(p, segment, now, sign)
-        if segment.negated and segment.direction is not None:
-            return now  # "not longer" asks for no change
-        if segment.factor is not None:
-            return now * segment.factor
-        degree = segment.degree or (SLIGHTLY if segment.negated else PLAINLY)
-        if segment.level is not None and sign is None:
-            share = segment.level
-            if segment.degree == STRONGLY:
-                share = float(round(share)) if share != 0.5 else 0.5
-            elif segment.degree == SLIGHTLY:
-                share = 0.5 + (share - 0.5) / 2
-            return share * p.high if isinstance(p, Weight) else p.low + share * span
-        if sign is not None:
-            step = TURNS[degree] * 360.0 if p.unit == "deg" else degree * span
-            return min(max(now + sign * step, p.low), p.high) if p.unit != "deg" else now + sign * step
-        if segment.default:
-            return float(_default(p))
-        if isinstance(p, Weight):
-            if segment.negated:
-                return p.low
-            if segment.degree == SLIGHTLY:
-                return p.high / 4
-            if segment.preferred or not segment.unknown:
-                return p.high
-        return f"how much? {_words(p.name)} goes from {p.low:g} to {p.high:g} {p.unit}".rstrip()
-
-    def _sign(self, segment: Segment, p: Parameter, last: tuple[str, float] | None) -> float | None:
-        """+1 or -1 for a change relative to the value in force."""
-        if segment.direction is not None:
-            dimension, sign = segment.direction
-            if segment.repeated and dimension == ANY and not segment.mentions and last and last[0] == p.name:
-                return sign * last[1]  # "a bit more" of what was asked before
-            return sign
-        if segment.level is not None and (segment.too or segment.negated) and segment.level != 0.5:
-            return -1.0 if segment.level > 0.5 else 1.0
-        if segment.repeated and last is not None and last[0] == p.name:
-            return last[1]
-        return None
-
-    def _given_number(self, p: Parameter, segment: Segment, now: float, sign: float | None) -> float | str:
-        assert segment.number is not None
-        number, unit = segment.number
-        if segment.negated:
-            return "say what instead"
-        if unit in PERCENT:
-            if sign is not None and not segment.absolute:
-                return now * (1 + sign * number / 100)
-            return p.low + (p.high - p.low) * number / 100
-        if unit:
-            if _dimension(p) != UNITS[unit][0]:
-                return f"{_words(p.name)} is no {UNITS[unit][0]}" + (f", it is in {p.unit}" if p.unit else "")
-            number = number * UNITS[unit][1] / UNITS[stem(p.unit)][1]
-        if segment.signed or (number < 0 and p.low >= 0):
-            return now + number
-        if sign is not None and not segment.absolute and segment.level is None:
-            return now + sign * number
-        return float(f"{number:.9g}")
 
     # -- echo ------------------------------------------------------------------------------------------------------
 
@@ -342,15 +272,6 @@ class StyleGrammar:
     def _note_unknown(segment: Segment, reading: _Reading) -> None:
         if segment.unknown:
             reading.failed.append(f"{', '.join(repr(word) for word in segment.unknown)} in '{segment.text}'")
-
-
-def _dimension(parameter: Parameter) -> str:
-    return UNITS.get(stem(parameter.unit), (ANY, 1.0))[0] if parameter.unit else ANY
-
-
-def _default(parameter: Parameter) -> Value:
-    """Declared or derived, it is never None once the parameter exists."""
-    return cast(Value, parameter.default)
 
 
 def _words(name: str) -> str:

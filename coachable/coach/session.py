@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,8 +20,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from coachable.coach.coaching import Coaching, coaching_of
 from coachable.coach.grammar import StyleGrammar, Understanding
-from coachable.coach.recording import Recording, ReplayMismatch, checksum
+from coachable.coach.recording import Recording
 from coachable.coach.report import MeasuredWindow, StyleReport
+from coachable.coach.timeline import Timeline
 from coachable.domain import Domain, load_domain
 from coachable.keys import STYLE
 from coachable.styles import Choice, StyleSpace
@@ -29,7 +30,6 @@ from coachable.training.weights import load_policy
 from coachable.transforms import coachable_env
 
 TIME_IS_UP = "time is up"
-_CHECK_EVERY = 40  # steps
 _EXPLORATION = threading.Lock()  # the exploration type is global to the process, sessions may run in several threads
 
 
@@ -57,7 +57,7 @@ class CoachSession:
         presets: named styles, yours to extend.
         grammar: reads the phrases of `say`.
         hold: see above.
-        step_count: steps since the session was last seeded.
+        ended: why the episode is over, None while it runs.
 
     Example:
         >>> session = CoachSession.open("humanoid", seed=1)
@@ -83,7 +83,7 @@ class CoachSession:
         coaching: Coaching | None = None,
     ) -> None:
         self.policy, self.space, self.domain, self.source = policy, space, domain, source
-        self.coaching = coaching_of(domain.name) if coaching is None else coaching
+        self.coaching = (coaching_of(domain.name) if coaching is None else coaching).fitting(space)
         self.strict, self.endless, self.hold, self.window = strict, endless, True, window
         self.env = coachable_env(domain.make_env(num_envs=1, num_threads=1), space, domain.make_reward(space))
         self.presets: dict[str, dict[str, Any]] = {"default": space.describe(space.default)}
@@ -96,9 +96,6 @@ class CoachSession:
         self._understood: Understanding | None = None
         self._recent = MeasuredWindow(domain.measures, round(window / domain.control_step))
         self._outside: dict[str, float] = {}
-        self._agenda: deque[tuple[int, dict[str, Any]]] = deque()
-        self._replayed: Recording | None = None
-        self._expected: dict[int, int] = {}
         self._theta = space.make(strict=strict, **(style or {}))
         self.reset(seed)
 
@@ -139,7 +136,7 @@ class CoachSession:
                 request in force then stays.
         """
         theta = self.space.make(strict=self.strict, **(self.style | values))
-        self._stop_replay()
+        self._timeline.take_over()
         outside = {name: value for name, value in values.items() if self._is_outside(name, value)}
         self._outside = {k: v for k, v in self._outside.items() if k not in values} | cast(dict[str, float], outside)
         self._request(theta)
@@ -164,7 +161,7 @@ class CoachSession:
             if name not in self._controls:
                 raise ValueError(f"no live control named {name!r}: {self.domain.name} has {list(self._controls)}")
         fitted = {name: self._controls[name].fit(float(value)) for name, value in values.items()}
-        self._stop_replay()
+        self._timeline.take_over()
         self._apply({"controls": fitted})
 
     def say(self, phrase: str) -> Understanding:
@@ -196,7 +193,7 @@ class CoachSession:
         Raises:
             ValueError: for a negative time or a style that `set` would refuse; nothing is scheduled then.
         """
-        agenda = []
+        agenda: dict[int, dict[str, Any]] = {}
         for seconds, style in sorted(plan.items()):
             if not 0.0 <= seconds < math.inf:
                 raise ValueError(f"the plan has the time {seconds}: expected seconds from now on, 0 or more")
@@ -205,19 +202,17 @@ class CoachSession:
             values = self.presets[style] if isinstance(style, str) else dict(style)
             theta = self.space.make(strict=self.strict, **(self.style | values))
             request = {name: value for name, value in self.space.describe(theta).items() if name in values}
-            agenda.append((self.step_count + round(seconds / self.domain.control_step), {"style": request}))
-        self._stop_replay()
-        self._agenda = deque(agenda)
+            agenda[round(seconds / self.domain.control_step)] = {"style": request}
+        self._timeline.plan(agenda)
 
     @property
     def scheduled(self) -> int:
         """Number of requests that are still to come, of a plan or a replay."""
-        return len(self._agenda)
+        return self._timeline.coming
 
     def cancel(self) -> None:
         """Drops the rest of a plan or replay; the request in force stays."""
-        self._stop_replay()
-        self._agenda.clear()
+        self._timeline.cancel()
 
     # -- acting ----------------------------------------------------------------------------------------------------
 
@@ -226,21 +221,25 @@ class CoachSession:
 
         Style and live controls stay; a plan is dropped.
         """
-        self.cancel()
         if seed is None:
+            self.cancel()
             self._apply({"reset": True})
             return
-        self.step_count = 0
+        self._timeline = Timeline(
+            Recording(self.domain.name, self.source, seed, self.style, self.controls, endless=self.endless)
+        )
         self._steps_at_request = 0
         self._complied_at: int | None = None
         self._episode, self._endings = 0, Counter[str]()
         self._generator = torch.Generator().manual_seed(seed)
-        self._recording = Recording(
-            self.domain.name, self.source, seed, self.style, self.controls, endless=self.endless
-        )
         self.env.set_seed(seed)
         self._steer_env()
         self._begin_episode()
+
+    @property
+    def step_count(self) -> int:
+        """Steps since the session was last seeded."""
+        return self._timeline.step
 
     @torch.no_grad()
     def step(self) -> TensorDictBase:
@@ -252,19 +251,18 @@ class CoachSession:
         Raises:
             ReplayMismatch: if a replay differs from its recording; a further `step` goes on without checking.
         """
-        while self._agenda and self._agenda[0][0] <= self.step_count:
-            self._apply(self._agenda.popleft()[1])
+        for event in self._timeline.due():
+            self._apply(event)
         if self.ended is not None:
-            self._begin_episode(draw=not self.hold and self._replayed is None)
+            self._begin_episode()
         with _deterministic():
             action = self.policy(self._current.set(STYLE, self._theta[None]))
         transition = self.env.step(action)
-        self.step_count += 1
         self._episode_steps += 1
         after = transition.get("next")
         self._recent.add(transition)
-        if self._complied_at is None and self._recent.complies(self.step_count - self._steps_at_request):
-            self._complied_at = self.step_count
+        if self._complied_at is None and self._recent.complies(self.step_count + 1 - self._steps_at_request):
+            self._complied_at = self.step_count + 1
         if after.get("terminated").any():
             self.ended = self.coaching.terminated
         elif after.get("done").any() and not self.endless:
@@ -272,7 +270,7 @@ class CoachSession:
         if self.ended is not None:
             self._endings[self.ended] += 1
         self._current = step_mdp(transition)
-        self._check()
+        self._timeline.advance(self._current.get("observation"))
         return transition
 
     def run(self, seconds: float, on_step: Callable[[CoachSession], None] | None = None) -> None:
@@ -321,11 +319,7 @@ class CoachSession:
 
     def recording(self) -> Recording:
         """What happened since the session was last seeded, as a copy."""
-        copy = Recording.from_json(self._recording.to_json())
-        copy.steps = self.step_count
-        if self.step_count:
-            copy.checks.append((self.step_count, checksum(self._current.get("observation"))))
-        return copy
+        return self._timeline.recording(self._current.get("observation"))
 
     def replay(self, recording: Recording) -> None:
         """Starts over as recorded; the following `recording.steps` steps repeat the session bit for bit.
@@ -341,28 +335,27 @@ class CoachSession:
         self._control_values = {name: recording.controls.get(name, v) for name, v in self._control_values.items()}
         self.endless = recording.endless
         self.reset(recording.seed)
-        self._agenda = deque((event["step"], event) for event in recording.events)
-        self._replayed, self._expected = recording, dict(recording.checks)
+        self._timeline.repeat(recording)
 
     @property
     def replaying(self) -> bool:
         """Whether a replay is under way; false after its last step."""
-        return self._replayed is not None
+        return self._timeline.replayed is not None
 
     # -- inside ----------------------------------------------------------------------------------------------------
 
     def _apply(self, event: Mapping[str, Any]) -> None:
         """Carries out an event now, and records it."""
         if "style" in event:
-            self._outside = {}
+            self._outside = {name: v for name, v in self._outside.items() if name not in event["style"]}
             self._request(self.space.make(**(self.style | event["style"])))
         if "controls" in event:
             self._control_values |= event["controls"]
             self._steer_env()
-            self._log({"controls": dict(event["controls"])})
+            self._timeline.note({"controls": dict(event["controls"])})
         if "reset" in event:
-            self._log({"reset": True})
-            self._begin_episode(draw=not self.hold and self._replayed is None)
+            self._timeline.note({"reset": True})
+            self._begin_episode()
 
     def _request(self, theta: Tensor) -> None:
         before = self.style
@@ -370,13 +363,11 @@ class CoachSession:
         changed = {name: value for name, value in self.style.items() if value != before[name]}
         if changed:
             self._steps_at_request, self._complied_at = self.step_count, None
-            self._log({"style": changed})
+            self._timeline.note({"style": changed})
 
-    def _log(self, event: dict[str, Any]) -> None:
-        self._recording.events.append({"step": self.step_count, **event})
-
-    def _begin_episode(self, draw: bool = False) -> None:
-        if draw:
+    def _begin_episode(self) -> None:
+        # The first episode has the style that was asked for, and a replay those that were drawn.
+        if not self.hold and self._episode and not self.replaying:
             self._request(self.space.sample((), self._generator))
         self._current = self.env.reset(TensorDict({STYLE: self._theta[None]}, [1]))
         self._recent.clear()
@@ -396,28 +387,6 @@ class CoachSession:
 
     def _seconds(self, step: int) -> float:
         return (step - self._steps_at_request) * self.domain.control_step
-
-    def _check(self) -> None:
-        """Notes a checksum now and then, and compares it with that of a replayed recording."""
-        step, due = self.step_count, self._expected.pop(self.step_count, None)
-        if due is None and step % _CHECK_EVERY:
-            return
-        found = checksum(self._current.get("observation"))
-        if step % _CHECK_EVERY == 0:
-            self._recording.checks.append((step, found))
-        if due is not None and due != found:
-            self._expected = {}
-            raise ReplayMismatch(
-                f"the replay differs from the recording at step {step}: it was made with other weights than those of "
-                f"{self.source!r}, with other versions, or on another processor"
-            )
-        if self._replayed is not None and step >= self._replayed.steps:
-            self._replayed = None
-
-    def _stop_replay(self) -> None:
-        if self._replayed is not None:
-            self._agenda.clear()
-            self._replayed, self._expected = None, {}
 
 
 @contextmanager

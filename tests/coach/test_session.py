@@ -7,10 +7,12 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 
+from coachable.coach.coaching import coaching_of
 from coachable.coach.recording import Recording, ReplayMismatch
 from coachable.coach.session import TIME_IS_UP, CoachSession
+from coachable.envs.humanoid import humanoid_style_space
 from coachable.keys import STYLE
-from coachable.styles import StyleRangeWarning
+from coachable.styles import Choice, StyleRangeWarning, StyleSpace
 from coachable.training.checkpoint import CheckpointError
 from tests.coach.echo_domain import echo_session
 
@@ -260,6 +262,17 @@ def humanoid():
     session = CoachSession.open("humanoid", seed=1)
     yield session
     session.close()
+
+
+def test_words_and_presets_of_what_the_style_space_lacks_are_left_out():
+    """An agent may have been trained on fewer styles than its domain has now."""
+    whole = coaching_of("humanoid")
+    fewer = whole.fitting(StyleSpace([Choice("pose", ("arms_up", "t_pose"))]))
+    assert not any(meaning.startswith("step_length") for meaning in fewer.vocabulary)
+    assert "pose=arms_in_front" not in fewer.vocabulary and "pose=t_pose" in fewer.vocabulary
+    assert "course" in fewer.vocabulary
+    assert fewer.presets == {}
+    assert whole.fitting(humanoid_style_space()) == whole
 
 
 class TestHumanoid:

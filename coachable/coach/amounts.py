@@ -1,0 +1,108 @@
+"""What a request asks of a number: "0.4 m", "a bit longer", "twice as much", "avoid"."""
+
+from __future__ import annotations
+
+from typing import cast
+
+from coachable.coach.segments import Segment
+from coachable.coach.vocabulary import ANGLE, ANY, PERCENT, PLAINLY, SLIGHTLY, STRONGLY, TURNS, UNITS, stem
+from coachable.styles import Choice, Setpoint, Weight
+
+
+def amount(p: Weight | Setpoint, segment: Segment, now: float, last: tuple[str, float] | None) -> float | str:
+    """The value that a request asks for.
+
+    Args:
+        p: the parameter it is about.
+        segment: the request.
+        now: value in force.
+        last: parameter and direction of the last change, to which "a bit more" refers.
+
+    Returns:
+        The value, possibly outside the range where a number was given; or, as text, what is missing.
+    """
+    sign = _sign(segment, p, last)
+    if segment.number is not None:
+        return _given(p, segment, now, sign)
+    if segment.keep and sign is None and segment.only_degree:
+        return now
+    if segment.negated and segment.direction is not None:
+        return now  # "not longer" asks for no change
+    if segment.factor is not None:
+        return now * segment.factor
+    if sign is not None:
+        return _moved(p, segment, now, sign)
+    if segment.level is not None:
+        return _level(p, segment.level, segment.degree)
+    if segment.default:
+        return default_of(p)
+    if isinstance(p, Weight):
+        return _weight(p, segment)
+    return f"how much? {p.name.replace('_', ' ')} goes from {p.low:g} to {p.high:g} {p.unit}".rstrip()
+
+
+def dimension_of(parameter: Weight | Setpoint | Choice) -> str:
+    """What a parameter measures, by its unit."""
+    return UNITS.get(stem(parameter.unit), (ANY, 1.0))[0] if parameter.unit else ANY
+
+
+def default_of(parameter: Weight | Setpoint) -> float:
+    """Declared or derived, it is never None once the parameter exists."""
+    return cast(float, parameter.default)
+
+
+def _sign(segment: Segment, p: Weight | Setpoint, last: tuple[str, float] | None) -> float | None:
+    """+1 or -1 for a change relative to the value in force."""
+    same = last is not None and last[0] == p.name
+    if segment.direction is not None:
+        dimension, sign = segment.direction
+        if last is not None and same and segment.repeated and dimension == ANY and not segment.mentions:
+            return sign * last[1]  # "a bit more" of what was asked before
+        return sign
+    if segment.level is not None and (segment.too or segment.negated) and segment.level != 0.5:
+        return -1.0 if segment.level > 0.5 else 1.0
+    return last[1] if last is not None and same and segment.repeated else None
+
+
+def _moved(p: Weight | Setpoint, segment: Segment, now: float, sign: float) -> float:
+    degree = segment.degree or (SLIGHTLY if segment.negated else PLAINLY)
+    if dimension_of(p) == ANGLE and p.high - p.low >= 360.0:  # a full circle has no ends
+        return now + sign * TURNS[degree] * 360.0
+    return min(max(now + sign * degree * (p.high - p.low), p.low), p.high)
+
+
+def _level(p: Weight | Setpoint, share: float, degree: float) -> float:
+    """Of an adjective, such as "short" or "very short"."""
+    if degree == STRONGLY and share != 0.5:
+        share = float(round(share))
+    elif degree == SLIGHTLY:
+        share = 0.5 + (share - 0.5) / 2
+    return share * p.high if isinstance(p, Weight) else p.low + share * (p.high - p.low)
+
+
+def _weight(p: Weight, segment: Segment) -> float:
+    """Of a mere mention: "fire", "a bit of fire", "avoid fire"."""
+    if segment.negated:
+        return p.low
+    return p.high / 4 if segment.degree == SLIGHTLY else p.high
+
+
+def _given(p: Weight | Setpoint, segment: Segment, now: float, sign: float | None) -> float | str:
+    """Of a number that was said."""
+    assert segment.number is not None
+    number, unit = segment.number
+    if segment.negated:
+        return "say what instead"
+    if unit in PERCENT:
+        if sign is not None and not segment.absolute:
+            return now * (1 + sign * number / 100)
+        return p.low + (p.high - p.low) * number / 100
+    if unit:
+        if dimension_of(p) != UNITS[unit][0]:
+            return f"{p.name.replace('_', ' ')} is no {UNITS[unit][0]}" + (f", it is in {p.unit}" if p.unit else "")
+        number = number * UNITS[unit][1] / UNITS[stem(p.unit)][1]
+    if segment.signed or (number < 0 and p.low >= 0):
+        return now + number
+    if sign is not None and not segment.absolute and segment.level is None:
+        return now + sign * number
+    return float(f"{number:.9g}")
