@@ -103,6 +103,22 @@ class PictureView:
 _SCENES: dict[str, Callable[[viser.ViserServer, CoachSession], View]] = {"humanoid": HumanoidView}
 
 
+class NoView:
+    """A note why there is nothing to see; coaching works without."""
+
+    def __init__(self, server: viser.ViserServer, reason: str) -> None:
+        server.gui.add_markdown(f"**No view:** {reason}")
+
+    def update(self) -> None:
+        """See `View.update`."""
+
+    def close(self) -> None:
+        """See `View.close`."""
+
+
 def make_view(server: viser.ViserServer, session: CoachSession) -> View:
-    """The 3-D view of a domain that has one, otherwise its renderer's picture."""
-    return _SCENES.get(session.domain.name, PictureView)(server, session)
+    """The 3-D view of a domain that has one, otherwise its renderer's picture, otherwise the reason why not."""
+    try:
+        return _SCENES.get(session.domain.name, PictureView)(server, session)
+    except (ImportError, RuntimeError) as error:  # an extra or an OpenGL library is missing
+        return NoView(server, str(error))

@@ -10,8 +10,10 @@ import pytest
 
 viser = pytest.importorskip("viser")
 
+from coachable.coach import views  # noqa: E402
 from coachable.coach.page import CoachPage  # noqa: E402
 from coachable.coach.server import make_server  # noqa: E402
+from coachable.coach.session import CoachSession  # noqa: E402
 from tests.coach.echo_domain import echo_session  # noqa: E402
 
 
@@ -204,3 +206,47 @@ def test_the_server_listens_on_this_machine_and_leaves_a_port_that_is_in_use(ser
 
 def test_no_tunnel_to_the_outside(server):
     assert server.request_share_url() is None
+
+
+def test_a_view_that_cannot_be_made_is_explained(server, monkeypatch):
+    def no_library(session):
+        raise RuntimeError("no OpenGL library was found")
+
+    session = echo_session()
+    monkeypatch.setattr(views, "PictureView", lambda server, session: no_library(session))
+    view = views.make_view(server, session)
+    view.update()
+    view.close()
+    assert isinstance(view, views.NoView)
+    session.close()
+
+
+def test_a_picture_is_drawn_only_while_somebody_looks(server, monkeypatch):
+    session = echo_session()
+    view = views.make_view(server, session)
+    drawn = []
+    monkeypatch.setattr(server.scene, "set_background_image", lambda picture, **_: drawn.append(picture.shape))
+    view.update()
+    assert drawn == []
+    monkeypatch.setattr(server, "get_clients", lambda: {0: "somebody"})
+    view.update()
+    view.update()
+    assert drawn == [(600, 800, 3)], "and not faster than it can be watched"
+    view.close()
+    session.close()
+
+
+def test_the_humanoid_stays_in_the_middle_of_the_scene(server):
+    pytest.importorskip("mjviser")
+    server.scene.reset()
+    session = CoachSession.open("humanoid", seed=1)
+    view = views.make_view(server, session)
+    assert isinstance(view, views.HumanoidView)
+    session.run(0.5)
+    view.update()
+    position = session.base_env.simulation.positions[0, :2]
+    assert view._scene.fixed_bodies_frame.position[:2] == pytest.approx(-position)
+    session.steer(course=90.0)
+    view.update()
+    assert view._arrow.points[0, :, 0] == pytest.approx(0.0)
+    session.close()
