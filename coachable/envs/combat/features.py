@@ -248,7 +248,7 @@ def _enemy_rows(s: State, traits: Traits, axes: Tensor, small: bool) -> Tensor:
         s.gauge,
         s.state_timer / _LONGEST_STATE,
         one_hot_rows(s.phase, NUM_PHASES) * living,
-        (s.phase_timer.clamp(min=0.0) * (s.phase > IDLE) * _TIMER_SCALE).unsqueeze(0),
+        (s.phase_timer.clamp(0.0, 2.0 * c.FPS) * (s.phase > IDLE) * _TIMER_SCALE).unsqueeze(0),
         _attack_id(s, traits),
         to_camera(s.lock, axes) * (s.phase == ACTIVE),
         torch.stack((1.0 * (s.phase == STAGGERED), 1.0 * (3.0 * s.enemy_hp < traits.hp), living)),
