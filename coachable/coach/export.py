@@ -42,7 +42,7 @@ def export(source: str | Path, out: Path) -> float:
 
     Raises:
         ImportError: without the extra `export`.
-        TypeError: if the policy is of a kind that cannot be exported.
+        ValueError: if the policy is of a kind that cannot be exported.
         RuntimeError: if file and torch differ by more than `TOLERANCE`; nothing is left behind.
     """
     onnx = _import_onnx()

@@ -112,11 +112,12 @@ def write_report(
     _requests(page, styles, agent, runs, out)
     _switches(page, domain, runs, switch_episodes, formats, out)
     _tradeoffs(page, styles, runs, formats, out)
-    footer = (
-        f"coachable {__version__}; made by: coachable report {' '.join(agents)} --seed {seed} --episodes {episodes}"
-    )
-    footer += f" --seeds {seeds}" if len(agents) == 1 else ""
-    (out / "report.html").write_text(page.text(footer + (f" --steps {steps}" if steps else "")), encoding="utf-8")
+    command = [f"coachable report {' '.join(agents)} --seed {seed} --episodes {episodes}"]
+    command += [f"--switch-episodes {switch_episodes} --sweep-points {sweep_points}"]
+    command += [f"--seeds {seeds}"] if len(agents) == 1 else []
+    command += [f"--steps {steps}"] if steps else []
+    footer = f"coachable {__version__}; made by: {' '.join(command)}"
+    (out / "report.html").write_text(page.text(footer), encoding="utf-8")
     return _text(styles, runs, formats, out)
 
 

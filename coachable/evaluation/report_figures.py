@@ -174,9 +174,9 @@ def _reach(estimates: Sequence[Estimate]) -> np.ndarray:
 
 
 def _panels(count: int) -> tuple[Figure, list[Axes]]:
-    columns = min(count, _COLUMNS)
+    columns = 2 if count == 4 else min(count, _COLUMNS)
     rows = -(-count // columns)
-    size = (4.0 * columns if count > 1 else 5.4, 3.3 * rows)
+    size = (4.0 * columns if count > 1 else 5.4, 3.2 * rows)
     figure, grid = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
     panels = list(itertools.chain.from_iterable(grid))
     for panel in panels[count:]:

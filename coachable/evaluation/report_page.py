@@ -15,6 +15,7 @@ from coachable.evaluation.runs import Estimate
 __all__ = ["Page", "paragraph", "picture", "shown", "table"]
 
 _NOTHING = "n/a"
+_DENSITY = 1.5  # pixels of a picture per pixel of the page
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1c2430; background: #fff; max-width: 1040px; margin: 2rem auto;
@@ -25,8 +26,8 @@ p { max-width: 78ch; margin: .5rem 0; }
 .scroll { overflow-x: auto; margin: .8rem 0; }
 table { border-collapse: collapse; font-size: 13.5px; font-variant-numeric: tabular-nums; }
 th { text-align: left; font-weight: 600; background: #eef1f5; vertical-align: bottom; }
-th, td { padding: .28rem .65rem; border-bottom: 1px solid #e3e8ee; white-space: nowrap; }
-td.number, th.number { text-align: right; }
+th, td { padding: .28rem .65rem; border-bottom: 1px solid #e3e8ee; }
+td.number, th.number { text-align: right; white-space: nowrap; }
 td small { color: #5b6675; }
 figure { margin: 1rem 0; }
 img { max-width: 100%; height: auto; }
@@ -76,9 +77,14 @@ def paragraph(text: str) -> str:
 
 
 def picture(path: Path, description: str) -> str:
-    """A PNG, inline."""
-    data = base64.b64encode(path.read_bytes()).decode()
-    return f'<figure><img src="data:image/png;base64,{data}" alt="{html.escape(description)}"></figure>'
+    """A PNG, inline, with letters as large as in the other pictures."""
+    content = path.read_bytes()
+    width = int.from_bytes(content[16:20], "big")  # of the header (PNG specification, IHDR)
+    data = base64.b64encode(content).decode()
+    return (
+        f'<figure><img width="{round(width / _DENSITY)}" alt="{html.escape(description)}" '
+        f'src="data:image/png;base64,{data}"></figure>'
+    )
 
 
 def table(rows: Sequence[Mapping[str, Any]], formats: Mapping[str, str], colour: bool = False) -> str:

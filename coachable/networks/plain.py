@@ -19,15 +19,16 @@ def policy_network(actor: TensorDictModuleBase) -> GaussianPolicy | MixedPolicy:
     """The network inside an actor.
 
     Raises:
-        TypeError: If the actor holds neither a `GaussianPolicy` nor a `MixedPolicy`.
+        ValueError: If the actor holds no `GaussianPolicy` or `MixedPolicy` that reads a style.
     """
     found = [module for module in actor.modules() if isinstance(module, GaussianPolicy | MixedPolicy)]
-    if len(found) != 1 or found[0].space is None:
-        raise TypeError(
-            f"{type(actor).__name__} holds {len(found)} style-conditioned policies of the kinds GaussianPolicy and "
-            "MixedPolicy: expected one, as made by coachable.networks.make_gaussian_actor or make_mixed_actor"
+    styled = [module for module in found if module.space is not None]
+    if len(styled) != 1:
+        raise ValueError(
+            f"{type(actor).__name__} holds {len(styled)} policies that read a style: expected one, as made by "
+            "coachable.networks.make_gaussian_actor or make_mixed_actor"
         )
-    return found[0]
+    return styled[0]
 
 
 class _PlainPolicy(nn.Module):

@@ -121,7 +121,7 @@ def test_a_file_that_disagrees_is_noticed(tmp_path):
 
 
 def test_a_policy_without_style_is_refused():
-    with pytest.raises(TypeError, match="expected one, as made by"):
+    with pytest.raises(ValueError, match="expected one, as made by"):
         DeterministicAction(make_gaussian_actor(3, 2, None, widths=(8,)))
 
 
