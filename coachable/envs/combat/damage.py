@@ -17,6 +17,7 @@ from coachable.envs.combat.traits import RELOAD as RELOAD_FRAMES
 ACID, PURGEWATER, FROST, SHOCK, PLASMA, BURNING, ADHESIVE = range(len(ELEMENTS))
 _CANISTER = PART_TYPES.index("canister")
 _FAR = 1e6  # [m], further than anything
+_MISSED = 1e12  # takes even a near miss out of range
 
 # Rows of `Totals.dealt`.
 BY_SHOT, BY_SPEAR, BY_TRAP, BY_ACID, BY_FIRE, BY_PLASMA = range(6)
@@ -144,7 +145,7 @@ def _dot(offset: Tensor, vector: tuple[Tensor, ...]) -> Tensor:
 
 
 def _entry(along: Tensor, squared: Tensor) -> Tensor:
-    """Distance at which a ray enters a sphere, `_FAR` or more if it misses.
+    """Distance at which a ray enters a sphere; far out of range if it misses.
 
     Args:
         along: projection of the centre on the ray [m].
@@ -152,8 +153,8 @@ def _entry(along: Tensor, squared: Tensor) -> Tensor:
     """
     inside = along.square() - squared
     # Arithmetic instead of a selection: on the CPU a selection between random elements is ten times slower.
-    missed = (-inside).clamp(min=0.0).sign() + (-along).clamp(min=0.0).sign()
-    return (along - inside.clamp(min=0.0).sqrt()).clamp(min=0.0) + _FAR * missed
+    missed = (-inside).clamp(min=0.0) + (-along).clamp(min=0.0)
+    return (along - inside.clamp(min=0.0).sqrt()).clamp(min=0.0) + _MISSED * missed
 
 
 def damage_parts(s: State, traits: Traits, damage: Tensor, totals: Totals) -> Tensor:

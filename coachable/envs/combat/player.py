@@ -89,6 +89,13 @@ def from_stick(stick: Tensor, forward: Tensor) -> Tensor:
     return torch.stack((fx * y + fy * x, fy * y - fx * x))
 
 
+def to_stick(direction: Tensor, yaw: Tensor) -> Tensor:
+    """Directions of the world (2, N) as a stick, x right and y forward: the inverse of `from_stick`."""
+    x, y = direction
+    fx, fy = facing(yaw)
+    return torch.stack((fy * x - fx * y, fx * x + fy * y))
+
+
 def element_of(section: Tensor, ammo_table: Tensor) -> Tensor:
     """One-hot of the element of wheel sections (N,), (7, N)."""
     return ammo_table[:, 11:].index_select(0, section).T

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -128,3 +130,10 @@ def event_components() -> Tensor:
     for piece in quiet:
         fires[:, piece] = 0.0
     return fires
+
+
+def style_counts(styles: Sequence[str]) -> Tensor:
+    """(len(styles), 44) 0 or 1: the damage, or the removals of the part styles, that count for each style."""
+    counts = event_components()
+    counts[:, COMPONENT_SLICES["part_damage"]] = 0.0
+    return counts[[STYLES.index(name) for name in styles]]

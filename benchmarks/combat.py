@@ -1,0 +1,120 @@
+"""Combat env steps per second for several batch sizes, split by phase.
+
+    python benchmarks/combat.py --envs 64 512 2048 8192 16384
+
+Every fight acts at random; finished fights are reset; observations, rewards, features, events and TensorDict included.
+Both clocks are given: on a busy machine the wall clock measures the neighbours.
+"""
+
+import argparse
+import json
+import resource
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from coachable.envs.combat import CombatEnv, env, fight, frame
+
+# Where the time of a step goes: module, function.
+PHASES: list[tuple[Any, str]] = [
+    (env, "canonical_rows"),
+    (fight, "command"),
+    (frame, "move_player"),
+    (frame, "turn_camera"),
+    (frame, "shoot"),
+    (frame, "damage_parts"),
+    (frame, "build_up"),
+    (frame, "swing"),
+    (frame, "spring_traps"),
+    (frame, "run_elements"),
+    (frame, "take_damage"),
+    (frame, "decide"),
+    (frame, "move_machines"),
+    (frame, "strike_player"),
+    (env, "observe"),
+    (env, "start_fights"),
+    (env, "look_up_traits"),
+]
+
+
+def timed(function: Callable[..., Any], total: dict[str, float], name: str) -> Callable[..., Any]:
+    def call(*args: Any, **kwargs: Any) -> Any:
+        start = time.process_time()
+        result = function(*args, **kwargs)
+        total[name] += time.process_time() - start
+        return result
+
+    return call
+
+
+def advance(fights: CombatEnv, current: Any, actions: torch.Tensor, steps: int) -> Any:
+    for step in range(steps):
+        _, current = fights.step_and_maybe_reset(current.set("action", actions[step % len(actions)]))
+    return current
+
+
+def bench(num_envs: int, steps: int, device: str) -> dict[str, float]:
+    fights = CombatEnv(num_envs, seed=0, device=device)
+    actions = fights.action_spec.rand((8,))
+    current = advance(fights, fights.reset(), actions, 5)
+    synchronize = torch.cuda.synchronize if device == "cuda" else lambda: None
+    synchronize()
+    wall, cpu = time.perf_counter(), time.process_time()
+    advance(fights, current, actions, steps)
+    synchronize()
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    state = sum(t.nbytes for t in fights.state.tensors().values()) + sum(t.nbytes for t in vars(fights.traits).values())
+    return {
+        "envs": num_envs,
+        "steps_per_second": num_envs * steps / wall,
+        "steps_per_cpu_second": num_envs * steps / cpu,
+        "ms_per_batch_step": 1e3 * wall / steps,
+        "state_kilobytes_per_fight": state / num_envs / 1024,
+    }
+
+
+def split(num_envs: int, steps: int) -> dict[str, float]:
+    """Milliseconds of CPU time per batch step in each phase."""
+    total = {name: 0.0 for _, name in PHASES}
+    originals = [(module, name, getattr(module, name)) for module, name in PHASES]
+    for module, name, function in originals:
+        setattr(module, name, timed(function, total, name))
+    start = time.process_time()
+    fights = CombatEnv(num_envs, seed=0)
+    advance(fights, fights.reset(), fights.action_spec.rand((8,)), steps)
+    total["everything"] = time.process_time() - start
+    for module, name, function in originals:
+        setattr(module, name, function)
+    return {name: 1e3 * seconds / steps for name, seconds in total.items()}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--envs", type=int, nargs="+", default=[64, 512, 2048, 8192, 16384])
+    parser.add_argument("--steps", type=int, default=30)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--split", type=int, default=2048, help="batch size whose phases are timed, 0 for none")
+    parser.add_argument("--json", type=Path, help="where to write the numbers")
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    rows = []
+    print("| envs | steps/s (wall) | steps per CPU second | ms per batch step | state KB per fight |\n|-|-|-|-|-|")
+    for num_envs in args.envs:
+        row = bench(num_envs, args.steps, args.device)
+        rows.append(row)
+        print("| {envs} | {steps_per_second:,.0f} | {steps_per_cpu_second:,.0f} |".format(**row), end="")
+        print(" {ms_per_batch_step:.1f} | {state_kilobytes_per_fight:.1f} |".format(**row), flush=True)
+    phases = split(args.split, args.steps) if args.split and args.device == "cpu" else {}
+    for name, milliseconds in sorted(phases.items(), key=lambda item: -item[1]):
+        print(f"{name:>16} {milliseconds:8.2f} ms")
+    print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
+    if args.json:
+        args.json.write_text(json.dumps({"rows": rows, "phases": phases}))
+
+
+if __name__ == "__main__":
+    main()
