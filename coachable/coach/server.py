@@ -35,4 +35,5 @@ def make_server(host: str = "127.0.0.1", port: int = 8080) -> viser.ViserServer:
         show_logo=False, show_share_button=False, control_width="large", brand_color=(31, 119, 180)
     )
     server.gui.set_panel_label("coachable")
+    server.gui.main_panel.dock_right()
     return server

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 _PICTURES_PER_SECOND = 12.0
 _PICTURE_SIZE = (800, 600)  # [px]
+_BORDER = 235  # grey
 
 
 class View(Protocol):
@@ -88,12 +89,13 @@ class PictureView:
 
     def update(self) -> None:
         """See `View.update`."""
-        now = time.perf_counter()
-        if now < self._due or not self._server.get_clients():
+        now, clients = time.perf_counter(), self._server.get_clients()
+        if now < self._due or not clients:
             return
         self._due = now + 1.0 / _PICTURES_PER_SECOND
         picture = self._renderer.draw(self._session.env)
-        self._server.scene.set_background_image(picture, format="jpeg", jpeg_quality=85)
+        for client in clients.values():
+            client.scene.set_background_image(padded(picture, client.camera.aspect), format="jpeg", jpeg_quality=85)
 
     def close(self) -> None:
         """See `View.close`."""
@@ -101,6 +103,19 @@ class PictureView:
 
 
 _SCENES: dict[str, Callable[[viser.ViserServer, CoachSession], View]] = {"humanoid": HumanoidView}
+
+
+def padded(picture: np.ndarray, aspect: float) -> np.ndarray:
+    """A picture with borders, so that a window of that width per height does not distort it.
+
+    Args:
+        picture: (height, width, 3) uint8.
+        aspect: width per height of the window.
+    """
+    height, width = picture.shape[:2]
+    across, down = max(0, round(height * aspect) - width), max(0, round(width / aspect) - height)
+    sides = ((down // 2, down - down // 2), (across // 2, across - across // 2), (0, 0))
+    return np.pad(picture, sides, constant_values=_BORDER)
 
 
 class NoView:

@@ -86,7 +86,7 @@ class MeasuredText:
     def update(self, report: StyleReport, measures: list[str]) -> None:
         """Shows the report's values of `measures`."""
         shown = [f"{self._name(m)}**{number(report.measured[m])}{self._unit(m)}**" for m in measures]
-        text = " · ".join(filter(None, [f"measured {', '.join(shown) or 'nothing yet'}", trained(self.parameter)]))
+        text = " · ".join(filter(None, [f"measured {', '.join(shown)}" if shown else "", trained(self.parameter)]))
         outside = report.outside.get(self.parameter.name)
         if outside is not None:
             used, unit = report.requested[self.parameter.name], f" {self.parameter.unit}".rstrip()

@@ -5,7 +5,9 @@ import socket
 import threading
 import time
 import warnings
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 viser = pytest.importorskip("viser")
@@ -225,15 +227,24 @@ def test_a_picture_is_drawn_only_while_somebody_looks(server, monkeypatch):
     session = echo_session()
     view = views.make_view(server, session)
     drawn = []
-    monkeypatch.setattr(server.scene, "set_background_image", lambda picture, **_: drawn.append(picture.shape))
+    scene = SimpleNamespace(set_background_image=lambda picture, **_: drawn.append(picture.shape))
+    client = SimpleNamespace(scene=scene, camera=SimpleNamespace(aspect=2.0))
     view.update()
     assert drawn == []
-    monkeypatch.setattr(server, "get_clients", lambda: {0: "somebody"})
+    monkeypatch.setattr(server, "get_clients", lambda: {0: client})
     view.update()
     view.update()
-    assert drawn == [(600, 800, 3)], "and not faster than it can be watched"
+    assert drawn == [(600, 1200, 3)], "as wide as the window, and not faster than it can be watched"
     view.close()
     session.close()
+
+
+def test_pictures_keep_their_proportions():
+    picture = np.zeros((60, 80, 3), dtype=np.uint8)
+    assert views.padded(picture, 4 / 3).shape == (60, 80, 3)
+    wide, tall = views.padded(picture, 2.0), views.padded(picture, 1.0)
+    assert wide.shape == (60, 120, 3) and (wide[:, 20:100] == 0).all() and (wide[:, :20] > 0).all()
+    assert tall.shape == (80, 80, 3) and (tall[10:70] == 0).all() and (tall[70:] > 0).all()
 
 
 def test_the_humanoid_stays_in_the_middle_of_the_scene(server):
