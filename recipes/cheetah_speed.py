@@ -63,8 +63,8 @@ class CheetahTask(Transform):
         return observation_spec
 
 
-def cheetah_env(num_envs: int = 8, seed: int = 0, num_threads: int = 1) -> EnvBase:
-    """`num_envs` cheetahs, one after the other in this process (`num_threads` is not used)."""
+def cheetah_env(num_envs: int = 8, seed: int = 0) -> EnvBase:
+    """`num_envs` cheetahs, one after the other in this process."""
     cheetahs = SerialEnv(num_envs, lambda: DMControlEnv("cheetah", "run"))
     env = TransformedEnv(
         cheetahs,

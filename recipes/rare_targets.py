@@ -35,7 +35,7 @@ STEPS = 60
 class RareTargets(EnvBase):
     """N points in the plane, steered at bounded speed. An episode ends at any target, whoever wanted it."""
 
-    def __init__(self, num_envs: int = 64, seed: int = 0, num_threads: int = 1) -> None:
+    def __init__(self, num_envs: int = 64, seed: int = 0) -> None:
         super().__init__(batch_size=[num_envs])
         shape = (num_envs,)
         observations = {"observation": 3, TASK_REWARD: 1, STYLE_FEATURES: TARGETS}

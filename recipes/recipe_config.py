@@ -128,7 +128,8 @@ def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
                 if choice not in groups[group]:
                     raise SystemExit(f"error: {group}={choice} does not exist.{_choices(choice, groups[group])}")
     if chosen.get("preset", ["auto"]) == ["auto"]:
-        chosen["preset"] = [choose_preset(detect())]
+        automatic = OmegaConf.load(CONFIGS / "preset" / config_name / "auto.yaml")
+        chosen["preset"] = [automatic.preset_for[choose_preset(detect())]]
     elif any(o.key_or_group == "resume" and o.value() for o in overrides):
         raise SystemExit("error: a resumed run keeps its preset: leave preset= out, or start anew with init_from=PATH")
     presets = [f"{config_name}/{preset}" for preset in chosen["preset"]]

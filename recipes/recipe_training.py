@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -53,17 +54,24 @@ def build_training(
     workers = config["collector"]["num_collectors"]
 
     def make_env(seed: int, **settings: Any) -> CoachableEnv:
-        simulation = make(config["env"])(num_threads=max(1, threads.simulator // workers), seed=seed, **settings)
-        return coachable_env(simulation, space, style_reward, EpisodeSums(), seed=seed)
+        simulation = make(config["env"])
+        if "num_threads" in signature(simulation).parameters:
+            settings["num_threads"] = max(1, threads.simulator // workers)
+        return coachable_env(simulation(seed=seed, **settings), space, style_reward, EpisodeSums(), seed=seed)
 
     # Actor and critics; a list of critics, because a single one would be re-initialised by the loss
     probe = make_env(config["seed"], num_envs=1)
-    sizes = {"obs_dim": probe.observation_spec["observation"].shape[-1], "action_dim": probe.action_spec.shape[-1]}
-    network = {part: {**config["network"][part], **sizes} for part in ("actor", "critic")}
+    obs_dim, action_dim = probe.observation_spec["observation"].shape[-1], probe.action_spec.shape[-1]
+    network = {part: {**config["network"][part], "obs_dim": obs_dim} for part in ("actor", "critic")}
+    for part in network.values():
+        if "heads" not in part:  # of a mixed action; they say how wide it is
+            part["action_dim"] = action_dim
     actor = make(network["actor"])(space=space).to(device)
     critics = [make(network["critic"])(space=space).to(device) for _ in range(config["network"]["num_critics"])]
 
     # Loss and learner
+    if config["loss"]["_target_"].endswith(".SACLoss") and network["actor"].get("heads", {}).get("categorical"):
+        raise ValueError(f"loss=sac serves continuous actions only, {config['domain']} has buttons: expected cat_rac")
     loss_module = make(config["loss"])(actor, critics, action_spec=probe.action_spec, num_qvalue_nets=len(critics))
     loss_module.make_value_estimator(gamma=config["gamma"])
     loss_module.to(device)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, get_args
 
 import torch
@@ -84,7 +84,7 @@ class MixedPolicy(nn.Module):
 
 def make_mixed_actor(
     obs_dim: int,
-    heads: ActionHeads,
+    heads: ActionHeads | Mapping[str, Any],
     space: StyleEncoding | None,
     widths: Sequence[int] = (512, 512, 512),
     *,
@@ -97,7 +97,8 @@ def make_mixed_actor(
 
     Args:
         obs_dim: Width of the observation.
-        heads: Components of the action; also works with only axes or only categorical heads.
+        heads: Components of the action, or the arguments of `ActionHeads`, as a configuration file has them; also
+            works with only axes or only categorical heads.
         space: Style space; theta is read from the key `style` and encoded inside. None for no style.
         widths: Widths of the residual layers.
         observation_key: Key of the observation.
@@ -114,6 +115,7 @@ def make_mixed_actor(
         >>> actor.out_keys
         ['probs', 'loc', 'scale', 'action']
     """
+    heads = heads if isinstance(heads, ActionHeads) else ActionHeads(**heads)
     names: list[Any] = (["probs"] if heads.categorical else []) + (["loc", "scale"] if heads.axes else [])
     in_keys: list[Any] = [observation_key] if space is None else [observation_key, STYLE]
     return ProbabilisticActor(

@@ -13,7 +13,7 @@ from coachable.training.loop import REPLAY_KEYS
 RECIPES = sorted(file.stem for file in (Path(__file__).resolve().parents[2] / "recipes" / "configs").glob("*_*.yaml"))
 TINY = ["preset=smoke", "env.num_envs=2", "threads.simulator=1", "threads.learner=1", "train.eval_interval=0"]
 TINY += ["init_random_frames=8", "train.warmup_frames=8", "train.batch_size=12", "eval.max_steps=5"]
-TINY += ["train.total_frames=28", "impersonation.n=0"]
+TINY += ["train.total_frames=28", "train.utd_ratio=0.125", "impersonation.n=0"]
 POLICY_FIRST = {"qr_sac", "rac", "cat_rac", "sac_categorical"}  # paper, Appendix B
 
 
@@ -29,11 +29,15 @@ def _choices(group):
 
 
 def test_recipes_were_found():
-    assert {"humanoid_sac", "cheetah_speed"} <= set(RECIPES)
+    assert {"humanoid_sac", "combat_cat_rac", "cheetah_speed", "rare_targets"} <= set(RECIPES)
 
 
 @pytest.mark.parametrize("recipe, loss", _choices("loss"))
 def test_every_loss_trains(recipe, loss, tmp_path):
+    if recipe == "combat_cat_rac" and loss in ("sac", "qr_sac"):
+        with pytest.raises(ValueError, match="serves? continuous actions only"):
+            _train(recipe, tmp_path, f"loss={loss}")
+        return
     train = _train(recipe, tmp_path, f"loss={loss}", "impersonation.n=1", "n_steps=1")
     assert train.learner.updates == 2
     assert train.learner.update_order == ("policy_first" if loss in POLICY_FIRST else "simultaneous")
@@ -87,6 +91,7 @@ def test_runs_with_tables_resume_bit_for_bit(loss, replay, tmp_path):
             r"initial_value must lie in \[100.0, 650.0\], got 0.0",
         ),
         ("humanoid_sac", ["init_from=nowhere"], r"nowhere"),
+        ("combat_cat_rac", ["env.machines=[Thunderclaw]"], r"Thunderclaw"),
         ("cheetah_speed", ["mirror=0.5"], r"cheetah has no mirror images, expected mirror=0"),
     ],
 )
