@@ -1,4 +1,4 @@
-"""Train a fighter with a gamepad whose way of fighting is chosen at run time (Cat-RAC, task impersonation, event tables).
+"""Train a fighter with a gamepad whose way of fighting is chosen at run time (Cat-RAC, impersonation, event tables).
 
 python recipes/combat_cat_rac.py                          small on a CPU, full on a GPU
 python recipes/combat_cat_rac.py preset=middle            more machines and styles
