@@ -243,7 +243,8 @@ class CoachPage:
             first = f"**Request met**, after {report.complied_after:.1f} s."
         else:
             first = f"Request not yet met, after {report.since_request:.1f} s."
-        state = "**paused**" if self.loop.paused else f"{self.loop.factor:.2f} of real time"
+        running = "between episodes" if report.ended is not None else f"{self.loop.factor:.2f} of real time"
+        state = "**paused**" if self.loop.paused else running
         if self.session.replaying:
             state += " · replaying"
         elif self.session.scheduled:

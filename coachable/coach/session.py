@@ -3,34 +3,26 @@
 from __future__ import annotations
 
 import math
-import threading
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs import EnvBase, TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from torchrl.envs import EnvBase
 
 from coachable.coach.coaching import Coaching, coaching_of
+from coachable.coach.episodes import LiveEpisodes
 from coachable.coach.grammar import StyleGrammar, Understanding
 from coachable.coach.recording import Recording
 from coachable.coach.report import MeasuredWindow, StyleReport
 from coachable.coach.timeline import Timeline
 from coachable.domain import Domain, load_domain
-from coachable.keys import STYLE
 from coachable.styles import Choice, StyleSpace
 from coachable.training.weights import load_policy
-from coachable.transforms import coachable_env
-
-TIME_IS_UP = "time is up"
-_EXPLORATION = threading.Lock()  # the exploration type is global to the process, sessions may run in several threads
 
 
 class CoachSession:
@@ -53,11 +45,10 @@ class CoachSession:
         coaching: live controls, words and presets; by default those of the domain.
 
     Attributes:
-        env: the environment, of batch size 1.
+        policy: see above; may be exchanged between steps.
         presets: named styles, yours to extend.
         grammar: reads the phrases of `say`.
         hold: see above.
-        ended: why the episode is over, None while it runs.
 
     Example:
         >>> session = CoachSession.open("humanoid", seed=1)
@@ -84,8 +75,8 @@ class CoachSession:
     ) -> None:
         self.policy, self.space, self.domain, self.source = policy, space, domain, source
         self.coaching = (coaching_of(domain.name) if coaching is None else coaching).fitting(space)
-        self.strict, self.endless, self.hold, self.window = strict, endless, True, window
-        self.env = coachable_env(domain.make_env(num_envs=1, num_threads=1), space, domain.make_reward(space))
+        self.strict, self.hold, self.window = strict, True, window
+        self._episodes = LiveEpisodes(domain, space, endless=endless, terminated=self.coaching.terminated)
         self.presets: dict[str, dict[str, Any]] = {"default": space.describe(space.default)}
         self.presets |= {name: dict(style) for name, style in self.coaching.presets.items()}
         self._controls = {control.parameter.name: control for control in self.coaching.controls}
@@ -226,13 +217,12 @@ class CoachSession:
             self._apply({"reset": True})
             return
         self._timeline = Timeline(
-            Recording(self.domain.name, self.source, seed, self.style, self.controls, endless=self.endless)
+            Recording(self.domain.name, self.source, seed, self.style, self.controls, self._episodes.endless)
         )
         self._steps_at_request = 0
         self._complied_at: int | None = None
-        self._episode, self._endings = 0, Counter[str]()
         self._generator = torch.Generator().manual_seed(seed)
-        self.env.set_seed(seed)
+        self._episodes.seed(seed)
         self._steer_env()
         self._begin_episode()
 
@@ -255,22 +245,11 @@ class CoachSession:
             self._apply(event)
         if self.ended is not None:
             self._begin_episode()
-        with _deterministic():
-            action = self.policy(self._current.set(STYLE, self._theta[None]))
-        transition = self.env.step(action)
-        self._episode_steps += 1
-        after = transition.get("next")
+        transition = self._episodes.step(self.policy, self._theta)
         self._recent.add(transition)
         if self._complied_at is None and self._recent.complies(self.step_count + 1 - self._steps_at_request):
             self._complied_at = self.step_count + 1
-        if after.get("terminated").any():
-            self.ended = self.coaching.terminated
-        elif after.get("done").any() and not self.endless:
-            self.ended = TIME_IS_UP
-        if self.ended is not None:
-            self._endings[self.ended] += 1
-        self._current = step_mdp(transition)
-        self._timeline.advance(self._current.get("observation"))
+        self._timeline.advance(self._episodes.observation)
         return transition
 
     def run(self, seconds: float, on_step: Callable[[CoachSession], None] | None = None) -> None:
@@ -290,19 +269,26 @@ class CoachSession:
             outside=dict(self._outside),
             complied_after=None if self._complied_at is None else self._seconds(self._complied_at),
             since_request=self._seconds(self.step_count),
-            episode=self._episode,
-            episode_time=self._episode_steps * self.domain.control_step,
+            episode=self._episodes.number,
+            episode_time=self._episodes.steps * self.domain.control_step,
             ended=self.ended,
-            endings=dict(self._endings),
+            endings=dict(self._episodes.endings),
         )
+
+    @property
+    def ended(self) -> str | None:
+        """Why the episode is over, None while it runs."""
+        return self._episodes.ended
+
+    @property
+    def env(self) -> EnvBase:
+        """The environment, of batch size 1, with its style transforms."""
+        return self._episodes.env
 
     @property
     def base_env(self) -> EnvBase:
         """The domain's own environment, below the transforms."""
-        env: EnvBase = self.env
-        while isinstance(env, TransformedEnv):
-            env = env.base_env
-        return env
+        return self._episodes.base_env
 
     def replica(self) -> CoachSession:
         """Another session of the same agent, in an environment of its own."""
@@ -312,14 +298,13 @@ class CoachSession:
 
     def close(self) -> None:
         """Releases the environment."""
-        if not self.env.is_closed:
-            self.env.close()
+        self._episodes.close()
 
     # -- recording -------------------------------------------------------------------------------------------------
 
     def recording(self) -> Recording:
         """What happened since the session was last seeded, as a copy."""
-        return self._timeline.recording(self._current.get("observation"))
+        return self._timeline.recording(self._episodes.observation)
 
     def replay(self, recording: Recording) -> None:
         """Starts over as recorded; the following `recording.steps` steps repeat the session bit for bit.
@@ -333,7 +318,7 @@ class CoachSession:
             raise ValueError(f"the recording belongs to {recording.domain!r}, this session to {self.domain.name!r}")
         self._theta, self._outside = self.space.make(strict=True, **recording.style), {}
         self._control_values = {name: recording.controls.get(name, v) for name, v in self._control_values.items()}
-        self.endless = recording.endless
+        self._episodes.endless = recording.endless
         self.reset(recording.seed)
         self._timeline.repeat(recording)
 
@@ -367,13 +352,10 @@ class CoachSession:
 
     def _begin_episode(self) -> None:
         # The first episode has the style that was asked for, and a replay those that were drawn.
-        if not self.hold and self._episode and not self.replaying:
+        if not self.hold and self._episodes.number and not self.replaying:
             self._request(self.space.sample((), self._generator))
-        self._current = self.env.reset(TensorDict({STYLE: self._theta[None]}, [1]))
+        self._episodes.begin(self._theta)
         self._recent.clear()
-        self._episode += 1
-        self._episode_steps = 0
-        self.ended: str | None = None
 
     def _steer_env(self) -> None:
         for name, value in self._control_values.items():
@@ -387,9 +369,3 @@ class CoachSession:
 
     def _seconds(self, step: int) -> float:
         return (step - self._steps_at_request) * self.domain.control_step
-
-
-@contextmanager
-def _deterministic() -> Iterator[None]:
-    with _EXPLORATION, set_exploration_type(ExplorationType.DETERMINISTIC):
-        yield

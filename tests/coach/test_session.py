@@ -8,8 +8,9 @@ import torch
 from tensordict.nn import TensorDictModule
 
 from coachable.coach.coaching import coaching_of
+from coachable.coach.episodes import TIME_IS_UP
 from coachable.coach.recording import Recording, ReplayMismatch
-from coachable.coach.session import TIME_IS_UP, CoachSession
+from coachable.coach.session import CoachSession
 from coachable.envs.humanoid import humanoid_style_space
 from coachable.keys import STYLE
 from coachable.styles import Choice, StyleRangeWarning, StyleSpace
