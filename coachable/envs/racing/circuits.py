@@ -33,7 +33,17 @@ _RIDGE = (
     (571.7, -33.8, 56.1),
     (581.1, -27.37, 58.7),
 )
-_ENDURANCE = ()
+_ENDURANCE = (
+    (998.0, -164.55, 130.0),
+    (558.0, 73.5, 55.0),
+    (1782.0, -105.79, 61.0),
+    (1909.0, -100.96, 101.0),
+    (1714.0, 95.55, 56.0),
+    (696.0, 24.2, 207.0),
+    (399.0, -169.14, 236.0),
+    (1438.0, -101.03, 156.0),
+    (642.0, 88.22, 183.0),
+)
 _APART = 60.0  # [m], between sections of a generated track
 
 
@@ -67,7 +77,7 @@ def ridge() -> Track:
 
 def endurance() -> Track:
     """13.6 km, fast, for races."""
-    return Track.from_turns(_ENDURANCE, solve=(6, 12), width=14.0, name="endurance")
+    return Track.from_turns(_ENDURANCE, solve=(4, 8), width=14.0, name="endurance")
 
 
 _BUILDERS = {"lakeside": lakeside, "ridge": ridge, "endurance": endurance, "ring": ring, "oval": oval}

@@ -19,7 +19,7 @@ from coachable.envs.racing.profile import Envelope, speed_profile
 from coachable.envs.racing.referee import TELEMETRY, Referee
 from coachable.envs.racing.run import RUN_ROWS, Run
 from coachable.envs.racing.scenarios import Conditions, Scenario, Starter, race_scenarios
-from coachable.envs.racing.simulation import SUBSTEPS, Simulation, compiled
+from coachable.envs.racing.simulation import SUBSTEPS, Simulation, maybe_compile
 from coachable.envs.racing.state import STATE_ROWS
 from coachable.envs.racing.styles import style_features_size
 from coachable.envs.racing.task import TaskWeights
@@ -31,7 +31,7 @@ SCENARIO = "scenario"
 TELEMETRY_KEY = "telemetry"
 
 Driver = Callable[["RacingEnv", Tensor], Tensor]
-"""Drives cars that the agent does not: (env, observations (M, D)) to actions (M, 2), of the last M rows of `env.all_rows`."""
+"""Drives cars that the agent does not: (env, observations (M, D)) to actions (M, 2), of the last M cars in `env.state`."""
 
 
 class RacingEnv(EnvBase):
@@ -56,7 +56,8 @@ class RacingEnv(EnvBase):
         course_points: points of each edge of the track that a driver sees.
         episode_steps: control steps (0.1 s) after which an episode is truncated.
         substeps: of physics in a control step; 40 for accurate runs.
-        compile: whether to compile the physics and the task: minutes at first, then several times faster.
+        compiled: whether to compile the physics and the task: minutes at first, then several times faster. (TorchRL
+            takes `compile` for itself.)
         device: where everything runs.
         seed: of the starts; race b gets a stream of its own.
         num_threads: ignored; torch's own threads are used.
@@ -89,7 +90,7 @@ class RacingEnv(EnvBase):
         course_points: int = COURSE_POINTS,
         episode_steps: int = EPISODE_STEPS,
         substeps: int = SUBSTEPS,
-        compile: bool = False,
+        compiled: bool = False,
         device: torch.device | str = "cpu",
         seed: int | None = None,
         num_threads: int | None = None,
@@ -111,7 +112,7 @@ class RacingEnv(EnvBase):
         self.course = Course(self.track, place)
         self.garage = Garage(car, cars, self.races, place)
         self.simulation = Simulation(
-            self.garage.car, resources or Resources(), cars=cars, substeps=substeps, compile=compile, device=place
+            self.garage.car, resources or Resources(), cars=cars, substeps=substeps, compile=compiled, device=place
         )
         self.referee = Referee(
             self.course, weights or TaskWeights(), cars, substeps, course_points, pool=self.garage.pooled
@@ -120,8 +121,8 @@ class RacingEnv(EnvBase):
         self.starter = Starter(
             self.course, scenarios or race_scenarios(cars), conditions or Conditions(), torch.tensor(profile), cars
         )
-        self._command = compiled(self.referee.command, place, compile)
-        self._judge = compiled(self.referee.judge, place, compile)
+        self._command = maybe_compile(self.referee.command, place, compiled)
+        self._judge = maybe_compile(self.referee.judge, place, compiled)
         self._compounds = compound_table().to(place)
         rows = cars * self.races
         self.state = torch.zeros(STATE_ROWS, rows, device=place)

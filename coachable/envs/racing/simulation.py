@@ -20,7 +20,7 @@ SUBSTEPS = 10  # 40 is the accurate mode
 _LOG = logging.getLogger(__name__)
 
 
-def compiled(function: Callable[..., Any], device: torch.device, wanted: bool) -> Callable[..., Any]:
+def maybe_compile(function: Callable[..., Any], device: torch.device, wanted: bool) -> Callable[..., Any]:
     """`torch.compile` where it is wanted and possible, otherwise the function itself; says so once."""
     if not wanted:
         return function
@@ -60,7 +60,7 @@ class Simulation:
         self.cars, self.substeps, self.h = cars, substeps, CONTROL_STEP / substeps
         self.car, self.resources = car, resources
         self.wheels = WheelSet.of(car, self.device, dtype)
-        self._move = compiled(self._one_car if cars == 1 else self._many_cars, self.device, compile)
+        self._move = maybe_compile(self._one_car if cars == 1 else self._many_cars, self.device, compile)
 
     def set_cars(self, car: Car) -> None:
         """Replaces the parameters of cars that have one each, as tensors (N,)."""

@@ -1,0 +1,287 @@
+"""`RacingEnv` as a TorchRL environment, its rewards, starts and endings."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
+
+from coachable.envs.racing import (
+    RacingEnv,
+    aggressiveness_style_reward,
+    aggressiveness_style_space,
+    resource_style_reward,
+    resource_style_space,
+)
+from coachable.envs.racing.chance import uniforms
+from coachable.envs.racing.driver import LineFollower
+from coachable.envs.racing.observation import observation_groups
+from coachable.envs.racing.parameters import Resources
+from coachable.envs.racing.referee import TELEMETRY
+from coachable.envs.racing.run import Others
+from coachable.envs.racing.scenarios import Conditions, Scenario, drift_scenarios, rolling_start
+from coachable.envs.racing.state import ROW, WEARS
+from coachable.envs.racing.task import metres_gained
+from coachable.transforms import coachable_env
+
+T = {name: column for column, name in enumerate(TELEMETRY)}
+
+
+def actions(rows, steps, seed=0):
+    return 2 * torch.rand(steps, rows, 2, generator=torch.Generator().manual_seed(seed)) - 1
+
+
+def roll(env, sequence):
+    """Steps without resets in between: all of `next`, stacked (steps, N)."""
+    current, seen = env.reset(), []
+    for action in sequence:
+        current = env.step(current.set("action", action))["next"]
+        seen.append(current.clone())
+    return torch.stack(seen)
+
+
+@pytest.mark.parametrize("options", [{}, {"cars": 5, "car": "pool"}, {"cars": 2, "car": "x2019"}], ids=["1", "5", "2"])
+def test_specs_hold(options):
+    env = RacingEnv(num_envs=2 * options.get("cars", 1), seed=0, track="ring", **options)
+    check_env_specs(env, seed=0)
+    groups = observation_groups(env.cars, env.garage.pooled)
+    assert env.observation_size == sum(width for _, width in groups)
+
+
+def test_the_same_seed_gives_the_same_races_and_another_does_not():
+    runs = [roll(RacingEnv(10, cars=5, seed=s, track="ring"), actions(10, 5))["observation"] for s in (1, 1, 2)]
+    assert torch.equal(runs[0], runs[1])
+    assert not torch.equal(runs[0][0], runs[2][0])
+
+
+def test_a_race_does_not_depend_on_how_many_run_beside_it():
+    """Every race has a random stream of its own."""
+    few, many = RacingEnv(10, cars=5, seed=1, track="ring"), RacingEnv(30, cars=5, seed=1, track="ring")
+    few.reset()
+    many.reset()
+    torch.testing.assert_close(few.state.reshape(-1, 5, 2), many.state.reshape(-1, 5, 6)[..., :2])
+
+
+def test_uniform_numbers_are_uniform():
+    u = uniforms(torch.arange(2000), torch.ones(2000, dtype=torch.int64), 10, 5)
+    assert u.shape == (10, 5, 2000) and u.min() >= 0 and u.max() < 1
+    assert abs(u.mean() - 0.5) < 5 / math.sqrt(12 * u.numel())
+    flat = u.reshape(50, -1)
+    assert (torch.corrcoef(flat) - torch.eye(50)).abs().max() < 6 / math.sqrt(2000)
+
+
+def test_partial_reset_touches_no_other_race():
+    env = RacingEnv(15, cars=5, seed=0, track="ring")
+    roll(env, actions(15, 3))
+    before = {k: v.clone() for k, v in env.simulator_state().items()}
+    mask = torch.tensor([False, True, False]).repeat(5)[:, None]
+    env.reset(TensorDict({"_reset": mask}, [15]))
+    after = env.simulator_state()
+    kept = ~mask.flatten()
+    for name in ("state", "run", "compound"):
+        assert torch.equal(before[name][:, kept], after[name][:, kept])
+        assert name == "compound" or not torch.equal(before[name][:, ~kept], after[name][:, ~kept])
+    with pytest.raises(ValueError, match="all rows of a race"):
+        env.reset(TensorDict({"_reset": torch.arange(15)[:, None] == 0}, [15]))
+
+
+@pytest.mark.parametrize("options", [{"cars": 5, "car": "pool"}, {}], ids=["pool", "solo"])
+def test_a_saved_simulation_goes_on_exactly(options):
+    first = RacingEnv(10, seed=0, track="ring", resources=Resources(9.0, 3.0), **options)
+    start = roll(first, actions(10, 4))[-1]
+    saved = first.simulator_state()
+    second = RacingEnv(10, seed=5, track="ring", resources=Resources(9.0, 3.0), **options)
+    second.reset()
+    second.load_simulator_state(saved)
+    for action in actions(10, 4, seed=1):
+        ends = [env.step(start.clone().set("action", action))["next"] for env in (first, second)]
+        assert torch.equal(ends[0]["observation"], ends[1]["observation"])
+        assert torch.equal(ends[0]["task_reward"], ends[1]["task_reward"])
+    assert torch.equal(first.reset()["observation"], second.reset()["observation"])
+    with pytest.raises(ValueError, match="this env has 4 of 1"):
+        RacingEnv(4, track="ring").load_simulator_state(RacingEnv(3, track="ring").simulator_state())
+
+
+def test_bad_actions_are_refused():
+    env = RacingEnv(2, track="ring", seed=0)
+    start = env.reset()
+    with pytest.raises(ValueError, match="NaN"):
+        env._step(start.clone().set("action", torch.full((2, 2), torch.nan)))
+    with pytest.raises(ValueError, match=r"expected \(2, 2\)"):
+        env._step(TensorDict({"action": torch.zeros(2, 3)}, [2]))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"num_envs": 3, "cars": 2}, "multiple of the 2"),
+        ({"num_envs": 21, "cars": 21}, "20 grid slots"),
+        ({"num_envs": 2, "cars": 2, "controlled": 1}, "no driver"),
+        ({"num_envs": 2, "car": "tractor"}, "unknown car"),
+        ({"num_envs": 2, "track": "road"}, "unknown track"),
+        ({"num_envs": 2, "scenarios": (Scenario("a", 0.5, "solo"),)}, "add up to 0.5"),
+    ],
+)
+def test_bad_arguments_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        RacingEnv(**{"track": "ring", **options})
+
+
+def test_task_reward_of_a_clean_straight_is_progress():
+    """No slip worth mentioning, nobody near: what remains is metres along the track."""
+    env = RacingEnv(4, track="oval", scenarios=(Scenario("s", 1.0, "slipstream"),), seed=0)
+    seen = roll(env, torch.zeros(3, 4, 2))
+    progress = seen["telemetry"][..., T["progress"]]
+    torch.testing.assert_close(seen["task_reward"][..., 0], progress, atol=0.05, rtol=0)
+    assert (progress > 1).all()
+
+
+def test_off_course_costs_the_squared_speed():
+    env = RacingEnv(1, track="ring", seed=0)
+    start = env.reset()
+    x, y, yaw = env.course.place(torch.tensor([100.0]), torch.tensor([9.0]))
+    for name, value in (("x", x), ("y", y), ("yaw", yaw), ("vx", 20.0)):
+        env.state[ROW[name]] = value
+    env.state[6:10] = 20.0 / 0.335
+    env.run = env.referee.begin(env.state, torch.tensor([100.0]), torch.zeros(1), env.garage.car, None)
+    after = env.step(start.set("action", torch.zeros(1, 2)))["next"]
+    kmh = 3.6 * after["telemetry"][0, T["speed"]]
+    slip = -after["task_reward"].item() - 0.01 * 0.1 * kmh.item() ** 2
+    assert after["telemetry"][0, T["off"]] == 1
+    assert -1e-3 < slip < 0.05
+
+
+def test_metres_gained_count_within_the_window():
+    """Ahead 40 m, behind 20 m, before or after; who is ahead is decided before."""
+    before = torch.tensor([41.0, 39.0, -5.0, -19.0, -30.0, 2.0, 100.0])
+    after = torch.tensor([38.0, 41.0, -7.0, -21.0, -31.0, -1.0, 97.0])
+    ones = torch.ones_like(before, dtype=torch.bool)
+    gained = [
+        [part.item() for part in metres_gained(Others(b[None], b[None], m[None]), Others(a[None], a[None], m[None]))]
+        for b, a, m in zip(before, after, ones, strict=True)
+    ]
+    assert gained == [[3.0, 0.0], [-2.0, 0.0], [0.0, 2.0], [0.0, 2.0], [0.0, 0.0], [3.0, 0.0], [0.0, 0.0]]
+
+
+@pytest.mark.parametrize("family", ["resources", "aggressiveness"])
+def test_rewards_are_the_sum_of_their_stored_parts_bit_for_bit(family):
+    space = resource_style_space() if family == "resources" else aggressiveness_style_space(cars=5)
+    reward = (resource_style_reward if family == "resources" else aggressiveness_style_reward)(space)
+    base = RacingEnv(10, cars=5, track="ring", resources=Resources(9.0, 3.0), scenarios=rolling_start(5))
+    env = coachable_env(base, space, reward, seed=0)
+    data = env.rollout(20, break_when_any_done=False)
+    features, theta = data["next", "style_features"], data["style"]
+    again = data["next", "task_reward"] + reward(features, theta)
+    assert torch.equal(again, data["next", "reward"])
+    flat = data["next", "task_reward"].reshape(-1, 1) + reward(features.reshape(200, -1), theta.reshape(200, -1))
+    assert torch.equal(flat.reshape(again.shape), again)
+    assert (reward(features, theta) != 0).any()
+    if family == "aggressiveness":
+        assert (theta.reshape(5, 2, 20, 2) == theta.reshape(5, 2, 20, 2)[0]).all()
+
+
+def test_style_features_of_tyres_and_fuel_are_what_the_step_used():
+    env = RacingEnv(4, track="ring", seed=0, resources=Resources(9.0, 3.0))
+    start = env.reset()
+    wear, fuel = env.state[WEARS].mean(0).clone(), env.state[ROW["fuel"]].clone()
+    after = env.step(start.set("action", torch.tensor([[0.3, 1.0]]).repeat(4, 1)))["next"]["style_features"]
+    torch.testing.assert_close(after[:, 6], wear - env.state[WEARS].mean(0), atol=1e-8, rtol=1e-3)
+    torch.testing.assert_close(after[:, 7], env.state[ROW["fuel"]] - fuel)
+    assert (after[:, 6:8] < 0).all()
+
+
+def test_drifting_features_need_speed():
+    env = RacingEnv(400, track="ring", seed=0, scenarios=drift_scenarios(), car="street")
+    features = roll(env, torch.zeros(1, 400, 2))[0]["style_features"][:, :4]
+    speed = torch.hypot(env.state[ROW["vx"]], env.state[ROW["vy"]])
+    assert (features[speed < 4.9] == 0).all()
+    assert (features[speed > 5.1].sum(0) > 0).all()
+    assert features[:, :2].max() <= math.pi / 2 and features[:, 2:].max() <= 1
+
+
+def test_launches_and_resources_follow_their_laws():
+    env = RacingEnv(4000, track="ring", seed=0, scenarios=drift_scenarios(), conditions=Conditions.resources())
+    env.reset()
+    speed, fuel, wear = env.state[ROW["vx"]], env.state[ROW["fuel"]], env.state[WEARS]
+    assert abs((speed > 57).float().mean() - 0.5 * 0.05) < 0.012  # half of the starts are U(0, 60)
+    assert abs(fuel.mean() - 55.0) < 5 * 26 / 4000**0.5 and fuel.min() >= 10 and fuel.max() <= 100
+    assert abs(wear.mean() - 0.375) < 5 * 0.22 / 4000**0.5 and wear.min() >= 0
+    spread = (wear - wear.mean(0)).std() * (4 / 3) ** 0.5
+    assert abs(spread - 0.05) < 0.003
+    assert set(env.compound[2:].argmax(0).tolist()) == {6, 7, 8}
+
+
+def test_wrong_way_and_standing_end_an_episode():
+    env = RacingEnv(2, track="ring", seed=0)
+    start = env.reset()
+    env.state[ROW["yaw"], 0] += math.pi
+    env.state[ROW["vx"]] = torch.tensor([20.0, 0.0])
+    env.state[6:10] = env.state[ROW["vx"]] / 0.335
+    ends = []
+    for _ in range(102):
+        after = env.step(start.set("action", torch.tensor([[0.0, 0.0], [0.0, -1.0]])))["next"]
+        ends.append(after["terminated"].flatten())
+    first = torch.stack(ends).int().argmax(0).tolist()
+    assert 29 <= first[0] <= 31 and 99 <= first[1] <= 101
+
+
+def test_episodes_are_truncated_together():
+    env = RacingEnv(10, cars=5, track="ring", seed=0, episode_steps=3)
+    seen = roll(env, torch.zeros(3, 10, 2))
+    assert seen["truncated"][-1].all() and not seen["done"][:-1].any() and not seen["terminated"].any()
+
+
+def test_cars_of_one_race_end_together_and_only_the_culprit_terminates():
+    env = RacingEnv(10, cars=5, track="ring", seed=0)
+    start = env.reset()
+    env.run[6, 0] = 2.95  # row 0, car 0 of race 0: nearly three seconds the wrong way
+    env.state[ROW["yaw"], 0] += math.pi
+    env.state[ROW["vx"], 0] = 20.0
+    after = env.step(start.set("action", torch.zeros(10, 2)))["next"]
+    by_car = after["done"].reshape(5, 2)
+    assert by_car[:, 0].all() and not by_car[:, 1].any()
+    assert after["terminated"].flatten().nonzero().tolist() == [[0]]
+
+
+def test_scripted_opponents_drive_the_other_cars():
+    driver = LineFollower(RacingEnv(1, track="oval").track, RacingEnv(1, track="oval").garage.typical, grip=0.8)
+    env = RacingEnv(2, cars=3, controlled=1, driver=driver, track="oval", seed=0, scenarios=rolling_start(3))
+    seen = roll(env, torch.zeros(10, 2, 2))
+    assert seen["observation"].shape == (10, 2, env.observation_size)
+    distance = env.run[4].reshape(3, 2)
+    assert (distance[1:] > distance[:1] - 50).all()
+    assert (env.state[ROW["throttle"], 2:] > 0).any()
+
+
+def test_random_driving_stays_finite():
+    env = RacingEnv(1000, cars=5, track="lakeside", seed=0, car="pool", resources=Resources(9.0, 3.0))
+    seen = roll(env, actions(1000, 20))
+    for key in ("observation", "task_reward", "style_features", "telemetry"):
+        assert torch.isfinite(seen[key]).all(), key
+    assert seen["observation"].abs().max() < 30
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("car", ["gt3", "x2019", "street", "pool"])
+def test_a_million_random_car_steps_stay_finite(car):
+    env = RacingEnv(5000, cars=5, track="ridge", seed=0, car=car, resources=Resources(9.0, 3.0))
+    current = env.reset()
+    for action in actions(5000, 50):
+        current.set("action", action)
+        stepped, current = env.step_and_maybe_reset(current)
+        after = stepped["next"]
+        for key in ("observation", "task_reward", "style_features"):
+            assert torch.isfinite(after[key]).all(), key
+        assert torch.isfinite(env.state).all()
+
+
+@pytest.mark.gpu
+def test_one_step_is_the_same_on_a_gpu():
+    options = {"cars": 5, "track": "ring", "seed": 0, "scenarios": rolling_start(5)}
+    ends = []
+    for device in ("cpu", "cuda"):
+        env = RacingEnv(50, device=device, **options)
+        start = env.reset()
+        ends.append(env.step(start.set("action", actions(50, 1)[0].to(device)))["next"]["observation"].cpu())
+    torch.testing.assert_close(*ends, atol=1e-4, rtol=1e-4)
