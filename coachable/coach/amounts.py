@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import cast
 
 from coachable.coach.segments import Segment
-from coachable.coach.vocabulary import ANGLE, ANY, PERCENT, PLAINLY, SLIGHTLY, STRONGLY, TURNS, UNITS, stem
+from coachable.coach.vocabulary import ANY, PERCENT, PLAINLY, SLIGHTLY, STRONGLY, TURNS, UNITS, stem
 from coachable.styles import Choice, Setpoint, Weight
 
 
@@ -51,6 +51,17 @@ def default_of(parameter: Weight | Setpoint) -> float:
     return cast(float, parameter.default)
 
 
+def wrapped(p: Weight | Setpoint | Choice, value: float) -> float:
+    """The same direction within the range of a parameter that goes full circle; other values as they are."""
+    if _is_circle(p) and not p.low <= value <= p.high:
+        return p.low + (value - p.low) % 360.0
+    return value
+
+
+def _is_circle(p: Weight | Setpoint | Choice) -> bool:
+    return p.unit == "deg" and p.high - p.low == 360.0
+
+
 def _sign(segment: Segment, p: Weight | Setpoint, last: tuple[str, float] | None) -> float | None:
     """+1 or -1 for a change relative to the value in force."""
     same = last is not None and last[0] == p.name
@@ -66,7 +77,7 @@ def _sign(segment: Segment, p: Weight | Setpoint, last: tuple[str, float] | None
 
 def _moved(p: Weight | Setpoint, segment: Segment, now: float, sign: float) -> float:
     degree = segment.degree or (SLIGHTLY if segment.negated else PLAINLY)
-    if dimension_of(p) == ANGLE and p.high - p.low >= 360.0:  # a full circle has no ends
+    if _is_circle(p):
         return now + sign * TURNS[degree] * 360.0
     return min(max(now + sign * degree * (p.high - p.low), p.low), p.high)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import cast
 
 from coachable.coach import segments
-from coachable.coach.amounts import amount, dimension_of
+from coachable.coach.amounts import amount, dimension_of, wrapped
 from coachable.coach.segments import Mention, Segment
 from coachable.coach.vocabulary import (
     DEFAULTS,
@@ -258,6 +258,7 @@ class StyleGrammar:
                 reading.said.append(f"{_words(name)} stays {_shown(parameter, before)}" + (f", {at}" if ends else ""))
                 return
             reading.last = (name, 1.0 if value > before else -1.0)
+            value = wrapped(parameter, value)
         if value == before:
             reading.said.append(f"{_words(name)} stays {_shown(parameter, value)}")
             return

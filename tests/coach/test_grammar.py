@@ -114,6 +114,13 @@ def test_a_bit_more_goes_on_in_the_same_direction(grammar):
     assert grammar.read("a bit more", NOW | turned.changes, turned).changes == {"course": -60.0}
 
 
+def test_directions_go_round(grammar):
+    turned = grammar.read("turn left", NOW | {"course": 170.0})
+    assert turned.changes == {"course": -145.0}
+    assert "outside" not in str(turned)
+    assert grammar.read("a bit more", NOW | {"course": -145.0}, turned).changes == {"course": -130.0}
+
+
 def test_changes_stop_at_the_end_of_the_range_and_numbers_are_flagged(grammar):
     lowest = NOW | {"step_length": 0.3}
     assert "already at its lowest" in str(grammar.read("shorter", lowest))
