@@ -177,7 +177,7 @@ def describe(action: Tensor) -> str:
     action = canonical(action)
     names = [values[int(i)] for values, i in zip(HEADS.values(), GAMEPAD.choices(action), strict=True)]
     face, dpad, left_shoulder, right_shoulder, left_mode, right_mode = names
-    pressed = [_SYMBOLS.get(n, n) for n in (left_shoulder, right_shoulder, dpad, face) if n != "none"]
+    pressed: list[str] = [_SYMBOLS.get(n, n) for n in (left_shoulder, right_shoulder, dpad, face) if n != "none"]
     parts = [" ".join(pressed)] if pressed else []
     for side, mode, first in (("left", left_mode, 20), ("right", right_mode, 22)):
         if mode == "joystick":

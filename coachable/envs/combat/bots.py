@@ -81,7 +81,7 @@ class Bot:
         eats = (s.hp < _BERRY_BELOW) & (s.berries > 0) & ~dodges
         choice[1] = torch.where(eats, HEADS["dpad"].index("up"), 0)
         choice[4] = torch.where(eats, 0, choice[4])
-        return GAMEPAD.from_choices(choice.T, axes.T)
+        return GAMEPAD.from_choices(choice.T, axes.T.clamp(-1.0, 1.0))
 
     @staticmethod
     def _aim(env: CombatEnv, second: Tensor, aiming: bool, flight: Tensor) -> Tensor:

@@ -139,8 +139,10 @@ class CombatEnv(EnvBase):
                 f"assign got {len(rows)} machines and {len(sites)} sites: expected {self.num_envs} of each, and "
                 f"{self.num_enemies} machines per fight"
             )
+        site = _numbers("sites", sites, SITES).to(self._on)
         columns = [_numbers("machines", [row[i] for row in rows], MACHINE_NAMES) for i in range(self.num_enemies)]
-        self._assigned = torch.stack(columns).to(self._on), _numbers("sites", sites, SITES).to(self._on)
+        self._assigned = torch.stack(columns).to(self._on), site
+        self._place_pillars(torch.cat([site, self.state.site]))
 
     # -- TorchRL ---------------------------------------------------------------------------------------------------
 
@@ -152,8 +154,13 @@ class CombatEnv(EnvBase):
         chosen = [STYLES.index(name) for name in self.styles]
         weights = torch.cat([task_weights().unsqueeze(0), style_weights(reward_scale)[chosen]])
         self._weights, self._fires = weights.to(on), event_components()[chosen].to(on)
-        self._pillars = bool((self._sites[:, 2] > 0).any())
         self._machine_pool, self._site_pool = self._machine_pool.to(on), self._site_pool.to(on)
+        self._place_pillars(self._site_pool)
+
+    def _place_pillars(self, sites: Tensor) -> None:
+        """Pillars are looked for only where a fight may have them."""
+        needed = bool((self._sites[sites, 2] > 0).any())
+        self._pillars = torch.tensor(c.PILLARS, device=self._on).T.contiguous() if needed else None
 
     @property
     def _on(self) -> torch.device:
@@ -268,6 +275,7 @@ class CombatEnv(EnvBase):
         names = self.state.tensors()
         self.state = State(**{name: state[name].movedim(0, -1).contiguous().to(self._on) for name in names})
         self._random.set_state(state["random"]["generator"])
+        self._place_pillars(torch.cat([self._site_pool, self.state.site]))
         self._look_up()
 
 

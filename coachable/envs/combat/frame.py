@@ -79,7 +79,7 @@ class Rules:
         site: (4, N) rows of `site_table`.
         elements: of `ElementNumbers.load`.
         traps: of `TrapNumbers.of`; None where no fight has traps.
-        pillars: whether any fight has pillars.
+        pillars: (2, 4) their places; None if no fight has any.
         assist: cone [rad] and share per frame of the aim assist.
     """
 
@@ -87,7 +87,7 @@ class Rules:
     site: Tensor
     elements: ElementNumbers
     traps: TrapNumbers | None
-    pillars: bool
+    pillars: Tensor | None
     assist: tuple[float, float]
 
 
@@ -115,11 +115,10 @@ def run_frame(
     rise = pick(s.enemy_z + traits.radius, second) - c.EYE_HEIGHT
     turn_camera(s, intent, *rules.assist, torch.atan2(y, x), torch.atan2(rise, pick(distance, second)))
 
-    blocked_at = torch.full_like(s.yaw, torch.inf)
-    has_pillars = site[2] > 0 if rules.pillars else None
-    if has_pillars is not None:
-        level = ray_blocked_at(s.position, s.yaw)
-        blocked_at = torch.where(has_pillars, level / s.pitch.cos(), torch.inf)
+    blocked_at, blocks = torch.full_like(s.yaw, torch.inf), site[2] > 0
+    if rules.pillars is not None:
+        level = ray_blocked_at(s.position, s.yaw, rules.pillars)
+        blocked_at = torch.where(blocks, level / s.pitch.cos(), torch.inf)
     factor = hit_factor(s, rules.elements)
     hit, body, parts = shoot(s, intent, traits, relative, distance, noise.spread[frame], blocked_at)
     by_shot = intent.damage * body
@@ -145,6 +144,6 @@ def run_frame(
     move_machines(s, traits, site, blow, noise.flip[frame])
     s.hp = (s.hp - burns).clamp(min=0.0)
     taken = strike_player(
-        s, traits, blow, strength, self_damage, noise.hit, noise.shot[frame], noise.aim[frame], has_pillars
+        s, traits, blow, strength, self_damage, noise.hit, noise.shot[frame], noise.aim[frame], rules.pillars, blocks
     )
     totals.taken = totals.taken + taken + burns

@@ -157,6 +157,7 @@ def strike_player(
     shot_roll: Tensor,
     noise: Tensor,
     pillars: Tensor | None,
+    blocks: Tensor,
 ) -> Tensor:
     """One frame of the attacks: hits, shots that are fired and that land, and what the player suffers.
 
@@ -169,7 +170,8 @@ def strike_player(
         roll: (E, N) uniform numbers, damage of hits.
         shot_roll: (E, N) uniform numbers, damage of shots.
         noise: (2, E, N) standard normal numbers, aim of the shots.
-        pillars: (N,) bool, sites whose pillars stop shots; None if no fight has any.
+        pillars: (2, 4) their places; None if no fight has any.
+        blocks: (N,) bool, sites that have them.
 
     Returns:
         (N,) damage to the player [HP].
@@ -186,15 +188,17 @@ def strike_player(
     charge = (kind == CHARGE) & (gap < c.CHARGE_GAP) & low
     area = (kind == AREA) & (gap < blow[FARTHEST] + c.AREA_MARGIN) & (s.timers[AIR] <= 0)
     safe = s.timers[SAFE] > 0
-    connects = attacking & (cone | charge | area) & ~safe
+    reaches = attacking & (cone | charge | area)
+    connects = reaches & ~safe
     weak = 1.0 - (1.0 - c.DRENCHED_DAMAGE) * s.state_timer[PURGEWATER].clamp(max=1.0)
     damage = traits.hit * blow[DAMAGE]
     direct = connects * damage * _spread(roll) * torch.where(kind == AREA, weak, 1.0)
 
-    fires = _fire_shots(s, blow, attacking & (kind == RANGED), distance, noise, pillars)
+    fires = _fire_shots(s, blow, attacking & (kind == RANGED), distance, noise, pillars, blocks)
     ranged = damage * _spread(shot_roll) * weak * (c.RANGED_REST + (1.0 - c.RANGED_REST) * strength)
     s.shot_damage = torch.where(fires, ranged, s.shot_damage)
-    s.hits_left = s.hits_left - 1.0 * (connects | fires.any(0))
+    # An attack that reaches a player who is safe is spent: that is what a dodge is for.
+    s.hits_left = s.hits_left - 1.0 * (reaches | fires.any(0))
 
     landing = s.land_timer == 1.0  # in this frame
     s.land_timer = (s.land_timer - 1.0).clamp(min=0.0)
@@ -215,7 +219,7 @@ def _spread(roll: Tensor) -> Tensor:
 
 
 def _fire_shots(
-    s: State, blow: Tensor, firing: Tensor, distance: Tensor, noise: Tensor, pillars: Tensor | None
+    s: State, blow: Tensor, firing: Tensor, distance: Tensor, noise: Tensor, pillars: Tensor | None, blocks: Tensor
 ) -> Tensor:
     """Starts the shots that are due in this frame, spread evenly over the active phase.
 
@@ -234,35 +238,31 @@ def _fire_shots(
     # Rounded up to whole frames, at least one.
     s.land_timer = torch.where(filled, (flight * c.FPS).ceil() + 1.0, s.land_timer)
     if pillars is not None:
-        stopped = segment_blocked(s.enemy_position, point) & pillars
+        stopped = segment_blocked(s.enemy_position, point, pillars) & blocks
         s.land_timer = torch.where(filled & stopped, 0.0, s.land_timer)
     return filled
 
 
-def segment_blocked(start: Tensor, end: Tensor) -> Tensor:
-    """Whether a pillar stands between points (2, ..., N): (..., N) bool."""
+def segment_blocked(start: Tensor, end: Tensor, pillars: Tensor) -> Tensor:
+    """Whether a pillar (2, 4) stands between points (2, E, N): (E, N) bool."""
     along = end - start
     length = along.square().sum(0).clamp(min=1e-6)
-    blocked = torch.zeros_like(length, dtype=torch.bool)
-    for x, y in c.PILLARS:
-        offset_x, offset_y = x - start[0], y - start[1]
-        share = ((offset_x * along[0] + offset_y * along[1]) / length).clamp(0.0, 1.0)
-        miss = (offset_x - share * along[0]).square() + (offset_y - share * along[1]).square()
-        blocked = blocked | (miss < c.PILLAR_RADIUS**2)
-    return blocked
+    x, y = pillars.view(2, -1, 1, 1)
+    offset_x, offset_y = x - start[0], y - start[1]  # (4, E, N)
+    share = ((offset_x * along[0] + offset_y * along[1]) / length).clamp(0.0, 1.0)
+    miss = (offset_x - share * along[0]).square() + (offset_y - share * along[1]).square()
+    return miss.amin(0) < c.PILLAR_RADIUS**2
 
 
-def ray_blocked_at(position: Tensor, yaw: Tensor) -> Tensor:
-    """Distance at which a level ray from (2, N) meets a pillar, (N,) [m]; infinite if none."""
-    x, y = facing(yaw)
-    nearest_entry = torch.full_like(yaw, torch.inf)
-    for pillar_x, pillar_y in c.PILLARS:
-        offset_x, offset_y = pillar_x - position[0], pillar_y - position[1]
-        along = offset_x * x + offset_y * y
-        inside = c.PILLAR_RADIUS**2 - (offset_x.square() + offset_y.square() - along.square())
-        entry = torch.where((inside > 0) & (along > 0), along - inside.clamp(min=0.0).sqrt(), torch.inf)
-        nearest_entry = torch.minimum(nearest_entry, entry)
-    return nearest_entry
+def ray_blocked_at(position: Tensor, yaw: Tensor, pillars: Tensor) -> Tensor:
+    """Distance at which a level ray from (2, N) meets a pillar (2, 4), (N,) [m]; infinite if none."""
+    x, y = pillars.unsqueeze(-1)
+    cos, sin = facing(yaw)
+    offset_x, offset_y = x - position[0], y - position[1]  # (4, N)
+    along = offset_x * cos + offset_y * sin
+    inside = c.PILLAR_RADIUS**2 - (offset_x * sin - offset_y * cos).square()
+    entry = along - inside.clamp(min=0.0).sqrt()
+    return torch.where((inside > 0) & (along > 0), entry, torch.inf).amin(0)
 
 
 def _suffer(s: State, hit: Tensor, charged: Tensor) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import cast
+from collections.abc import Sequence
+from typing import Any, cast
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -82,8 +83,8 @@ class CombatRenderer:
             self._map_height / 2 - (y - self._centre[1]) * self._scale,
         )
 
-    def _circle(self, pen: ImageDraw.ImageDraw, x: float, y: float, metres: float, **style) -> None:
-        px, py = self._at(x, y)
+    def _circle(self, pen: ImageDraw.ImageDraw, place: Sequence[float], metres: float, **style: Any) -> None:
+        px, py = self._at(*place)
         r = metres * self._scale
         pen.ellipse((px - r, py - r, px + r, py + r), **style)
 
@@ -92,21 +93,21 @@ class CombatRenderer:
 
     def _draw_place(self, pen: ImageDraw.ImageDraw, s: dict, site: str) -> None:
         anchor = s["anchor"].tolist()
-        self._circle(pen, *anchor, c.BOUND_RADIUS, outline=(200, 80, 80), width=2)
+        self._circle(pen, anchor, c.BOUND_RADIUS, outline=(200, 80, 80), width=2)
         if site == "Arena":
-            self._circle(pen, 0.0, 0.0, 38.0, outline=_INK, width=4)
+            self._circle(pen, (0.0, 0.0), 38.0, outline=_INK, width=4)
         if site == "Shining-wastes":
             for x, y in c.PILLARS:
-                self._circle(pen, x, y, c.PILLAR_RADIUS, fill=(150, 130, 100))
+                self._circle(pen, (x, y), c.PILLAR_RADIUS, fill=(150, 130, 100))
         for slot in range(c.HAZARD_SLOTS):
             if s["hazard_timer"][slot] > 0:
-                self._circle(pen, *s["hazard_position"][:, slot].tolist(), c.HAZARD_RADIUS, fill=(245, 190, 160))
+                self._circle(pen, s["hazard_position"][:, slot].tolist(), c.HAZARD_RADIUS, fill=(245, 190, 160))
         for slot in range(c.TRAP_SLOTS):
             kind = int(s["trap_type"][slot])
             if kind >= 0:
                 armed = bool(s["trap_arm"][slot] <= 0)
                 x, y = s["trap_position"][:, slot].tolist()
-                self._circle(pen, x, y, 0.5, outline=_INK, fill=_ELEMENT[TRAPS[kind]] if armed else None)
+                self._circle(pen, (x, y), 0.5, outline=_INK, fill=_ELEMENT[TRAPS[kind]] if armed else None)
 
     def _draw_machine(self, pen: ImageDraw.ImageDraw, env: CombatEnv, s: dict, row: int, enemy: int) -> None:
         x, y = s["enemy_position"][:, enemy].tolist()
@@ -117,22 +118,22 @@ class CombatRenderer:
         blow = env.traits.attacks[:, int(s["attack"][enemy]), enemy, row]
         if alive and phase in (TELEGRAPH, ACTIVE):
             self._draw_warning(pen, x, y, radius, yaw, KINDS[int(blow[KIND])], float(blow[FARTHEST]), colour)
-        self._circle(pen, x, y, radius, fill=colour, outline=_INK)
+        self._circle(pen, (x, y), radius, fill=colour, outline=_INK)
         for slot in range(s["count"].shape[0]):
             if s["count"][slot, enemy] > 0:
                 dx, dy, _ = env.traits.offset[:, slot, enemy, row].tolist()
                 px = x + math.cos(yaw) * dx - math.sin(yaw) * dy
                 py = y + math.sin(yaw) * dx + math.cos(yaw) * dy
                 kind = int(env.traits.part_type[:, slot, enemy, row].argmax())
-                self._circle(pen, px, py, 0.25 + 0.1 * radius, fill=_PARTS[kind], outline=_INK)
+                self._circle(pen, (px, py), 0.25 + 0.1 * radius, fill=_PARTS[kind], outline=_INK)
         self._arrow(pen, x, y, yaw, 1.6 * radius, _INK)
         for slot in range(c.SHOT_SLOTS):
             if s["land_timer"][slot, enemy] > 0:
                 point = s["shot_point"][:, slot, enemy].tolist()
-                self._circle(pen, *point, c.SHOT_RADIUS, outline=(215, 40, 40), width=2)
+                self._circle(pen, point, c.SHOT_RADIUS, outline=(215, 40, 40), width=2)
         states = [name for i, name in enumerate(ELEMENTS) if s["state_timer"][i, enemy] > 0]
         for i, name in enumerate(states):
-            self._circle(pen, x, y, radius + 0.4 + 0.25 * i, outline=_ELEMENT[name], width=3)
+            self._circle(pen, (x, y), radius + 0.4 + 0.25 * i, outline=_ELEMENT[name], width=3)
         px, py = self._at(x, y + radius + 1.6)
         share = float(s["enemy_hp"][enemy] / env.traits.hp[enemy, row])
         self._bar(pen, px - 30, py - 4, 60, 7, share, (200, 50, 50))
@@ -150,7 +151,7 @@ class CombatRenderer:
     ) -> None:
         reach = radius + c.BODY_RADIUS + far
         if kind == "area":
-            self._circle(pen, x, y, reach, outline=fill, width=2)
+            self._circle(pen, (x, y), reach, outline=fill, width=2)
         elif kind == "cone":
             px, py = self._at(x, y)
             r, degrees = reach * self._scale, -math.degrees(yaw)

@@ -144,6 +144,8 @@ class State:
 
 def nearest(state: State) -> Tensor:
     """(N,) bool: the second enemy is the nearest living one; False where there is one enemy."""
+    if state.enemy_hp.shape[0] == 1:
+        return torch.zeros_like(state.hp, dtype=torch.bool)
     offset = state.enemy_position - state.position.unsqueeze(1)
     squared = offset.square().sum(0) + 1e6 * (state.enemy_hp <= 0)
     return squared[-1] < squared[0]

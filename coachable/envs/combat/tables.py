@@ -95,7 +95,9 @@ def parse_table(file: str, text: str) -> Table:
 def load_table(name: str) -> Table:
     """A table of `data/`, such as "machines"."""
     file = f"{name}.csv"
-    return parse_table(file, resources.files(__package__).joinpath("data", file).read_text(encoding="utf-8"))
+    return parse_table(
+        file, resources.files("coachable.envs.combat").joinpath("data", file).read_text(encoding="utf-8")
+    )
 
 
 @dataclass(frozen=True)
