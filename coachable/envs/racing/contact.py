@@ -1,6 +1,6 @@
 """Contact between cars as rotated rectangles: separating axes, impulses, position correction.
 
-Cars of B races are laid out (A, B). The pair (i, i + k) is found by rolling the first axis by k, so that k = 1 to A // 2
+Cars of B races are laid out (A, B). Rolling the first axis by k pairs car i with i + k, so that k = 1 to A // 2
 visits every pair, for even A the last k twice; those count half.
 """
 

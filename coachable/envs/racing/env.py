@@ -31,7 +31,7 @@ SCENARIO = "scenario"
 TELEMETRY_KEY = "telemetry"
 
 Driver = Callable[["RacingEnv", Tensor], Tensor]
-"""Drives cars that the agent does not: (env, observations (M, D)) to actions (M, 2), of the last M cars in `env.state`."""
+"""Drives cars that the agent does not: (env, observations (M, D)) to actions (M, 2), of the last M cars of the env."""
 
 
 class RacingEnv(EnvBase):

@@ -244,5 +244,5 @@ def test_the_pool_has_530_different_cars():
 
 
 def test_unknown_cars_are_refused():
-    with pytest.raises(ValueError, match="unknown car 'gt4'.*gt3"):
+    with pytest.raises(ValueError, match=r"unknown car 'gt4'.*gt3"):
         load_car("gt4")

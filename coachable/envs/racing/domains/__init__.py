@@ -1,0 +1,1 @@
+"""Declarations of the three racing domains, one per family of style."""

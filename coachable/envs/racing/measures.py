@@ -1,0 +1,90 @@
+"""Measured style of racing: what the car did, beside what was asked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from coachable.envs.racing.referee import TELEMETRY
+from coachable.envs.racing.simulation import CONTROL_STEP
+from coachable.envs.racing.styles import GAP_COLUMNS, GAPS, RESOURCES
+from coachable.keys import STYLE, STYLE_FEATURES
+
+DRIFT_ANGLE_DEG = 20.0  # that counts as a drift
+GRIP_ANGLE_DEG = 8.0  # that counts as none
+_COLUMN = {name: index for index, name in enumerate(TELEMETRY)}
+
+
+class RacingMeasures:
+    """Pace, road manners and the quantities that the styles ask for.
+
+    Args:
+        family: "drift", "resources" or "aggressiveness"; decides what compliance means.
+
+    Raises:
+        ValueError: if there is no such family.
+    """
+
+    def __init__(self, family: str) -> None:
+        if family not in ("drift", "resources", "aggressiveness"):
+            raise ValueError(f"unknown family {family!r}: expected drift, resources or aggressiveness")
+        self.family = family
+
+    def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
+        """See `StyleMeasures.step`. Angles in degrees, wear and fuel per kilometre, gaps in metres."""
+        theta, features = transition.get(STYLE), transition.get(("next", STYLE_FEATURES))
+        telemetry = transition.get(("next", "telemetry"))
+
+        def told(name: str) -> Tensor:
+            return telemetry[:, _COLUMN[name]]
+
+        degrees = 180.0 / math.pi
+        found = {
+            "pace": told("progress") / CONTROL_STEP,
+            "speed": told("speed"),
+            "off": told("off"),
+            "contact": told("contact"),
+            "wall": told("wall"),
+            "slip_angle_front": features[:, 0] * degrees,
+            "slip_angle_rear": features[:, 1] * degrees,
+            "wear": -features[:, RESOURCES][:, 2],
+            "fuel": -features[:, RESOURCES][:, 3],
+            "place": told("place"),
+        }
+        if self.family == "drift":
+            asked = theta[:, 1] > 1.0
+            angle = found["slip_angle_rear"]
+            found["complied"] = torch.where(asked, angle >= DRIFT_ANGLE_DEG, angle <= GRIP_ANGLE_DEG).float()
+        elif self.family == "resources":
+            found["complied"] = 1.0 - found["off"]
+        else:
+            found["complied"] = _margins_kept(features, theta).float()
+        return found
+
+    def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
+        """See `StyleMeasures.summarise`: means over the steps that count; wear and fuel per kilometre of progress."""
+        means = {name: torch.where(alive, values, torch.nan).nanmean(0) for name, values in record.items()}
+        kilometres = (means["pace"] * CONTROL_STEP / 1000.0).clamp(min=1e-6)
+        for name in ("wear", "fuel"):
+            means[f"{name}_per_km"] = means.pop(name) / kilometres
+        return means
+
+    def complies(self, record: Mapping[str, Tensor]) -> Tensor:
+        """See `StyleMeasures.complies`.
+
+        Drifting above 20 degrees where asked for and below 8 where not; on the track; margins kept.
+        """
+        return record["complied"] > 0
+
+
+def _margins_kept(features: Tensor, theta: Tensor) -> Tensor:
+    """(N,) bool: no near opponent within the longitudinal and the lateral margin at once."""
+    kept = torch.ones(len(features), dtype=torch.bool, device=features.device)
+    for column in range(GAPS, features.shape[1], len(GAP_COLUMNS)):
+        long, lat, near = features[:, column], features[:, column + 1], features[:, column + 2] > 0
+        kept &= ~(near & (long < theta[:, 0]) & (lat < theta[:, 1]))
+    return kept
