@@ -19,7 +19,8 @@ class LiveLoop:
     """Steps a session at the pace of its control step.
 
     Only the loop's thread touches the session. What others want done is submitted, and carried out before the next
-    step: a request therefore acts at the next observation. An exception pauses the loop and is kept in `problem`.
+    step: a request therefore acts at the next observation. A step that raises pauses the loop; the text of any
+    exception is kept in `problem`.
 
     Args:
         session: stepped here and nowhere else.
@@ -83,7 +84,7 @@ class LiveLoop:
                 changed |= self._attempt(lambda session: session.step())
                 due = self._next(due, now)
             if changed:
-                self._attempt(lambda _: self.on_step())
+                self._attempt(lambda _: self.on_step(), pause=False)  # what is shown may fail, the agent goes on
             time.sleep(_IDLE if self.paused else min(_IDLE, max(0.0, due - time.perf_counter())))
 
     def _next(self, due: float, now: float) -> float:

@@ -46,6 +46,7 @@ def page(request):
 
 def visit(browser, page, outside):
     tab = browser.new_page(viewport={"width": 1280, "height": 900})
+    tab.set_default_timeout(PATIENCE)
     tab.on("request", lambda request: outside.append(request.url) if is_outside(request.url) else None)
     tab.goto(f"http://127.0.0.1:{page.server.get_port()}")
     tab.get_by_text("Pause").wait_for(timeout=PATIENCE)
@@ -91,7 +92,8 @@ def test_two_browsers_coach_one_agent(browser, page):
 
     first.close()  # a browser that goes away disturbs nobody
     steps = page.session.step_count
-    wait_for(lambda: page.session.step_count > steps)
+    wait_for(lambda: page.session.step_count > steps or page.loop.paused)
+    assert not page.loop.paused, page.loop.problem
     second.get_by_text("Pause").click()
     wait_for(lambda: page.loop.paused)
     steps = page.session.step_count
