@@ -24,7 +24,6 @@ from coachable.evaluation.runs import (
     response_rows,
 )
 from coachable.evaluation.style_grid import mean_of, write_csv
-from coachable.evaluation.sweep import STYLE_SCORE
 from coachable.styles import Setpoint
 from coachable.training.weights import LoadedPolicy, load_policy
 
@@ -216,6 +215,7 @@ def _tradeoffs(page: Page, styles: StyleTable, runs: Sequence[Run], formats: Map
         {
             "weight": sweeps[0].weight,
             "value": float(value),
+            "style": estimate(np.array([mean_of(sweep.episodes[sweep.score][i]) for sweep in sweeps])),
             **{
                 name: estimate(np.array([mean_of(sweep.episodes[name][i]) for sweep in sweeps]))
                 for name in sweeps[0].episodes
@@ -225,12 +225,13 @@ def _tradeoffs(page: Page, styles: StyleTable, runs: Sequence[Run], formats: Map
         for i, value in enumerate(sweeps[0].values)
     ]
     write_csv([flat_row(row) for row in rows], out / "tradeoffs.csv")
-    kept = ("weight", "value", STYLE_SCORE, *(name for name in formats if name in rows[0]))
+    kept = ("weight", "value", "style", *(name for name in formats if name in rows[0]))
     page.section(
         "What a style costs",
         paragraph(
-            "Each weight from neutral to its maximum, the other parameters at their defaults. The style score is what "
-            f"the weight rewards per step, at weight 1; task success is {readable(success)}."
+            "Each weight from neutral to its maximum, the other parameters at their defaults. Style is what the domain "
+            "measures under the weight's name, or else what the weight rewards per step, at weight 1; task success is "
+            f"{readable(success)}."
         ),
         picture(out / "tradeoffs.png", "task success against style score along each weight"),
         table([{name: row[name] for name in kept} for row in rows], formats),

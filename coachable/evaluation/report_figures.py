@@ -19,7 +19,7 @@ from matplotlib.ticker import PercentFormatter
 from coachable.evaluation.figures import readable
 from coachable.evaluation.runs import Estimate, Run, StyleTable, describe, estimate
 from coachable.evaluation.style_grid import mean_of
-from coachable.evaluation.sweep import STYLE_SCORE
+from coachable.evaluation.sweep import UNIT_REWARD
 from coachable.styles import Choice, StyleSpace
 
 __all__ = ["draw_metrics", "draw_requests", "draw_switches", "draw_tradeoffs"]
@@ -96,10 +96,11 @@ def draw_switches(runs: Sequence[Run], period_seconds: float, path: Path) -> Non
 
 
 def draw_tradeoffs(runs: Sequence[Run], success: str, form: str, path: Path) -> None:
-    """Task success against style score along each weight, neutral to maximum (paper, Pareto curves)."""
+    """Task success against the amount of style along each weight, neutral to maximum (paper, Pareto curves)."""
     figure, panels = _panels(len(runs[0].sweeps))
     for panel, sweeps in zip(panels, zip(*(run.sweeps for run in runs), strict=True), strict=False):
-        x, y = ([_point(sweeps, metric, i) for i in range(len(sweeps[0].values))] for metric in (STYLE_SCORE, success))
+        score = sweeps[0].score
+        x, y = ([_point(sweeps, metric, i) for i in range(len(sweeps[0].values))] for metric in (score, success))
         panel.errorbar(
             [e.value for e in x], [e.value for e in y], _reach(y), _reach(x), marker="o", ms=5, capsize=2, lw=1
         )
@@ -107,7 +108,7 @@ def draw_tradeoffs(runs: Sequence[Run], success: str, form: str, path: Path) -> 
             if position in (0, len(x) - 1) and not np.isnan(at.value + height.value):
                 panel.annotate(f"{value:g}", (at.value, height.value), (5, 5), textcoords="offset points", fontsize=8)
         panel.set_title(readable(sweeps[0].weight), fontsize=10)
-        panel.set_xlabel("style score per step")
+        panel.set_xlabel("style reward per step at weight 1" if score == UNIT_REWARD else f"measured {readable(score)}")
         panel.set_ylabel(readable(success))
         _as_share(panel, form)
         panel.grid(alpha=0.3)

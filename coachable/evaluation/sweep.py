@@ -17,9 +17,10 @@ from coachable.keys import STYLE_FEATURES
 from coachable.styles import StyleReward, StyleSpace, Weight
 from coachable.transforms import coachable_env
 
-__all__ = ["STYLE_SCORE", "WeightSweep", "sweep_weights"]
+__all__ = ["UNIT_REWARD", "WeightSweep", "sweep_weights"]
 
-STYLE_SCORE = "style_score"
+UNIT_REWARD = "unit_style_reward"
+"""What a weight's terms pay per step at weight 1, whatever weight was requested."""
 
 
 @dataclass(frozen=True)
@@ -29,12 +30,17 @@ class WeightSweep:
     Attributes:
         weight: name of the parameter.
         values: (P,) requested.
-        episodes: name to (P, episodes); `style_score` is what the weight rewards, per step and at weight 1.
+        episodes: name to (P, episodes): what the domain measures, and `UNIT_REWARD`.
     """
 
     weight: str
     values: np.ndarray
     episodes: dict[str, np.ndarray]
+
+    @property
+    def score(self) -> str:
+        """Which of the episodes' values says how much of the style there was: the domain's measure of that name."""
+        return self.weight if self.weight in self.episodes else UNIT_REWARD
 
 
 def sweep_weights(
@@ -76,7 +82,7 @@ def sweep_weights(
     unit = space.default.repeat(len(rows), 1)
     for row, (name, _) in enumerate(rows):
         unit[row, space.slices[name]] = 1.0
-    measures = _WithStyleScore(domain.measures, reward, unit.repeat_interleave(episodes, 0))
+    measures = _WithUnitReward(domain.measures, reward, unit.repeat_interleave(episodes, 0))
     env = coachable_env(domain.make_env(num_envs=len(theta), num_threads=num_threads), space, reward, seed=seed)
     record = record_episodes(
         env,
@@ -98,8 +104,8 @@ def sweep_weights(
     ]
 
 
-class _WithStyleScore:
-    """A domain's measures, and what one style term pays per step at weight 1, whatever weight was requested."""
+class _WithUnitReward:
+    """A domain's measures, and `UNIT_REWARD`."""
 
     def __init__(self, measures: StyleMeasures, reward: StyleReward, unit: Tensor) -> None:
         self._measures = measures
@@ -109,13 +115,13 @@ class _WithStyleScore:
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
         features = transition.get(("next", STYLE_FEATURES))
-        score = self._reward(features, self._unit) - self._reward(features, self._neutral)
-        return {**self._measures.step(transition), STYLE_SCORE: score.squeeze(-1)}
+        paid = self._reward(features, self._unit) - self._reward(features, self._neutral)
+        return {**self._measures.step(transition), UNIT_REWARD: paid.squeeze(-1)}
 
     def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
-        own = {name: values for name, values in record.items() if name != STYLE_SCORE}
-        score = torch.where(alive, record[STYLE_SCORE], torch.nan).nanmean(0)
-        return {**self._measures.summarise(own, alive), STYLE_SCORE: score}
+        own = {name: values for name, values in record.items() if name != UNIT_REWARD}
+        paid = torch.where(alive, record[UNIT_REWARD], torch.nan).nanmean(0)
+        return {**self._measures.summarise(own, alive), UNIT_REWARD: paid}
 
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
         return self._measures.complies(record)

@@ -148,8 +148,20 @@ def test_a_weight_buys_style_with_survival():
     assert sweep.weight == "bold"
     np.testing.assert_allclose(sweep.values, [0, 1, 2, 3, 4])  # from neutral, not from the lowest
     # The default style asks for a speed of 1 under a red hat. Scale 2 per unit of the feature, whatever the weight.
-    np.testing.assert_allclose(sweep.episodes["style_score"][:, 0], 2 * np.array([1, 1.25, 1.5, 1.75, 2.0]))
+    assert sweep.score == "unit_style_reward"
+    np.testing.assert_allclose(sweep.episodes[sweep.score][:, 0], 2 * np.array([1, 1.25, 1.5, 1.75, 2.0]))
     np.testing.assert_array_equal(sweep.episodes["survived"], [[1, 1]] * 3 + [[0, 0]] * 2)
+
+
+def test_a_domain_may_measure_a_weight_itself():
+    class Measures(ToyMeasures):
+        def step(self, transition):
+            return {**super().step(transition), "bold": transition["action"].squeeze(-1)}
+
+    domain = Domain(**{**vars(DOMAIN), "measures": Measures()})
+    (sweep,) = sweep_weights(domain, AGENT.actor, SPACE, points=2, episodes=1, progress=False)
+    assert sweep.score == "bold"
+    np.testing.assert_allclose(sweep.episodes["bold"][:, 0], [1.0, 2.0])
 
 
 def test_without_weights_there_is_no_sweep(tmp_path):
