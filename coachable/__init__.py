@@ -12,6 +12,7 @@ from coachable.gl import choose_gl_backend
 choose_gl_backend()  # MuJoCo, which TorchRL imports, reads the choice once, when it is imported
 
 if TYPE_CHECKING:
+    from coachable.coach.session import CoachSession
     from coachable.replay import EventTableBuffer
     from coachable.styles import Choice, Setpoint, StyleReward, StyleSpace, Weight
     from coachable.transforms import CoachableEnv, StyleRewardTransform, StyleSampler, TaskImpersonation, coachable_env
@@ -26,6 +27,7 @@ _MODULE_OF = {
     "StyleReward": "coachable.styles",
     "StyleSpace": "coachable.styles",
     "Weight": "coachable.styles",
+    "CoachSession": "coachable.coach.session",
     "CoachableEnv": "coachable.transforms",
     "StyleRewardTransform": "coachable.transforms",
     "StyleSampler": "coachable.transforms",
@@ -35,6 +37,7 @@ _MODULE_OF = {
 
 __all__ = [
     "Choice",
+    "CoachSession",
     "CoachableEnv",
     "EventTableBuffer",
     "Setpoint",

@@ -18,7 +18,7 @@ def test_help_names_the_commands(capsys):
         main(["--help"])
     assert stop.value.code == 0
     text = capsys.readouterr().out
-    for command in ("evaluate", "render", "weights", "doctor"):
+    for command in ("evaluate", "report", "render", "curves", "explain", "coach", "export", "weights", "doctor"):
         assert re.search(rf"^\s+{command}\s", text, re.MULTILINE)
 
 

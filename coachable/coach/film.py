@@ -9,7 +9,7 @@ import numpy as np
 
 from coachable.coach.recording import Recording
 from coachable.coach.session import CoachSession
-from coachable.evaluation.video import _caption as caption
+from coachable.evaluation.video import caption
 from coachable.evaluation.video import write_video
 
 

@@ -131,7 +131,7 @@ def _film(
                     transition = env.step(policy(current.set(STYLE, theta[None])))
                 recent.append(domain.measures.step(transition))
                 if step % every == 0:
-                    yield _caption(renderer.draw(env), _caption_lines(domain, request, recent, falls))
+                    yield caption(renderer.draw(env), caption_lines(domain, request, recent, falls))
                 current = step_mdp(transition)
                 if transition["next", "done"].any():
                     falls += int(transition["next", "terminated"].sum())
@@ -141,7 +141,7 @@ def _film(
         env.close()
 
 
-def _caption_lines(
+def caption_lines(
     domain: Domain, request: dict[str, Any], recent: list[dict[str, Tensor]], falls: int
 ) -> tuple[str, str]:
     window = recent[-round(2.0 / domain.control_step) :]
@@ -152,7 +152,7 @@ def _caption_lines(
     return f"asked: {asked}".replace("_", " "), f"last 2 s: {shown}; falls {falls}".replace("_", " ")
 
 
-def _caption(frame: np.ndarray, lines: tuple[str, str]) -> np.ndarray:
+def caption(frame: np.ndarray, lines: tuple[str, str]) -> np.ndarray:
     image = Image.fromarray(frame)
     draw = ImageDraw.Draw(image)
     width, height = image.size
