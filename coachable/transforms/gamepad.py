@@ -40,8 +40,16 @@ GAMEPAD = ActionHeads(categorical=tuple(len(values) for values in HEADS.values()
 NUM_COMBINATIONS = 315
 """Legal combinations of the buttons and thumb positions (paper)."""
 
-_SYMBOLS = {"cross": "✕", "circle": "○", "square": "□", "up": "↑", "down": "↓", "left": "←", "right": "→"}
-_ROWS = {}  # "face.cross": 1, ... rows of the transposed action tensor
+_SYMBOLS: dict[str, str] = {
+    "cross": "✕",
+    "circle": "○",
+    "square": "□",
+    "up": "↑",
+    "down": "↓",
+    "left": "←",
+    "right": "→",
+}
+_ROWS: dict[str, int] = {}  # "face.cross": 1, ... rows of the transposed action tensor
 for _head, _values in HEADS.items():
     for _value in _values:
         _ROWS[f"{_head}.{_value}"] = len(_ROWS)
@@ -175,9 +183,9 @@ def describe(action: Tensor) -> str:
     if tuple(action.shape) != (GAMEPAD.action_dim,):
         raise ValueError(f"expected one action of shape ({GAMEPAD.action_dim},), got {tuple(action.shape)}")
     action = canonical(action)
-    names = [values[int(i)] for values, i in zip(HEADS.values(), GAMEPAD.choices(action), strict=True)]
+    names: list[str] = [values[int(i)] for values, i in zip(HEADS.values(), GAMEPAD.choices(action), strict=True)]
     face, dpad, left_shoulder, right_shoulder, left_mode, right_mode = names
-    pressed: list[str] = [_SYMBOLS.get(n, n) for n in (left_shoulder, right_shoulder, dpad, face) if n != "none"]
+    pressed = [_SYMBOLS.get(n, n) for n in (left_shoulder, right_shoulder, dpad, face) if n != "none"]
     parts = [" ".join(pressed)] if pressed else []
     for side, mode, first in (("left", left_mode, 20), ("right", right_mode, 22)):
         if mode == "joystick":
