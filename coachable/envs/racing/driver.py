@@ -18,7 +18,8 @@ from coachable.envs.racing.track import Track
 if TYPE_CHECKING:
     from coachable.envs.racing.env import RacingEnv
 
-_PREVIEW = (5.0, 0.28)  # [m] and [s], distance at which it aims
+_PREVIEW = (5.0, 0.5)  # [m] and [s], distance at which it aims: well beyond the lag of the steering
+_YAW_DAMPING = 0.04  # [s]
 _REACTION = 0.12  # [s], looked ahead in the speed profile
 _FOLLOWING = 0.35  # [s], time gap to a car ahead in the same lane
 _LANE = 2.2  # [m]
@@ -79,9 +80,11 @@ class LineFollower:
         cos, sin = torch.cos(state.yaw), torch.sin(state.yaw)
         forward, side = dx * cos + dy * sin, dy * cos - dx * sin
         bearing = torch.atan2(side, forward)
-        # Pure pursuit, plus the slip angle that the tyres need for the turn, plus a correction of slides.
-        steer = torch.atan(2.0 * self.base * torch.sin(bearing) / distance)
+        # Pure pursuit, damped in yaw, a little more for the tyres' slip, and a correction of slides.
+        curvature = 2.0 * torch.sin(bearing) / distance
+        steer = torch.atan(self.base * curvature)
         slide = torch.atan2(state.vy, state.vx.clamp(min=3.0))
+        steer = steer + _YAW_DAMPING * (speed * curvature - state.yaw_rate)
         steer = 1.15 * steer + 0.5 * (slide.abs() - 0.08).clamp(min=0.0) * torch.sign(slide)
         steer = torch.where(bearing.abs() > 0.5 * math.pi, torch.sign(bearing) * self.steer_max, steer)
 
