@@ -9,8 +9,7 @@ import numpy as np
 
 from coachable.coach.recording import Recording
 from coachable.coach.session import CoachSession
-from coachable.evaluation.video import caption
-from coachable.evaluation.video import write_video
+from coachable.evaluation.video import caption, write_video
 
 
 def film(

@@ -131,7 +131,7 @@ def _film(
                     transition = env.step(policy(current.set(STYLE, theta[None])))
                 recent.append(domain.measures.step(transition))
                 if step % every == 0:
-                    yield caption(renderer.draw(env), caption_lines(domain, request, recent, falls))
+                    yield caption(renderer.draw(env), _caption_lines(domain, request, recent, falls))
                 current = step_mdp(transition)
                 if transition["next", "done"].any():
                     falls += int(transition["next", "terminated"].sum())
@@ -141,7 +141,7 @@ def _film(
         env.close()
 
 
-def caption_lines(
+def _caption_lines(
     domain: Domain, request: dict[str, Any], recent: list[dict[str, Tensor]], falls: int
 ) -> tuple[str, str]:
     window = recent[-round(2.0 / domain.control_step) :]
@@ -153,6 +153,7 @@ def caption_lines(
 
 
 def caption(frame: np.ndarray, lines: tuple[str, str]) -> np.ndarray:
+    """Writes two lines, the first one larger, over the bottom of a frame (height, width, 3) uint8."""
     image = Image.fromarray(frame)
     draw = ImageDraw.Draw(image)
     width, height = image.size

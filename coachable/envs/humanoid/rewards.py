@@ -25,11 +25,13 @@ def move_reward(
 ) -> np.ndarray:
     """Task reward `r_move` (Appendix C, DMC Humanoid), within [-1, 1].
 
-    The factors are those of the suite's walk task. What differs: only speed along the course counts, standing still
-    earns nothing, walking backwards costs as much as walking forwards earns (a flat zero is where training from
-    scratch settles: it learns to step backwards), running earns less than walking, leaning costs more, and the pelvis must face the course. Without
-    the last, training settles on a sideways gallop; without a highest speed, on a run with short, quick steps. Effort
-    costs up to one half, not one fifth: motors that always push with full force hold no arm between its joint limits.
+    The factors are those of the suite's walk task. What differs, and what training settles on without it:
+
+    - only speed along the course counts, and walking backwards costs what walking forwards earns (stepping backwards,
+      where the reward would be flat);
+    - running earns less than walking (a run with short, quick steps);
+    - leaning costs more, and the pelvis must face the course (a crouched sideways gallop);
+    - effort costs up to one half, not one fifth (arms pressed against their joint limits, whatever the style).
 
     Args:
         forward_speed: (N,) speed of the centre of mass along the course [m/s].
