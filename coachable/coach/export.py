@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import warnings
 from pathlib import Path
@@ -131,18 +132,23 @@ def _trace(plain: DeterministicAction) -> Any:
     # Two rows: torch.export would take a batch of one for a constant.
     example = (torch.zeros(2, plain.observation_dim), torch.zeros(2, plain.style_dim))
     batch = torch.export.Dim("batch")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the exporter's own deprecations
-        return torch.onnx.export(
-            plain,
-            example,
-            input_names=["observation", "style"],
-            output_names=list(plain.output_names),
-            dynamic_shapes=({0: batch}, {0: batch}),
-            dynamo=True,
-            external_data=False,
-            verbose=False,
-        )
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)  # the exporter lists packages that it could also serve
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the exporter's own deprecations
+            return torch.onnx.export(
+                plain,
+                example,
+                input_names=["observation", "style"],
+                output_names=list(plain.output_names),
+                dynamic_shapes=({0: batch}, {0: batch}),
+                dynamo=True,
+                external_data=False,
+                verbose=False,
+            )
+    finally:
+        logging.disable(before)
 
 
 def _import_onnx() -> Any:
