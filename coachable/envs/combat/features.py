@@ -238,7 +238,7 @@ def _enemy_rows(s: State, traits: Traits, axes: Tensor, small: bool) -> Tensor:
     living = (s.enemy_hp > 0).float()
     rows = [
         encode_position(body),
-        torch.stack((bearing / torch.pi, pitch_error)),
+        torch.stack((bearing, pitch_error)) / torch.pi,
         to_camera(facing(s.enemy_yaw), axes),
         to_camera(s.enemy_velocity, axes) * _SPEED_SCALE,
         traits.radius.unsqueeze(0) / 2.6,
