@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 _PREVIEW = (5.0, 0.5)  # [m] and [s], distance at which it aims: well beyond the lag of the steering
 _YAW_DAMPING = 0.04  # [s]
+_SLIDE, _COUNTER_STEER = 0.05, 1.0  # [rad] of body slip that is no slide yet, and steering per radian beyond
 _REACTION = 0.12  # [s], looked ahead in the speed profile
 _FOLLOWING = 0.35  # [s], time gap to a car ahead in the same lane
 _LANE = 2.2  # [m]
@@ -85,7 +86,7 @@ class LineFollower:
         steer = torch.atan(self.base * curvature)
         slide = torch.atan2(state.vy, state.vx.clamp(min=3.0))
         steer = steer + _YAW_DAMPING * (speed * curvature - state.yaw_rate)
-        steer = 1.15 * steer + 0.5 * (slide.abs() - 0.08).clamp(min=0.0) * torch.sign(slide)
+        steer = 1.15 * steer + _COUNTER_STEER * (slide.abs() - _SLIDE).clamp(min=0.0) * torch.sign(slide)
         steer = torch.where(bearing.abs() > 0.5 * math.pi, torch.sign(bearing) * self.steer_max, steer)
 
         wanted = self.speeds[course.node(run.s + _REACTION * speed)]
@@ -97,6 +98,9 @@ class LineFollower:
         tyres = tyre_view(env.garage.car, env.simulation.wheels, env.state, env.compound[0])
         spin = tyres.ratio.amax(0) / self.peak
         lock = -tyres.ratio.amin(0) / self.peak
+        # Either pedal takes lateral grip from the rear: both are eased while the car slides.
+        ease = (1.0 - (slide.abs() - _SLIDE) / 0.10).clamp(0.0, 1.0)
+        pedal = torch.where(speed > 8.0, pedal * ease, pedal)
         throttle = pedal.clamp(0.0, 1.0) * (1.7 - spin).clamp(0.0, 1.0)
         brake = (-pedal).clamp(0.0, 1.0) * (1.9 - lock).clamp(0.1, 1.0)
         action = torch.stack([(steer / self.steer_max).clamp(-1.0, 1.0), throttle - brake], dim=-1)
