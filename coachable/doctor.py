@@ -11,7 +11,13 @@ __all__ = ["Check", "examine"]
 
 Verdict = Literal["ok", "note", "problem"]
 _SHOWN = ("torch", "torchrl", "tensordict", "mujoco", "dm_control", "numpy", "hydra-core", "wandb")
-_EXTRAS = {"ui": ("viser", "mjviser"), "video": ("av",), "export": ("onnx", "onnxruntime"), "explain": ("captum",)}
+_EXTRAS = {
+    "ui": ("viser", "mjviser"),
+    "video": ("av",),
+    "export": ("onnx", "onnxruntime", "onnxscript"),
+    "explain": ("captum",),
+    "gym": ("gymnasium",),
+}
 
 
 @dataclass(frozen=True)
