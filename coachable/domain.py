@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase
 from coachable.styles import StyleReward, StyleSpace
 
 # Where each built-in domain is declared; imported only when asked for.
-_DECLARATIONS = {"humanoid": "coachable.envs.humanoid.domain"}
+_DECLARATIONS = {"combat": "coachable.envs.combat.domain", "humanoid": "coachable.envs.humanoid.domain"}
 
 
 class StyleMeasures(Protocol):
