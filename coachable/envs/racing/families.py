@@ -55,4 +55,5 @@ def rival_env(num_envs: int = 64, **options: Any) -> RacingEnv:
         "car": car,
         "scenarios": rolling_start(5),
     }
-    return RacingEnv(num_envs, **(defaults | options | {"track": course}))
+    settings: dict[str, Any] = {**defaults, **options, "track": course}
+    return RacingEnv(num_envs, **settings)

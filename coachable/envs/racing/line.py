@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from coachable.envs.racing.track import Track
@@ -27,11 +29,11 @@ def minimum_curvature_line(track: Track, margin: float = BODY_MARGIN, rounds: in
     n = len(table)
     normal = np.stack([-table[:, 3], table[:, 2]], axis=1)
     ones = np.ones(n)
-    second = sparse.diags([ones[:-1], -2 * ones, ones[:-1]], [-1, 0, 1], format="lil")
+    second: Any = sparse.diags([ones[:-1], -2 * ones, ones[:-1]], [-1, 0, 1], format="lil")  # pyright: ignore[reportArgumentType]
     second[0, n - 1] = second[n - 1, 0] = 1.0
     second = second.tocsc()
     parts = [second @ sparse.diags(normal[:, axis]) for axis in (0, 1)]
-    hessian = sum(part.T @ part for part in parts)
+    hessian: Any = sum(part.T @ part for part in parts)
     slope = sum(part.T @ (second @ table[:, axis]) for axis, part in enumerate(parts))
     low, high = -(table[:, 6] - margin), table[:, 5] - margin
     penalty = 1e-3

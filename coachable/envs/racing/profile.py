@@ -82,13 +82,13 @@ def speed_profile(envelope: Envelope, curvature: np.ndarray, spacing: np.ndarray
     for _ in range(_LAPS):  # braking, backwards
         for i in range(n - 1, -1, -1):
             ahead = speed[(i + 1) % n]
-            room = _left(envelope.friction(ahead), ahead**2 * curvature[i]) + envelope.drag(ahead)
+            room = _left(float(envelope.friction(ahead)), ahead**2 * curvature[i]) + envelope.drag(ahead)
             speed[i] = min(speed[i], np.sqrt(ahead**2 + 2 * room * step[i]))
     for _ in range(_LAPS):  # accelerating, forwards
         for i in range(n):
             now, following = speed[i], (i + 1) % n
             share = _left(
-                envelope.traction(now), now**2 * curvature[i] * envelope.traction(now) / envelope.friction(now)
+                float(envelope.traction(now)), now**2 * curvature[i] * envelope.traction(now) / envelope.friction(now)
             )
             gain = min(share, envelope.engine(now)) - envelope.drag(now)
             speed[following] = min(speed[following], np.sqrt(max(now**2 + 2 * gain * step[i], 1.0)))

@@ -111,7 +111,7 @@ class SharedByRace(Sampler):
         drawn = self.sampler._draw((*shape[:-1], races), generator, device)
         return drawn.repeat(*(1 for _ in shape[:-1]), self.cars, 1)[..., : shape[-1], :].clone()
 
-    def support(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    def support(self) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
         """Bounds of the shared style."""
         return self.sampler.support()
 

@@ -164,7 +164,9 @@ def _integrate(pieces: list[tuple[float, float, float]]) -> tuple[np.ndarray, np
     """Positions, headings, curvatures and distances along pieces of linear curvature, at most `_FINE` apart."""
     nodes, weights = np.polynomial.legendre.leggauss(4)
     position, heading, distance = np.zeros(2), 0.0, 0.0
-    points, headings, curvatures, distances = [position[None]], [[0.0]], [[pieces[0][1]]], [[0.0]]
+    points, headings = [position[None]], [np.zeros(1)]
+    curvatures: list[np.ndarray] = [np.array([pieces[0][1]])]
+    distances: list[np.ndarray] = [np.zeros(1)]
     for length, first, last in pieces:
         if length <= 0.0:
             continue
