@@ -30,7 +30,7 @@ def cheetah_space() -> StyleSpace:
     return StyleSpace([Setpoint("speed", 0.0, 5.0, unit="m/s", help="forward speed")], name="cheetah")
 
 
-def cheetah_style_reward(space: StyleSpace, *, scale: float = 1.0, margin: float = 5.0) -> StyleReward:
+def cheetah_style_reward(space: StyleSpace, *, scale: float = 2.0, margin: float = 5.0) -> StyleReward:
     """Up to `scale` per step for the requested speed, linearly less down to nothing `margin` [m/s] off.
 
     The margin is as wide as the range: where a reward is flat, standing still looks as good as a little running.
