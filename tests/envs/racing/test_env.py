@@ -166,11 +166,11 @@ def test_metres_gained_count_within_the_window():
 
 @pytest.mark.parametrize("family", ["resources", "aggressiveness"])
 def test_rewards_are_the_sum_of_their_stored_parts_bit_for_bit(family):
+    torch.manual_seed(0)  # of the actions: with others, no car may come close enough to another
     space = resource_style_space() if family == "resources" else aggressiveness_style_space(cars=5)
     reward = (resource_style_reward if family == "resources" else aggressiveness_style_reward)(space)
     base = RacingEnv(10, cars=5, track="ring", resources=Resources(9.0, 3.0), scenarios=rolling_start(5))
     env = coachable_env(base, space, reward, seed=0)
-    torch.manual_seed(0)  # of the actions: with others, no car may come close enough to another
     data = env.rollout(20, break_when_any_done=False)
     features, theta = data["next", "style_features"], data["style"]
     again = data["next", "task_reward"] + reward(features, theta)
