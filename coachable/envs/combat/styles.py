@@ -3,25 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import get_args
 
 from coachable.envs.combat.rewards import REWARD_SCALES
 from coachable.envs.combat.tables import STYLES, load_table
-from coachable.styles import (
-    ContinuousOneHot,
-    Mixture,
-    OneHot,
-    PointMass,
-    StyleReward,
-    StyleSpace,
-    Uniform,
-    Weight,
-    WeightedSum,
-)
-
-MIXTURE = (0.03, 0.10, 0.87)
-"""Shares of no style, of every weight at once, and of one weight (paper)."""
-
-COMBAT_COMPONENTS = ("continuous_one_hot", "one_hot", "independent")
+from coachable.styles import StyleReward, StyleSpace, Weight, WeightedSum
+from coachable.styles.mixtures import Single, style_mixture
 
 
 def check_styles(styles: Sequence[str] | None) -> tuple[str, ...]:
@@ -40,15 +27,14 @@ def check_styles(styles: Sequence[str] | None) -> tuple[str, ...]:
 def combat_style_space(
     styles: Sequence[str] | None = None,
     reward_scale: str = "sim",
-    combat_component: str = "continuous_one_hot",
+    combat_component: Single = "continuous_one_hot",
 ) -> StyleSpace:
     """The style weights and the mixture that they are drawn from at every reset.
 
     Args:
         styles: names of the weights, as in `CombatEnv(styles=...)`; all 18 if None.
         reward_scale: "sim" ranges fit the damage rates of this simulator, "paper" are the paper's.
-        combat_component: third component of the mixture. "continuous_one_hot" (paper): one weight, uniform over its
-            range; "one_hot" (ablation): one weight at its maximum; "independent" (ablation): all of them.
+        combat_component: third component of the mixture, see `coachable.styles.mixtures.style_mixture`.
 
     Raises:
         ValueError: if a name or an option is unknown.
@@ -56,22 +42,17 @@ def combat_style_space(
     names = check_styles(styles)
     if reward_scale not in REWARD_SCALES:
         raise ValueError(f"reward_scale is {reward_scale!r}: expected one of {REWARD_SCALES}")
-    if combat_component not in COMBAT_COMPONENTS:
-        raise ValueError(f"combat_component is {combat_component!r}: expected one of {COMBAT_COMPONENTS}")
+    if combat_component not in get_args(Single):
+        raise ValueError(f"combat_component is {combat_component!r}: expected one of {get_args(Single)}")
     table = load_table("styles")
     low = [table.number(name, f"{reward_scale}_low") for name in names]
     high = [table.number(name, f"{reward_scale}_high") for name in names]
-    together = Uniform(low, high)
-    single = {
-        "continuous_one_hot": ContinuousOneHot(low, high),
-        "one_hot": OneHot(high),
-        "independent": together,
-    }[combat_component]
     weights = [
         Weight(name, a, b, help=table.rows[name]["help"], evaluation=(a if -a == b else 0.0, b))
         for name, a, b in zip(names, low, high, strict=True)
     ]
-    return StyleSpace(weights, Mixture([PointMass([0.0] * len(names)), together, single], MIXTURE), name="combat")
+    space = StyleSpace(weights, name="combat")
+    return space.with_sampler(style_mixture(space, combat_component))
 
 
 def combat_style_reward(space: StyleSpace) -> StyleReward:
