@@ -117,6 +117,7 @@ class Learner:
             for name, group in params.items()
             if group
         }
+        self._rates = rates
         if device.type == "cpu":
             for optimizer in self.optimizers.values():
                 _move_moments(optimizer)
@@ -162,6 +163,12 @@ class Learner:
             metrics["q_policy"] = -(metrics["loss_actor"] + metrics["alpha"] * metrics["entropy"])
         return metrics
 
+    def scale_learning_rates(self, factor: float) -> None:
+        """Set every learning rate to `factor` times what the constructor was given."""
+        for name, optimizer in self.optimizers.items():
+            for group in optimizer.param_groups:
+                group["lr"] = factor * self._rates[name]
+
     def check_finite(self) -> None:
         """Raise if a loss or gradient since the last check was not finite (this reads one number from the device)."""
         if not math.isfinite(float(self._watch)):
@@ -180,12 +187,13 @@ class Learner:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned."""
+        """Restore what :meth:`state_dict` returned; the learning rates stay those of the constructor."""
         self.loss_module.load_state_dict(state["loss_module"])
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
             if self._device_type == "cpu":
                 _move_moments(optimizer)
+        self.scale_learning_rates(1.0)
         self.updates = int(state["updates"])
         self._watch.zero_()
 

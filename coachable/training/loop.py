@@ -164,6 +164,7 @@ class Train:
         if warming_up or len(self.replay) < self.settings.batch_size:
             return
         with self._timed("update"):
+            self.learner.scale_learning_rates(self.settings.learning_rate_factor(self.frames))
             if self.settings.utd_ratio is None:  # the learner fills the time that the throttle leaves
                 while self._throttle.remaining() > 0 and not stop.is_set():
                     self._update_once()
@@ -283,11 +284,7 @@ class Train:
             state: contains what `state_dict` returned.
             replay: folder of the saved replay buffer; None starts with an empty one, and says so.
         """
-        rates = {name: [group["lr"] for group in o.param_groups] for name, o in self.learner.optimizers.items()}
         self.learner.load_state_dict(state["learner"])
-        for name, optimizer in self.learner.optimizers.items():  # a new learning rate on the command line must count
-            for group, rate in zip(optimizer.param_groups, rates[name], strict=True):
-                group["lr"] = rate
         self.frames = state["loop"]["frames"]
         self.owed = state["loop"]["owed"]
         self._evaluations = state["loop"]["evaluations"]

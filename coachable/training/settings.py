@@ -16,6 +16,7 @@ class TrainSettings:
         utd_ratio: updates per env-step, fractions allowed; None makes as many as fit into the time that the throttle
             leaves.
         throttle: [env-steps/s] upper bound on collection, or None.
+        anneal: share of total_frames, at its end, over which the learning rates fall linearly to a tenth.
         eval_interval: [env-steps] between evaluations, 0 for none but the last.
         log_interval: [s] between rows of metrics.
         checkpoint_interval: [s] between checkpoints.
@@ -26,6 +27,7 @@ class TrainSettings:
     warmup_frames: int = 0
     utd_ratio: float | None = 1.0
     throttle: float | None = None
+    anneal: float = 0.0
     eval_interval: int = 0
     log_interval: float = 20.0
     checkpoint_interval: float = 300.0
@@ -39,3 +41,10 @@ class TrainSettings:
             raise ValueError("utd_ratio=null (as many updates as fit) needs a throttle: set train.throttle=RATE")
         if self.utd_ratio is not None and self.utd_ratio < 0:
             raise ValueError(f"utd_ratio must not be negative, got {self.utd_ratio}")
+        if not 0.0 <= self.anneal <= 1.0:
+            raise ValueError(f"anneal must be between 0 and 1, got {self.anneal}")
+
+    def learning_rate_factor(self, frames: int) -> float:
+        """What the learning rates are multiplied with after so many env-steps (see `anneal`)."""
+        left = max(0.0, 1.0 - frames / self.total_frames)
+        return 1.0 if left >= self.anneal else 0.1 + 0.9 * left / self.anneal
