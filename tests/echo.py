@@ -125,6 +125,7 @@ def make_train(
     resumable: bool = True,
     num_envs: int = 4,
     checkpoints: CheckpointStore | None = None,
+    actor_lr: float = 1e-3,
     **settings: Any,
 ) -> Train:
     """Makes a small training on one thread; `settings` are those of `TrainSettings`."""
@@ -149,7 +150,7 @@ def make_train(
             seed=seed,
         ),
         replay=TensorDictReplayBuffer(storage=LazyTensorStorage(300)),
-        learner=Learner(loss, actor_lr=1e-3, critic_lr=1e-3, precision="fp32"),
+        learner=Learner(loss, actor_lr=actor_lr, critic_lr=1e-3, precision="fp32"),
         settings=TrainSettings(total_frames=total_frames, **{**defaults, **settings}),
         log=MetricsLog(run_dir),
         progress=Progress(total_frames, every=1e9),

@@ -73,12 +73,23 @@ def test_resume_with_another_number_of_environments_says_so(make_train, tmp_path
 
 def test_resume_takes_a_new_learning_rate(make_train, tmp_path):
     make_train(total_frames=80).run()
-    rest = make_train(total_frames=80)
-    for group in rest.learner.optimizers["actor"].param_groups:
-        group["lr"] = 0.5
+    rest = make_train(total_frames=80, actor_lr=0.5)
     rest.resume(tmp_path / "run")
     assert rest.learner.optimizers["actor"].param_groups[0]["lr"] == 0.5
     assert rest.learner.optimizers["critic"].param_groups[0]["lr"] == 1e-3
+
+
+def test_learning_rates_fall_to_a_tenth_over_the_last_share(make_train, tmp_path):
+    settings = TrainSettings(total_frames=400, anneal=0.25)
+    assert [settings.learning_rate_factor(frames) for frames in (0, 300, 350, 400, 450)] == pytest.approx(
+        [1.0, 1.0, 0.55, 0.1, 0.1]
+    )
+    train = make_train(total_frames=400, anneal=0.25)
+    train.run()
+    assert train.learner.optimizers["actor"].param_groups[0]["lr"] == pytest.approx(1e-4)
+    again = make_train(total_frames=800, anneal=0.25)
+    again.resume(tmp_path / "run")
+    assert again.learner.optimizers["actor"].param_groups[0]["lr"] == pytest.approx(1e-3)
 
 
 @pytest.mark.parametrize("utd_ratio, updates", [(0.0, 0), (0.125, 45), (0.3, 108), (1.0, 360)])
@@ -94,6 +105,11 @@ def test_without_a_ratio_the_learner_fills_the_throttled_time(make_train):
     train.run()
     assert time.monotonic() - start >= 60 / 40 - 0.2
     assert train.learner.updates >= 5  # hundreds on an idle machine
+
+
+def test_the_share_of_annealing_is_a_share():
+    with pytest.raises(ValueError, match="anneal must be between 0 and 1, got 1.5"):
+        TrainSettings(total_frames=10, anneal=1.5)
 
 
 def test_a_ratio_of_none_needs_a_throttle():
