@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
+from itertools import product
 from typing import Any, Protocol
 
 import numpy as np
@@ -72,12 +73,17 @@ class Domain:
         make_reward: `(space, **scales) -> StyleReward`.
         measures: measured style.
         make_renderer: `(width, height) -> Renderer`.
-        grid: values of each style parameter that make up the evaluation grid.
+        grid: values of each style parameter, whose combinations make up the evaluation grid; or its styles one by one,
+            by parameter name, where the combinations are too many.
         control_step: duration of one env step [s].
         episode_steps: length of a full episode.
         columns: metrics of the published table, in order, with the format of their values.
         observation_groups: name and width of each block of the observation, in order, for explanations; without it
             every entry is a group of its own.
+        as_trained: this domain as the settings of a training made it (`env` of its configuration: which machines,
+            which cars); None where trainings do not differ.
+        evaluation: what `coachable evaluate` does instead of running the grid and switched styles, with the arguments
+            of `coachable.evaluation.evaluate.evaluate` but `source`, preceded by the domain and the loaded policy.
     """
 
     name: str
@@ -86,11 +92,19 @@ class Domain:
     make_reward: Callable[..., StyleReward]
     measures: StyleMeasures
     make_renderer: Callable[..., Renderer]
-    grid: Mapping[str, Sequence[Any]]
+    grid: Mapping[str, Sequence[Any]] | Sequence[Mapping[str, Any]]
     control_step: float
     episode_steps: int
     columns: Mapping[str, str] = field(default_factory=dict)
     observation_groups: Sequence[tuple[str, int]] = ()
+    as_trained: Callable[[Mapping[str, Any]], Domain] | None = None
+    evaluation: Callable[..., str] | None = None
+
+    def cells(self) -> list[dict[str, Any]]:
+        """The styles of the evaluation grid, by parameter name."""
+        if isinstance(self.grid, Mapping):
+            return [dict(zip(self.grid, values, strict=True)) for values in product(*self.grid.values())]
+        return [dict(cell) for cell in self.grid]
 
 
 def domain_names() -> list[str]:
@@ -98,12 +112,17 @@ def domain_names() -> list[str]:
     return sorted(_DECLARATIONS)
 
 
-def load_domain(name: str) -> Domain:
+def load_domain(name: str, config: Mapping[str, Any] | None = None) -> Domain:
     """The declaration of a built-in domain.
+
+    Args:
+        name: of the domain.
+        config: of a training; the domain is as it was there.
 
     Raises:
         ValueError: if there is no such domain; lists those that exist.
     """
     if name not in _DECLARATIONS:
         raise ValueError(f"unknown domain {name!r}: expected one of {domain_names()}")
-    return import_module(_DECLARATIONS[name]).DOMAIN
+    domain: Domain = import_module(_DECLARATIONS[name]).DOMAIN
+    return domain if config is None or domain.as_trained is None else domain.as_trained(config.get("env", {}))

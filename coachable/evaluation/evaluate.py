@@ -42,8 +42,10 @@ def evaluate(
     """
     out.mkdir(parents=True, exist_ok=True)
     agent = load_policy(source)
-    domain = load_domain(agent.metadata["domain"])
+    domain = load_domain(agent.metadata["domain"], agent.config)
     options: dict[str, Any] = {"steps": steps, "seed": seed, "num_threads": num_threads, "progress": progress}
+    if domain.evaluation is not None:
+        return domain.evaluation(domain, agent, out, episodes=episodes, switch_episodes=switch_episodes, **options)
     grid = evaluate_grid(domain, agent.actor, agent.space, episodes=episodes, **options)
     switching = evaluate_switching(domain, agent.actor, agent.space, episodes=switch_episodes, **options)
     rows, response = grid.rows(), grid.response(agent.space)
@@ -85,7 +87,7 @@ def _report(
     switch_episodes: int,
 ) -> str:
     known = [f"{agent.metadata[name]:,} {name}" for name in ("frames", "updates") if agent.metadata.get(name)]
-    columns = {name: "" for name in domain.grid} | dict(domain.columns)
+    columns = {name: "" for name in grid.cells[0]} | dict(domain.columns)
     text = f"# {domain.name}: requested and measured style\n\n"
     text += f"Deterministic policy{' after ' + ', '.join(known) if known else ''}; {rows[0]['episodes']} episodes of "
     text += f"{grid.steps} steps per style, seed {grid.seed}.\n\n![style grid](grid.png)\n\n"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,7 +87,7 @@ def evaluate_grid(
     episodes: int = 20,
     steps: int | None = None,
     seed: int = 0,
-    grid: Mapping[str, Sequence[Any]] | None = None,
+    cells: Sequence[Mapping[str, Any]] | None = None,
     num_threads: int | None = None,
     progress: bool = True,
 ) -> StyleGrid:
@@ -101,15 +100,14 @@ def evaluate_grid(
         episodes: per cell.
         steps: length of an episode; default: the domain's.
         seed: of the initial states, the same in every cell.
-        grid: values per style parameter; default: the domain's.
+        cells: styles by parameter name; default: the domain's grid.
         num_threads: physics threads.
         progress: show a bar.
     """
     if episodes < 1:
         raise ValueError(f"episodes per cell must be at least 1, got {episodes}")
     steps = steps or domain.episode_steps
-    grid = domain.grid if grid is None else grid
-    cells = [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
+    cells = domain.cells() if cells is None else [dict(cell) for cell in cells]
     theta = torch.stack([space.make(strict=True, **cell) for cell in cells]).repeat_interleave(episodes, 0)
     env = coachable_env(
         domain.make_env(num_envs=len(theta), num_threads=num_threads), space, domain.make_reward(space), seed=seed

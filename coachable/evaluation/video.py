@@ -59,7 +59,7 @@ def render(
     if out.suffix == ".mp4":
         _import_av()
     agent = load_policy(source)
-    domain = load_domain(agent.metadata["domain"])
+    domain = load_domain(agent.metadata["domain"], agent.config)
     requests = default_tour(agent.space) if styles is None else list(styles)
     period = max(1, round(seconds_per_style / domain.control_step))
     sheet = out.suffix == ".png"

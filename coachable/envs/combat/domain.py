@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from coachable.domain import Domain
 from coachable.envs.combat.constants import CONTROL_STEP, EPISODE_STEPS
 from coachable.envs.combat.env import CombatEnv
+from coachable.envs.combat.evaluation import evaluate_fights, single_styles
 from coachable.envs.combat.features import observation_groups
 from coachable.envs.combat.measures import CombatMeasures
 from coachable.envs.combat.render import CombatRenderer
@@ -20,6 +24,21 @@ def make_combat_env(
     return CombatEnv(num_envs, seed=seed, components=True, **options)
 
 
+def _as_trained(settings: Mapping[str, Any]) -> Domain:
+    """With the machines, styles and observation of a training, and its length of a fight."""
+    options = {name: value for name, value in settings.items() if name not in ("_target_", "num_envs", "components")}
+    styles: Sequence[str] | None = settings.get("styles")
+    return replace(
+        DOMAIN,
+        make_env=partial(make_combat_env, **options),
+        make_space=partial(combat_style_space, styles, settings.get("reward_scale", "sim")),
+        measures=CombatMeasures(styles),
+        grid=single_styles(combat_style_space(styles)),
+        episode_steps=settings.get("episode_steps", EPISODE_STEPS),
+        observation_groups=observation_groups(settings.get("observation", "full")),
+    )
+
+
 DOMAIN = Domain(
     name="combat",
     make_env=make_combat_env,
@@ -27,10 +46,11 @@ DOMAIN = Domain(
     make_reward=combat_style_reward,
     measures=CombatMeasures(),
     make_renderer=CombatRenderer,
-    # One style at a time is 20 cells, the product of 18 weights 2^18: the damage matrix is an evaluation of its own.
-    grid={"skykiller": (-0.3, 0.0, 0.3)},
+    grid=single_styles(combat_style_space()),
     control_step=CONTROL_STEP,
     episode_steps=EPISODE_STEPS,
     columns={"won": ".0%", "damage": ".0f", "style_score": ".2f"},
     observation_groups=observation_groups("full"),
+    as_trained=_as_trained,
+    evaluation=evaluate_fights,
 )

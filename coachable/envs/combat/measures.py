@@ -11,6 +11,7 @@ from torch import Tensor
 from coachable.envs.combat.env import COMPONENTS_KEY
 from coachable.envs.combat.rewards import COMPONENT_SLICES, style_counts
 from coachable.envs.combat.styles import check_styles, combat_style_space
+from coachable.envs.combat.tables import STYLES
 from coachable.keys import STYLE
 
 
@@ -26,21 +27,26 @@ class CombatMeasures:
     def __init__(self, styles: Sequence[str] | None = None) -> None:
         self.styles = check_styles(styles)
         self._high = combat_style_space(self.styles).high
-        self._counts = style_counts(self.styles)  # (styles, 44)
+        self._rows = torch.tensor([STYLES.index(name) for name in self.styles])
+        self._counts = style_counts(STYLES)  # (18, 44)
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
-        """See `StyleMeasures.step`: HP of damage per style (units for parts), all damage, and the share asked for."""
+        """See `StyleMeasures.step`.
+
+        HP of damage that counts for each of the 18 styles (units for parts), all damage, and how much counts for the
+        style that theta asks for most.
+        """
         components = transition.get(("next", COMPONENTS_KEY))
-        counted = components @ self._counts.T.to(components.device)  # (N, styles)
+        counted = components @ self._counts.T.to(components.device)  # (N, 18)
         wanted = transition.get(STYLE) / self._high.to(components.device)
         strongest, index = wanted.max(-1)
         damage = components[:, COMPONENT_SLICES["damage"]][:, 0]
-        asked = counted.gather(-1, index.unsqueeze(-1))[:, 0]
+        asked = counted.gather(-1, self._rows.to(index.device)[index].unsqueeze(-1))[:, 0]
         death, outside = (components[:, COMPONENT_SLICES[name]][:, 0] for name in ("death", "out_of_bounds"))
         terminated = transition.get(("next", "terminated"))[:, 0].float()
         return {
             "damage": damage,
-            **dict(zip(self.styles, counted.unbind(-1), strict=True)),
+            **dict(zip(STYLES, counted.unbind(-1), strict=True)),
             "requested": torch.where(strongest > 0, asked, torch.nan),
             "died": death,
             "out_of_bounds": outside,

@@ -1,10 +1,14 @@
 """The declaration of the domain: measures add up, pictures are drawn."""
 
+import csv
+
 import numpy as np
 import pytest
 import torch
 
+from coachable.domain import load_domain
 from coachable.envs.combat.domain import DOMAIN
+from coachable.envs.combat.evaluation import evaluate_fights, style_label
 from coachable.envs.combat.tables import STYLES
 from coachable.transforms import coachable_env
 
@@ -46,3 +50,45 @@ def test_pictures_show_the_fight(options):
     assert image.shape == (240, 320, 3)
     assert image.dtype == np.uint8
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 5
+
+
+def test_the_domain_is_as_it_was_trained():
+    settings = {"_target_": "x", "num_envs": 128, "machines": ["Scrounger"], "styles": ["melee", "skykiller"]}
+    domain = load_domain("combat", {"env": {**settings, "observation": "small", "episode_steps": 20, "traps": 0}})
+    assert domain.make_space().names == ("melee", "skykiller")
+    assert [style_label(cell) for cell in domain.cells()] == ["default", "melee", "skykiller", "no skykiller"]
+    env = domain.make_env(num_envs=3, seed=0)
+    assert (env.observation, env.episode_steps, env.batch_size) == ("small", 20, (3,))
+    assert sum(width for _, width in domain.observation_groups) == env.reset()["observation"].shape[-1]
+
+
+class _Idle:
+    """An agent that presses nothing, with what `evaluate_fights` reads of one."""
+
+    def __init__(self, space):
+        self.space, self.config, self.metadata = space, {"env": {"machines": ["Scrounger", "Burrower"]}}, {"updates": 5}
+
+    def actor(self, tensordict):
+        action = torch.zeros(*tensordict.batch_size, 24)
+        action[:, [0, 4, 10, 13, 16, 18]] = 1.0
+        return tensordict.set("action", action)
+
+
+def test_fights_are_counted_by_style_and_machine(tmp_path):
+    domain = load_domain(
+        "combat", {"env": {"styles": ["melee", "corrosive_blastsling", "acid"], "observation": "small", "traps": 0}}
+    )
+    agent = _Idle(domain.make_space())
+    report = evaluate_fights(domain, agent, tmp_path, episodes=2, steps=30, progress=False)
+    again = evaluate_fights(domain, agent, tmp_path / "again", episodes=2, steps=30, progress=False)
+    assert report == again and (tmp_path / "report.md").read_text() == report
+    styles = ["default", "melee", "corrosive_blastsling", "acid", "corrosive_blastsling + acid"]
+    for name in ("damage", "wins", "outcomes", "sweep"):
+        rows = list(csv.DictReader((tmp_path / f"{name}.csv").read_text().splitlines()))
+        if name in ("damage", "wins"):
+            assert [row["style"] for row in rows] == styles
+        if name == "outcomes":
+            assert [sum(int(row[key]) for key in row if key != "machine") for row in rows] == [10, 10]
+    assert (tmp_path / "damage.png").stat().st_size > 5_000 and (tmp_path / "sweep.png").stat().st_size > 5_000
+    with pytest.raises(ValueError, match="episodes per style and machine must be at least 1, got 0"):
+        evaluate_fights(domain, agent, tmp_path, episodes=0)
