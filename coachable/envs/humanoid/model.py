@@ -8,10 +8,10 @@ our features need and every force switched off, so that one cheap step of it rea
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.resources import files
 
 import mujoco
 import numpy as np
-from dm_control.suite import humanoid as suite_humanoid
 
 PHYSICS_STEP = 0.005  # [s], as in the suite
 PHYSICS_STEPS_PER_CONTROL = 5
@@ -41,6 +41,8 @@ _FOOT_CAPSULES = {
 }
 FOOT_RADIUS = 0.027  # [m]
 
+_INCLUDES = ("materials", "skybox", "visual")
+
 _FULL_PHYSICS = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 
 
@@ -69,11 +71,11 @@ class HumanoidModel:
 
 def load_spec() -> mujoco.MjSpec:
     """The suite's humanoid as an editable specification."""
-    xml, assets = suite_humanoid.get_model_and_assets()
+    suite = files("dm_control") / "suite"  # read as files: importing the suite loads every task and SciPy
+    common = {f"common/{name}.xml": (suite / "common" / f"{name}.xml").read_bytes() for name in _INCLUDES}
     # dm_control prefixes its includes with "./", which MjSpec does not resolve.
-    text = (xml.decode() if isinstance(xml, bytes) else xml).replace('"./common/', '"common/')
-    include = {name.removeprefix("./"): data for name, data in assets.items()}
-    return mujoco.MjSpec.from_string(text, include=include)
+    text = (suite / "humanoid.xml").read_text().replace('"./common/', '"common/')
+    return mujoco.MjSpec.from_string(text, include=common)
 
 
 def build_model() -> HumanoidModel:
