@@ -77,9 +77,11 @@ class ActorCriticLoss(SACLoss):
         if reduction not in ("none", "mean", "sum"):
             raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
         policy = PolicyReader(actor_network, name, continuous_only=self._continuous_only, action_spec=action_spec)
+        # TorchRL makes buffers of a list of one, and draws new weights for a critic on its own: these are put back.
+        single = TensorDict.from_module(critics[0]).data.clone() if len(critics) == 1 else None
         super().__init__(
             actor_network,
-            critics,  # pyright: ignore[reportArgumentType]  # documented as a list too
+            critics if single is None else critics[0],  # pyright: ignore[reportArgumentType]  # documented as a list too
             num_qvalue_nets=num_qvalue_nets,
             loss_function="l2",
             alpha_init=alpha,
@@ -90,6 +92,9 @@ class ActorCriticLoss(SACLoss):
             use_prioritized_weights=use_prioritized_weights,
             scalar_output_mode="exclude",
         )
+        if single is not None:
+            for params in (self.qvalue_network_params, self.target_qvalue_network_params):
+                cast(TensorDictBase, params).data.copy_(single.unsqueeze(0))
         # In float64, as gamma: float64 losses see the rounding, and a 0-dim number does not widen float32 tensors.
         self.log_alpha = torch.tensor(math.log(alpha), dtype=torch.float64, device=cast(Tensor, self.log_alpha).device)
         self._policy = policy  # no submodule: the parameters are those of actor_network_params

@@ -507,10 +507,14 @@ def test_a_single_critic() -> None:
     actor = make_mixed_actor(OBS, AXES, PlainSpace(), (8,))
     with pytest.raises(ValueError, match="num_qvalue_nets=2"):
         RACLoss(actor, critic)
-    loss = RACLoss(actor, critic, num_qvalue_nets=1)
-    weight = critic.module.trunk.head.weight  # Glorot weights, not resampled
-    assert torch.equal(loss.qvalue_network_params["module", "trunk", "head", "weight"][0], weight)
-    assert loss(make_batch(AXES))["loss_qvalue"].isfinite()
+    weight = critic.module.trunk.head.weight.detach().clone()
+    loss = RACLoss(actor, [critic], num_qvalue_nets=1)
+    for params in (loss.qvalue_network_params, loss.target_qvalue_network_params):
+        assert torch.equal(params["module", "trunk", "head", "weight"][0], weight)  # not drawn again
+    loss(make_batch(AXES))["loss_qvalue"].backward()
+    critics = [p for name, p in loss.named_parameters() if name.startswith("qvalue_network_params")]
+    assert len(critics) == len(list(critic.parameters()))
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in critics)
 
 
 @pytest.mark.parametrize("arguments", [{"lmbda": 0.9}, {"average_rewards": True}])
