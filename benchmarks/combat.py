@@ -1,20 +1,27 @@
 """Combat env steps per second for several batch sizes, split by phase.
 
     python benchmarks/combat.py --envs 64 512 2048 8192 16384
+    python benchmarks/combat.py --envs 2048 --side-by-side 2 --peers .venv-bench/bin/python
 
 Every fight acts at random; finished fights are reset; observations, rewards, features, events and TensorDict included.
-Both clocks are given: on a busy machine the wall clock measures the neighbours.
+Both clocks are given: on a busy machine the wall clock measures the neighbours. `--side-by-side 2` steps 2048 fights in
+each of two processes at once; `--peers` names an interpreter with vizdoom, which plays in turn with ours.
 """
 
 import argparse
 import json
 import resource
+import statistics
+import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import torch
+from combat_workers import FIGHTS
+from contest import Worker, measure
 
 from coachable.envs.combat import CombatEnv, env, fight, frame
 
@@ -91,6 +98,27 @@ def split(num_envs: int, steps: int) -> dict[str, float]:
     return {name: 1e3 * seconds / steps for name, seconds in total.items()}
 
 
+def side_by_side(processes: int, steps: int) -> float:
+    """Steps per second (wall) of so many processes that run at once."""
+    workers = [Worker("combat_workers.py", "coachable", sys.executable, threads=1) for _ in range(processes)]
+    if not all([worker.ready() for worker in workers]):
+        raise SystemExit("a process could not be set up")
+    with ThreadPoolExecutor(processes) as pool:
+        seconds = max(taken["wall"] for taken in pool.map(lambda worker: worker.run(steps), workers))
+    for worker in workers:
+        worker.close()
+    return processes * FIGHTS * steps / seconds
+
+
+def beside_doom(peers: str, steps: int) -> dict[str, float]:
+    """Steps per second (wall) of one process of each, in turn, median of five rounds."""
+    pythons = {"coachable": sys.executable, "vizdoom": peers}
+    workers = [Worker("combat_workers.py", name, python, threads=1) for name, python in pythons.items()]
+    times = measure(workers, 5, {"coachable": steps, "vizdoom": 20 * steps})
+    rows = {"coachable": FIGHTS, "vizdoom": 1}
+    return {name: rows[name] / statistics.median(t["wall"] for t in rounds) for name, rounds in times.items()}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--envs", type=int, nargs="+", default=[64, 512, 2048, 8192, 16384])
@@ -98,6 +126,8 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--split", type=int, default=2048, help="batch size whose phases are timed, 0 for none")
+    parser.add_argument("--side-by-side", type=int, default=0, metavar="PROCESSES", help="0 for none")
+    parser.add_argument("--peers", help="interpreter with vizdoom")
     parser.add_argument("--json", type=Path, help="where to write the numbers")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
@@ -112,8 +142,16 @@ def main() -> None:
     for name, milliseconds in sorted(phases.items(), key=lambda item: -item[1]):
         print(f"{name:>16} {milliseconds:8.2f} ms")
     print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
+    found: dict[str, Any] = {"rows": rows, "phases": phases}
+    if args.side_by_side:
+        found["side_by_side"] = side_by_side(args.side_by_side, args.steps)
+        print(f"{args.side_by_side} processes at once: {found['side_by_side']:,.0f} steps/s")
+    if args.peers:
+        found["beside_doom"] = beside_doom(args.peers, args.steps)
+        for name, rate in found["beside_doom"].items():
+            print(f"{name}, one process: {rate:,.0f} steps/s")
     if args.json:
-        args.json.write_text(json.dumps({"rows": rows, "phases": phases}))
+        args.json.write_text(json.dumps(found))
 
 
 if __name__ == "__main__":
