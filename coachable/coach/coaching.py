@@ -111,7 +111,71 @@ _COACHING = {
             "victory lap": {"pose": "arms_up", "step_length": 0.60},
         },
         terminated="fell",
-    )
+    ),
+    "combat": Coaching(
+        vocabulary={
+            "melee": ("spear", "close combat", "hand to hand"),
+            "traps": ("tripwire", "ambush"),
+            "part_weapon": ("break weapon", "destroy weapon", "tear off weapon", "disarm"),
+            "part_canister": ("break canister", "destroy canister", "tear off canister"),
+            "part_shield": ("break shield", "destroy shield", "tear off shield", "armour", "armor"),
+            "acid": ("corrode", "corrosion"),
+            "purgewater": ("drench", "water"),
+            "frost": ("freeze", "ice"),
+            "shock": ("stun", "electrify"),
+            "fire": ("burn", "ignite", "set on fire"),
+            "adhesive": ("glue", "slow it", "slow down"),
+        },
+        presets={
+            "spear fighter": {"melee": 1.1},
+            "archer": {"sunscourge": 1.6, "carjas_bane": 1.0},
+            "trapper": {"traps": 0.15},
+            "arsonist": {"fire": 4.5},
+            "scavenger": {"part_weapon": 1.0, "part_canister": 1.0, "part_shield": 1.0},
+        },
+        terminated="ended the fight",
+    ),
+    "racing_drift": Coaching(
+        vocabulary={
+            "slip_angle_rear": ("drift", "drifting", "slide", "sliding", "sideway", "oversteer"),
+            "slip_angle_rear=low": ("grip", "grippy", "tidy"),
+            "slip_angle_front": ("understeer", "plough"),
+            "slip_ratio_rear": ("wheelspin", "burnout", "spin wheel", "spin the rear wheel"),
+            "slip_ratio_front": ("lock wheel", "lock the front wheel"),
+        },
+        presets={
+            "drift": {"slip_angle_rear": 5.0},
+            "grip": {"slip_angle_front": -0.4, "slip_angle_rear": -0.4},
+        },
+        terminated="retired",
+    ),
+    "racing_resources": Coaching(
+        vocabulary={
+            "tire": ("tyre", "rubber", "save tyre", "tyre saving", "spare tyre", "nurse tyre"),
+            "fuel": ("petrol", "gas", "save fuel", "fuel saving", "lift and coast"),
+            "tire=0": ("burn tyre", "waste tyre", "ignore tyre"),
+            "fuel=0": ("burn fuel", "waste fuel", "ignore fuel"),
+            "overtake": ("attack", "pass"),
+            "defend": ("block",),
+        },
+        presets={
+            "flat out": {"tire": 0.0, "fuel": 0.0},
+            "save tyres": {"tire": 12000.0},
+            "save fuel": {"fuel": 105.0},
+        },
+        terminated="retired",
+    ),
+    "racing_aggressiveness": Coaching(
+        vocabulary={
+            "longitudinal": ("following distance", "distance behind", "distance ahead"),
+            "lateral": ("distance beside", "distance at side", "elbow room"),
+        },
+        presets={
+            "door to door": {"longitudinal": 0.0, "lateral": 0.0},
+            "room to breathe": {"longitudinal": 2.0, "lateral": 1.0},
+        },
+        terminated="retired",
+    ),
 }
 
 

@@ -80,7 +80,7 @@ def metadata_of(agent: LoadedPolicy, plain: DeterministicAction) -> dict[str, st
         "updates": agent.metadata["updates"],
     }
     if domain in domain_names():
-        declaration = load_domain(domain)
+        declaration = load_domain(domain, agent.config)
         known["control_step"] = declaration.control_step  # [s]
         known["observation_groups"] = json.dumps(list(declaration.observation_groups))
     if plain.choice_sizes:

@@ -116,8 +116,7 @@ class StyleGrammar:
             reading.failed.append(f"'{phrase.strip()}'" if phrase.strip() else "an empty phrase")
         for segment in split:
             if segment.default and not segment.unknown and not segment.mentions:
-                for name, parameter in self.parameters.items():
-                    self._change(reading, name, cast(Value, parameter.default))
+                self._reset(reading)
             else:
                 self._interpret(segment, reading)
         reading.failed += [text for name, text in reading.excluded.items() if name not in reading.changes]
@@ -246,6 +245,14 @@ class StyleGrammar:
             return fitting[0], ""
         return None, f" (of what: {_listed(fitting)}?)"
 
+    def _reset(self, reading: _Reading) -> None:
+        defaults = {name: cast(Value, parameter.default) for name, parameter in self.parameters.items()}
+        changed = [name for name, value in defaults.items() if reading.values[name] != value]
+        for name in changed:
+            self._change(reading, name, defaults[name])
+        if not changed:
+            reading.said.append("everything stays at its default")
+
     # -- echo ------------------------------------------------------------------------------------------------------
 
     def _change(self, reading: _Reading, name: str, value: Value) -> None:
@@ -262,9 +269,8 @@ class StyleGrammar:
         if value == before:
             reading.said.append(f"{_words(name)} stays {_shown(parameter, value)}")
             return
-        number = isinstance(before, float)
-        was = f"{before:.3g}" if number else _shown(parameter, before)
-        outside = number and not parameter.low <= float(value) <= parameter.high
+        was = readable_number(before) if isinstance(before, float) else _shown(parameter, before)
+        outside = isinstance(before, float) and not parameter.low <= float(value) <= parameter.high
         trained = f", outside the trained range {parameter.low:g} to {parameter.high:g}" if outside else ""
         reading.said.append(f"{_words(name)} {was} → {_shown(parameter, value)}{trained}")
         reading.values[name] = reading.changes[name] = value
@@ -286,4 +292,9 @@ def _listed(names: Sequence[str]) -> str:
 def _shown(parameter: Parameter, value: Value) -> str:
     if isinstance(value, str):
         return _words(value)
-    return f"{value:.3g} {parameter.unit}".rstrip()
+    return f"{readable_number(value)} {parameter.unit}".rstrip()
+
+
+def readable_number(value: float) -> str:
+    """Three digits, however large."""
+    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"

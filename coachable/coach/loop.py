@@ -81,8 +81,9 @@ class LiveLoop:
                 due = now
                 self._steps.clear()
             elif now >= due:
-                changed |= self._attempt(lambda session: session.step())
+                self._attempt(lambda session: session.step())
                 due = self._next(due, now)
+                changed = True  # a step that failed has something to show as well
             if changed:
                 self._attempt(lambda _: self.on_step(), pause=False)  # what is shown may fail, the agent goes on
             time.sleep(_IDLE if self.paused else min(_IDLE, max(0.0, due - time.perf_counter())))
@@ -104,12 +105,10 @@ class LiveLoop:
             changed = True
         return changed
 
-    def _attempt(self, change: Callable[[CoachSession], Any], pause: bool = True) -> bool:
-        """Whether it went well; a refused change leaves the agent acting, a failed step pauses it."""
+    def _attempt(self, change: Callable[[CoachSession], Any], pause: bool = True) -> None:
+        """A refused change leaves the agent acting, a failed step pauses it."""
         try:
             change(self.session)
         except Exception as error:  # whatever it is, the page must show it and stay alive
             self.problem = f"{error}" or type(error).__name__
             self.paused = self.paused or pause
-            return False
-        return True

@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coachable.coach.film import film
+from coachable.coach.grammar import readable_number
 from coachable.coach.loop import LiveLoop
 from coachable.coach.plan import read_plan
 from coachable.coach.recording import Recording
 from coachable.coach.report import StyleReport, measures_by_parameter
 from coachable.coach.session import CoachSession
 from coachable.coach.views import View, make_view
-from coachable.coach.widgets import Chart, MeasuredText, ParameterWidget, number, write
+from coachable.coach.widgets import Chart, MeasuredText, ParameterWidget, write
 from coachable.styles import Parameter
 
 if TYPE_CHECKING:
@@ -210,16 +211,17 @@ class CoachPage:
 
     def _on_step(self) -> None:
         now = time.perf_counter()
-        if self._view is None:
-            self._view = make_view(self.server, self.session)
-        if now >= self._frame_due or self.loop.paused:
-            self._frame_due = now + 1.0 / _FRAMES_PER_SECOND
-            self._view.update()
         for name, value in (self.session.style | self.session.controls).items():
             self.widgets[name].follow(value)
         if now >= self._report_due or self.loop.paused or self.session.ended is not None:
             self._report_due = now + 1.0 / _REPORTS_PER_SECOND
             self._show(self.session.report())
+        # Last, so that a view that fails leaves the read-outs, which say so.
+        if self._view is None:
+            self._view = make_view(self.server, self.session)
+        if now >= self._frame_due or self.loop.paused:
+            self._frame_due = now + 1.0 / _FRAMES_PER_SECOND
+            self._view.update()
 
     def _show(self, report: StyleReport) -> None:
         with self.server.atomic():
@@ -230,7 +232,7 @@ class CoachPage:
             groups = measures_by_parameter(self.session.space, report.measured)
             for name, text in self.measured.items():
                 text.update(report, groups[name])
-            others = ", ".join(f"{m.replace('_', ' ')} **{number(report.measured[m])}**" for m in groups[""])
+            others = ", ".join(f"{m.replace('_', ' ')} **{readable_number(report.measured[m])}**" for m in groups[""])
             write(self.others, f"also measured: {others}" if others else "")
             self.chart.add(self.session.step_count * self.session.domain.control_step, report)
 

@@ -102,7 +102,8 @@ class CoachSession:
             CheckpointError: if there is no such agent, or it is of another version.
         """
         agent = load_policy(source)
-        return cls(agent.actor, agent.space, load_domain(agent.metadata["domain"]), source=str(source), **settings)
+        domain = load_domain(agent.metadata["domain"], agent.config)
+        return cls(agent.actor, agent.space, domain, source=str(source), **settings)
 
     # -- requests --------------------------------------------------------------------------------------------------
 

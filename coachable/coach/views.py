@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import viser
 
 _PICTURES_PER_SECOND = 12.0
+_DRAWING_SHARE = 0.3  # of the loop's time, at most: the agent acts in the rest
 _PICTURE_SIZE = (800, 600)  # [px]
 _BORDER = 235  # grey
 
@@ -80,7 +81,7 @@ class HumanoidView:
 
 
 class PictureView:
-    """The domain's renderer as the background of the page, drawn only while somebody looks."""
+    """The domain's renderer as the background of the page, drawn only while somebody looks, slow ones less often."""
 
     def __init__(self, server: viser.ViserServer, session: CoachSession) -> None:
         self._server, self._session = server, session
@@ -92,10 +93,11 @@ class PictureView:
         now, clients = time.perf_counter(), self._server.get_clients()
         if now < self._due or not clients:
             return
-        self._due = now + 1.0 / _PICTURES_PER_SECOND
         picture = self._renderer.draw(self._session.env)
         for client in clients.values():
             client.scene.set_background_image(padded(picture, client.camera.aspect), format="jpeg", jpeg_quality=85)
+        taken = time.perf_counter() - now
+        self._due = now + max(1.0 / _PICTURES_PER_SECOND, taken / _DRAWING_SHARE)
 
     def close(self) -> None:
         """See `View.close`."""

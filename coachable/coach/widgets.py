@@ -9,14 +9,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from coachable.coach.grammar import readable_number
 from coachable.coach.report import StyleReport, measures_by_parameter
-from coachable.styles import Choice, Parameter, StyleSpace
+from coachable.styles import Choice, Parameter, StyleSpace, Weight
 
 if TYPE_CHECKING:
     import viser
 
 _SLIDER_STEPS = 200
 _HISTORY = 150  # points of the chart
+_REQUESTED, _MEASURED = "#d62728", "#1f77b4"
 
 
 class ParameterWidget:
@@ -85,7 +87,7 @@ class MeasuredText:
 
     def update(self, report: StyleReport, measures: list[str]) -> None:
         """Shows the report's values of `measures`."""
-        shown = [f"{self._name(m)}**{number(report.measured[m])}{self._unit(m)}**" for m in measures]
+        shown = [f"{self._name(m)}**{readable_number(report.measured[m])}{self._unit(m)}**" for m in measures]
         text = " · ".join(filter(None, [f"measured {', '.join(shown)}" if shown else "", trained(self.parameter)]))
         outside = report.outside.get(self.parameter.name)
         if outside is not None:
@@ -106,24 +108,36 @@ class Chart:
     """Requested against measured over the last seconds, of one parameter at a time."""
 
     def __init__(self, server: viser.ViserServer, space: StyleSpace) -> None:
-        import viser.uplot as uplot
-
         self._space = space
         self._history: deque[tuple[float, StyleReport]] = deque(maxlen=_HISTORY)
         self._names = {_words(name): name for name in space.names}
         numeric = [_words(p.name) for p in space.parameters if not isinstance(p, Choice)]
         self.choice = server.gui.add_dropdown("show", list(self._names), initial_value=[*numeric, *self._names][0])
-        self.plot = server.gui.add_uplot(
-            data=(np.zeros(1), np.zeros(1), np.zeros(1)),
-            series=(
+        self.plot = server.gui.add_uplot(data=(np.zeros(1), np.zeros(1), np.zeros(1)), height=190, **self._layout())
+        self.choice.on_update(lambda _: self._lay_out())
+
+    def _layout(self) -> dict[str, Any]:
+        """Of the chosen parameter: a weight and what it brings about have no common unit, hence an axis each."""
+        import viser.uplot as uplot
+
+        apart = isinstance(self._space[self._names[self.choice.value]], Weight)
+        scale = "measured" if apart else "y"
+        axes = [uplot.Axis(size=34), uplot.Axis(size=48)]
+        if apart:
+            axes.append(uplot.Axis(scale=scale, side=1, size=56, stroke=_MEASURED, grid=uplot.Axis_Grid(show=False)))
+        return {
+            "series": (
                 uplot.Series(label="time [s]"),
-                uplot.Series(label="requested", stroke="#d62728", width=2),
-                uplot.Series(label="measured", stroke="#1f77b4", width=2),
+                uplot.Series(label="requested", stroke=_REQUESTED, width=2),
+                uplot.Series(label="measured (right)" if apart else "measured", stroke=_MEASURED, width=2, scale=scale),
             ),
-            scales={"x": uplot.Scale(time=False)},
-            axes=(uplot.Axis(size=34), uplot.Axis(size=48)),
-            height=190,
-        )
+            "scales": {"x": uplot.Scale(time=False)},
+            "axes": tuple(axes),
+        }
+
+    def _lay_out(self) -> None:
+        for name, value in self._layout().items():
+            setattr(self.plot, name, value)
 
     def add(self, time: float, report: StyleReport) -> None:
         """A further point."""
@@ -165,11 +179,6 @@ def trained(parameter: Parameter) -> str:
     if isinstance(parameter, Choice):
         return ""
     return f"trained {parameter.low:g} to {parameter.high:g} {parameter.unit}".rstrip()
-
-
-def number(value: float) -> str:
-    """Three digits, however large."""
-    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
 
 
 def _words(name: str) -> str:

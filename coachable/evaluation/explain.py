@@ -64,7 +64,7 @@ def explain(
     """
     import_captum()
     agent = load_policy(source)
-    domain = load_domain(agent.metadata["domain"])
+    domain = load_domain(agent.metadata["domain"], agent.config)
     outputs = ActionOutputs(agent.actor).eval()
     groups = input_groups(domain, agent.space, outputs.observation_dim)
     trajectories = record_states(

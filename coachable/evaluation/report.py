@@ -51,7 +51,7 @@ def report(sources: Sequence[str | Path], out: Path, **settings: Any) -> str:
         if not same:
             differences = " ".join(first.space.difference(agent.space)) or "they belong to different domains."
             raise ValueError(f"{source} cannot share a report with {sources[0]}: {differences}")
-    domain = load_domain(first.metadata["domain"])
+    domain = load_domain(first.metadata["domain"], first.config)
     return write_report(domain, dict(zip(map(str, sources), agents, strict=True)), out, **settings)
 
 

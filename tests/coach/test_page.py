@@ -189,10 +189,32 @@ def test_a_failing_step_pauses_and_says_so(page):
     def broken(transition):
         raise RuntimeError("a wheel came off")
 
+    do(page)
     page.session.policy = broken
-    page._press("Resume")
-    wait_for(lambda: page.loop.paused)
+    page.loop.paused = False  # as when the very first step fails: nobody presses anything
     wait_for(lambda: "a wheel came off" in page.status.content)
+    assert page.loop.paused
+
+
+def test_a_failing_view_leaves_the_read_outs(page, monkeypatch):
+    def torn():
+        raise RuntimeError("the canvas is torn")
+
+    do(page)
+    monkeypatch.setattr(page._view, "update", torn)
+    page._press("Resume")
+    wait_for(lambda: "the canvas is torn" in page.status.content)
+    count = page.session.step_count
+    wait_for(lambda: page.session.step_count > count)
+
+
+def test_a_weight_and_what_it_brings_about_have_an_axis_each(page):
+    assert page.chart.choice.value == "target" and len(page.chart.plot.axes) == 2
+    page.chart.choice.value = "fire"
+    wait_for(lambda: len(page.chart.plot.axes) == 3)
+    assert page.chart.plot.series[2]["label"] == "measured (right)"
+    page.chart.choice.value = "target"
+    wait_for(lambda: len(page.chart.plot.axes) == 2)
 
 
 def test_the_server_listens_on_this_machine_and_leaves_a_port_that_is_in_use(server):
