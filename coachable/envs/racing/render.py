@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from coachable.envs.racing.env import RacingEnv
 
 VIEW = 60.0  # [m] from the car to the left and right border of the picture
+_GRASS = "#7ba05b"
 _CAR_COLOURS = ("#d62728", "#1f77b4", "#ff7f0e", "#9467bd", "#17becf")
 
 
@@ -28,7 +29,7 @@ class RacingRenderer:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
-        self._figure = Figure(figsize=(width / 100, height / 100), dpi=100)
+        self._figure = Figure(figsize=(width / 100, height / 100), dpi=100, facecolor=_GRASS)
         self._canvas = FigureCanvasAgg(self._figure)
         self._view = VIEW, VIEW * height / width
 
@@ -42,7 +43,7 @@ class RacingRenderer:
             env = cast(EnvBase, env.base_env)
         state = env.state.cpu().numpy()
         self._figure.clear()
-        axes = self._figure.add_axes((0, 0, 1, 1), facecolor="#7ba05b")
+        axes = self._figure.add_axes((0, 0, 1, 1), facecolor=_GRASS)
         x, y = state[ROW["x"], row], state[ROW["y"], row]
         self._road(axes, env, x, y)
         for car, column in enumerate(_mates(env, row)):
