@@ -129,9 +129,7 @@ class CoachSession:
         """
         theta = self.space.make(strict=self.strict, **(self.style | values))
         self._timeline.take_over()
-        outside = {name: value for name, value in values.items() if self._is_outside(name, value)}
-        self._outside = {k: v for k, v in self._outside.items() if k not in values} | cast(dict[str, float], outside)
-        self._request(theta)
+        self._request(theta, values)
 
     def apply(self, preset: str) -> None:
         """Asks for a preset.
@@ -333,8 +331,7 @@ class CoachSession:
     def _apply(self, event: Mapping[str, Any]) -> None:
         """Carries out an event now, and records it."""
         if "style" in event:
-            self._outside = {name: v for name, v in self._outside.items() if name not in event["style"]}
-            self._request(self.space.make(**(self.style | event["style"])))
+            self._request(self.space.make(**(self.style | event["style"])), event["style"])
         if "controls" in event:
             self._control_values |= event["controls"]
             self._steer_env()
@@ -343,7 +340,9 @@ class CoachSession:
             self._timeline.note({"reset": True})
             self._begin_episode()
 
-    def _request(self, theta: Tensor) -> None:
+    def _request(self, theta: Tensor, asked: Mapping[str, Any]) -> None:
+        """Puts a style in force; `asked` is what led to it, perhaps beyond the trained range."""
+        self._outside = {name: v for name, v in {**self._outside, **asked}.items() if self._is_outside(name, v)}
         before = self.style
         self._theta = theta
         changed = {name: value for name, value in self.style.items() if value != before[name]}
@@ -354,7 +353,8 @@ class CoachSession:
     def _begin_episode(self) -> None:
         # The first episode has the style that was asked for, and a replay those that were drawn.
         if not self.hold and self._episodes.number and not self.replaying:
-            self._request(self.space.sample((), self._generator))
+            drawn = self.space.sample((), self._generator)
+            self._request(drawn, self.space.describe(drawn))
         self._episodes.begin(self._theta)
         self._recent.clear()
 

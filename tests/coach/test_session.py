@@ -49,6 +49,14 @@ def test_outside_the_trained_range_is_clamped_with_a_warning_and_flagged(session
     assert session.report().outside == {}
 
 
+def test_a_drawn_style_is_within_the_trained_range(session):
+    with pytest.warns(StyleRangeWarning):
+        session.set(target=1.5)
+    session.hold = False
+    session.reset()
+    assert session.report().outside == {}
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [
