@@ -9,25 +9,36 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from coachable.envs.racing.dynamics import total_mass
 from coachable.envs.racing.parameters import Car
 from coachable.envs.racing.profile import Envelope, speed_profile
-from coachable.envs.racing.run import Run, look_around, tyre_view
+from coachable.envs.racing.run import Run, TyreView, look_around, tyre_view
 from coachable.envs.racing.state import CarState
 from coachable.envs.racing.track import Track
+from coachable.envs.racing.tyres import tangent
 
 if TYPE_CHECKING:
     from coachable.envs.racing.env import RacingEnv
 
-_PREVIEW = (5.0, 0.5)  # [m] and [s], distance at which it aims: well beyond the lag of the steering
-_YAW_DAMPING = 0.04  # [s]
-_SLIDE, _COUNTER_STEER = 0.05, 1.0  # [rad] of body slip that is no slide yet, and steering per radian beyond
-_REACTION = 0.12  # [s], looked ahead in the speed profile
-_FOLLOWING = 0.35  # [s], time gap to a car ahead in the same lane
+_PREVIEW = (5.0, 0.4)  # [m] and [s], distance at which it aims
+_LAG = 0.1  # [s], until a steering command is carried out
+_YAW_TIME = 0.3  # [s], in which it corrects its yaw rate
+_FRONT_MAX = 0.97  # of the front tyres' grip that it steers for
+_PEDAL_TIME = 0.4  # [s], in which it corrects its speed
+_REACTION = 0.1  # [s], looked ahead in the speed profile: one control step
+_GAP_TIME = 0.35  # [s], to a car ahead in the same lane
+_BRAKING = 0.75  # of the friction: with fixed brake shares the rear wheels lock first
 _LANE = 2.2  # [m]
+_LOST_SPEED = 14.0  # [m/s], off the road or across it
 
 
 class LineFollower:
     """Aims at a point ahead on its line and keeps to a speed profile; slows down behind others.
+
+    It asks of the front tyres the slip angle that the wanted lateral force needs, counted from the direction in which
+    the front axle moves: that steers into slides by itself. Pedals follow the accelerations of the profile, as far as
+    the tyres' combined slip allows. It feels the grip of its tyres, and slows down where there is less than the profile
+    counts on.
 
     Args:
         track: circuit.
@@ -57,54 +68,73 @@ class LineFollower:
             raise ValueError(f"grip is {grip}: expected a share of the tyres' grip, such as 0.9")
         curvature, spacing = line_geometry(track, line)
         self.line = torch.as_tensor(np.zeros(len(track.table)) if line is None else line, dtype=torch.float32)
-        profile = speed_profile(Envelope(car, grip=grip), curvature, spacing)
+        envelope = Envelope(car, grip=grip, braking=_BRAKING)
+        profile = speed_profile(envelope, curvature, spacing)
+        gain = (np.roll(profile, -1) ** 2 - profile**2) / (2 * spacing) + envelope.drag(profile)
         self.speeds = torch.as_tensor(profile, dtype=torch.float32)
-        self.base = float(car.front_axle + car.rear_axle)
-        self.steer_max, self.peak = float(car.steer_max), float(car.peak_slip_ratio)
-        self.lanes = lanes
+        self.gains = torch.as_tensor(gain, dtype=torch.float32)  # acceleration that engine or brakes must provide
+        self.car, self.lanes = car, lanes
+        # How far the tyre curve of `slip_curve` is inverted: force share sin(C atan(B ρ)), ρ = tan α / tan α_p.
+        self._stiffness = math.tan(math.pi / 2 / car.shape)
+        self._peak = tangent(car.peak_slip_angle)
 
     def __call__(self, env: RacingEnv, observation: Tensor) -> Tensor:
         """Actions (M, 2) for the last M cars of an env."""
         m = len(observation)
         if self.speeds.device != observation.device:
-            self.speeds, self.line = self.speeds.to(observation.device), self.line.to(observation.device)
-        state, run, course = CarState(*env.state.unbind(0)), Run(*env.run.unbind(0)), env.course
-        rows = env.state.shape[1]
-        car_number = torch.arange(rows, device=observation.device) // env.races
-        lanes = torch.tensor(self.lanes, device=observation.device)[car_number % len(self.lanes)]
-
+            for name in ("speeds", "gains", "line"):
+                setattr(self, name, getattr(self, name).to(observation.device))
+        state, run = CarState(*env.state.unbind(0)), Run(*env.run.unbind(0))
+        tyres = tyre_view(env.garage.car, env.simulation.wheels, env.state, env.compound[0])
         speed = torch.sqrt(state.vx**2 + state.vy**2)
+        steer = self._steer(env, state, run, tyres, speed)
+        pedal = self._pedal(env, state, run, tyres, speed)
+        return torch.stack([steer, pedal], dim=-1)[len(speed) - m :]
+
+    def _steer(self, env: RacingEnv, state: CarState, run: Run, tyres: TyreView, speed: Tensor) -> Tensor:
+        """Steering in [-1, 1] towards a point ahead on the line."""
+        car, course = self.car, env.course
+        number = torch.arange(len(speed), device=speed.device) // env.races
+        lanes = torch.tensor(self.lanes, device=speed.device)[number % len(self.lanes)]
         distance = _PREVIEW[0] + _PREVIEW[1] * speed
         ahead = run.s + distance
-        target_x, target_y, _ = course.place(ahead, self.line[course.node(ahead)] + lanes)
-        dx, dy = target_x - state.x, target_y - state.y
-        cos, sin = torch.cos(state.yaw), torch.sin(state.yaw)
-        forward, side = dx * cos + dy * sin, dy * cos - dx * sin
-        bearing = torch.atan2(side, forward)
-        # Pure pursuit, damped in yaw, a little more for the tyres' slip, and a correction of slides.
-        curvature = 2.0 * torch.sin(bearing) / distance
-        steer = torch.atan(self.base * curvature)
-        slide = torch.atan2(state.vy, state.vx.clamp(min=3.0))
-        steer = steer + _YAW_DAMPING * (speed * curvature - state.yaw_rate)
-        steer = 1.15 * steer + _COUNTER_STEER * (slide.abs() - _SLIDE).clamp(min=0.0) * torch.sign(slide)
-        steer = torch.where(bearing.abs() > 0.5 * math.pi, torch.sign(bearing) * self.steer_max, steer)
+        x, y, _ = course.place(ahead, self.line[course.node(ahead)] + lanes)
+        forward_speed = state.vx.clamp(min=3.0)
+        bearing = torch.atan2(y - state.y, x - state.x) - state.yaw
+        bearing = torch.remainder(bearing + math.pi, 2 * math.pi) - math.pi
+        off = bearing - torch.atan2(state.vy, forward_speed)  # between the way it moves and the way to the point
+        curvature = 2.0 * torch.sin(off.clamp(-0.5 * math.pi, 0.5 * math.pi)) / distance
+        base = car.front_axle + car.rear_axle
+        turn_in = car.yaw_inertia * (speed * curvature - state.yaw_rate) / _YAW_TIME
+        force = (total_mass(car, state.fuel) * speed**2 * curvature * car.rear_axle + turn_in) / base
+        share = force / (tyres.grip * tyres.load)[:2].sum(0)
+        share = share.clamp(-_FRONT_MAX, _FRONT_MAX)
+        slip = torch.atan(self._peak / self._stiffness * torch.tan(torch.asin(share) / car.shape))
+        # Which way the front axle will move, seen from the car, when the command has been carried out.
+        drift = state.vy + _LAG * (state.ay - state.yaw_rate * forward_speed)
+        steer = torch.atan2(drift + car.front_axle * state.yaw_rate, forward_speed) + slip
+        lost = (bearing.abs() > 0.5 * math.pi) & (speed < _LOST_SPEED)
+        steer = torch.where(lost, torch.sign(bearing) * car.steer_max, steer)
+        return (steer / car.steer_max).clamp(-1.0, 1.0)
 
-        wanted = self.speeds[course.node(run.s + _REACTION * speed)]
-        # Off the road or across it there is less grip than the profile counts on.
-        wanted = torch.where((run.off > 0.5) | (run.along < 0.7), wanted.clamp(max=14.0), wanted)
+    def _pedal(self, env: RacingEnv, state: CarState, run: Run, tyres: TyreView, speed: Tensor) -> Tensor:
+        """Throttle (positive) or brake (negative) in [-1, 1]."""
+        car = self.car
+        node = env.course.node(run.s + _REACTION * speed)
+        expected = car.grip + car.grip_per_load * 1e-3 * (tyres.load.mean(0) - car.reference_load)
+        grip = (tyres.grip.mean(0) / expected).clamp(max=1.0)  # of cold, worn or hard tyres
+        wanted = self.speeds[node] * torch.sqrt(grip)
+        wanted = torch.where((run.off > 0.5) | (run.along < 0.7), wanted.clamp(max=_LOST_SPEED), wanted)
         if env.cars > 1:
             wanted = torch.minimum(wanted, self._behind(env, run, speed))
-        pedal = 0.35 * (wanted - speed)
-        tyres = tyre_view(env.garage.car, env.simulation.wheels, env.state, env.compound[0])
-        spin = tyres.ratio.amax(0) / self.peak
-        lock = -tyres.ratio.amin(0) / self.peak
-        # Either pedal takes lateral grip from the rear: both are eased while the car slides.
-        ease = (1.0 - (slide.abs() - _SLIDE) / 0.10).clamp(0.0, 1.0)
-        pedal = torch.where(speed > 8.0, pedal * ease, pedal)
-        throttle = pedal.clamp(0.0, 1.0) * (1.7 - spin).clamp(0.0, 1.0)
-        brake = (-pedal).clamp(0.0, 1.0) * (1.9 - lock).clamp(0.1, 1.0)
-        action = torch.stack([(steer / self.steer_max).clamp(-1.0, 1.0), throttle - brake], dim=-1)
-        return action[rows - m :]
+        force = total_mass(car, state.fuel) * (self.gains[node] * grip + (wanted - speed) / _PEDAL_TIME)
+        slip = torch.sqrt((tyres.ratio / car.peak_slip_ratio) ** 2 + (tyres.side / self._peak) ** 2)
+        throttle = (force * speed.clamp(min=10.0) / (car.efficiency * car.power)).clamp(0.0, 1.0)
+        brake = (-force * car.wheel_radius / car.brake_torque).clamp(0.0, 1.0)
+        driven = slip[2:].amax(0) if car.drive_share_front == 0.0 else slip.amax(0)
+        throttle = throttle * ((1.0 - driven) / 0.3).clamp(0.0, 1.0)
+        brake = brake * ((1.1 - slip[2:].amax(0)) / 0.4).clamp(0.0, 1.0) * ((1.4 - slip.amax(0)) / 0.4).clamp(0.1, 1.0)
+        return throttle - brake
 
     @staticmethod
     def _behind(env: RacingEnv, run: Run, speed: Tensor) -> Tensor:
@@ -115,7 +145,7 @@ class LineFollower:
         gap = torch.where(in_lane, others.gap, 1e4)
         theirs = torch.stack([speed.reshape(split).roll(-k, 0) for k in range(1, env.cars)])
         nearest = gap.argmin(0, keepdim=True)
-        room = gap.gather(0, nearest)[0] - 5.5 - _FOLLOWING * speed.reshape(split)
+        room = gap.gather(0, nearest)[0] - 5.5 - _GAP_TIME * speed.reshape(split)
         return (theirs.gather(0, nearest)[0] + 0.8 * room).clamp(min=3.0).reshape(-1)
 
 

@@ -12,6 +12,8 @@ from coachable.envs.racing.powertrain import FUEL_DENSITY
 
 LOAD_TRANSFER = 0.96  # share of the ideal grip that is left when the load shifts between wheels
 SPEED_MAX = 110.0  # [m/s]
+_RPM = 60.0 / (2.0 * np.pi)
+_SHIFT_UP = 0.98  # of the highest engine speed, at full throttle
 _LAPS = 2  # so that the end of the lap fits its start
 
 
@@ -23,11 +25,13 @@ class Envelope:
         car: parameters, numbers.
         fuel: [l].
         grip: factor of the friction coefficient.
+        braking: share of the friction that the brakes can use.
     """
 
     car: Car
     fuel: float = 30.0
     grip: float = 1.0
+    braking: float = 1.0
 
     @property
     def mass(self) -> float:
@@ -46,8 +50,20 @@ class Envelope:
         return air + self.car.rolling_resistance * GRAVITY
 
     def engine(self, speed: np.ndarray) -> np.ndarray:
-        """At full throttle in the best gear."""
-        return self.car.efficiency * self.car.power / self.mass / np.maximum(speed, 10.0)
+        """At full throttle in the best gear, less what it takes to spin up the wheels and the engine."""
+        car = self.car
+        wheel = np.maximum(speed, 3.0) / car.wheel_radius  # [rad/s]
+        wheels = 2 * (car.wheel_inertia_front + car.wheel_inertia_rear)
+        best = np.zeros_like(wheel)
+        for gear in car.gears:
+            ratio = gear * car.final_drive
+            omega = np.maximum(wheel * ratio, car.rpm_idle / _RPM)
+            force = np.minimum(car.torque, car.power / omega) * ratio * car.efficiency / car.wheel_radius
+            spinning = (wheels + car.engine_inertia * ratio**2) / car.wheel_radius**2
+            # The gearbox shifts up at 98 % of the highest speed.
+            gain = np.where((omega * _RPM <= _SHIFT_UP * car.rpm_max) | (gear == car.gears[-1]), force, 0.0)
+            best = np.maximum(best, gain / (self.mass + spinning))
+        return best
 
     def traction(self, speed: np.ndarray) -> np.ndarray:
         """Share of the friction that the driven axle has, with the load moved to it."""
@@ -79,10 +95,13 @@ def speed_profile(envelope: Envelope, curvature: np.ndarray, spacing: np.ndarray
     n = len(curvature)
     step = np.broadcast_to(np.asarray(spacing, dtype=float), (n,))
     speed = cornering_speed(envelope, curvature)
+    grid = np.linspace(3.0, SPEED_MAX, 200)
+    engine = envelope.engine(grid)
     for _ in range(_LAPS):  # braking, backwards
         for i in range(n - 1, -1, -1):
             ahead = speed[(i + 1) % n]
-            room = _left(float(envelope.friction(ahead)), ahead**2 * curvature[i]) + envelope.drag(ahead)
+            room = _left(float(envelope.friction(ahead)), ahead**2 * curvature[i])
+            room = envelope.braking * room + envelope.drag(ahead)
             speed[i] = min(speed[i], np.sqrt(ahead**2 + 2 * room * step[i]))
     for _ in range(_LAPS):  # accelerating, forwards
         for i in range(n):
@@ -90,7 +109,7 @@ def speed_profile(envelope: Envelope, curvature: np.ndarray, spacing: np.ndarray
             share = _left(
                 float(envelope.traction(now)), now**2 * curvature[i] * envelope.traction(now) / envelope.friction(now)
             )
-            gain = min(share, envelope.engine(now)) - envelope.drag(now)
+            gain = min(share, float(np.interp(now, grid, engine))) - envelope.drag(now)
             speed[following] = min(speed[following], np.sqrt(max(now**2 + 2 * gain * step[i], 1.0)))
     return speed
 

@@ -1,0 +1,53 @@
+"""The scripted driver laps without leaving the track, on good tyres and bad ones."""
+
+import pytest
+import torch
+
+from coachable.envs.racing import RacingEnv
+from coachable.envs.racing.driver import LineFollower
+from coachable.envs.racing.line import minimum_curvature_line
+from coachable.envs.racing.parameters import compound_index
+from coachable.envs.racing.referee import TELEMETRY
+from coachable.envs.racing.scenarios import Conditions, Scenario
+from coachable.envs.racing.state import ROW, SPINS
+
+T = {name: column for column, name in enumerate(TELEMETRY)}
+ALONE = (Scenario("solo", 1.0, "solo"),)
+
+
+def drive(env, driver, steps, slowed=1.0):
+    """Telemetry (steps, N, 11); starts at a share of the usual speed."""
+    current, seen = env.reset(), []
+    env.state[ROW["vx"]] *= slowed
+    env.state[SPINS] *= slowed
+    for _ in range(steps):
+        current = env.step(current.set("action", driver(env, current["observation"])))["next"]
+        seen.append(current["telemetry"].clone())
+    return torch.stack(seen)
+
+
+def test_it_keeps_to_the_road_of_an_oval():
+    env = RacingEnv(8, track="oval", seed=0, scenarios=ALONE)
+    seen = drive(env, LineFollower(env.track, env.garage.typical), 150)
+    assert seen[..., T["off"]].sum() == 0
+    assert (seen[-1, :, T["distance"]] > 150 * 0.1 * 30.0).all()
+
+
+def test_it_feels_tyres_with_less_grip():
+    """On the hardest comfort tyres corners are slower: 67 % of the grip that the profile counts on."""
+    conditions = Conditions(compounds=(compound_index("comfort_hard"),))
+    env = RacingEnv(8, track="ring", seed=0, scenarios=ALONE, conditions=conditions)
+    seen = drive(env, LineFollower(env.track, env.garage.typical), 100, slowed=0.6)
+    assert seen[..., T["off"]].sum() == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("car, bound", [("gt3", 120.0), ("x2019", 96.0)])
+def test_a_lap_of_lakeside(car, bound):
+    """racing.md, 3.3: a naive preview driver needs 115.5 s and 93.4 s."""
+    env = RacingEnv(3, track="lakeside", car=car, seed=0, scenarios=ALONE)
+    line = minimum_curvature_line(env.track, margin=2.0)
+    driver = LineFollower(env.track, env.garage.typical, grip=0.93, line=line)
+    seen = drive(env, driver, int(10 * bound))
+    assert seen[..., T["off"]].sum() == 0
+    assert (seen[-1, :, T["distance"]] > env.course.length).all()
