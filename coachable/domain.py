@@ -16,7 +16,13 @@ from torchrl.envs import EnvBase
 from coachable.styles import StyleReward, StyleSpace
 
 # Where each built-in domain is declared; imported only when asked for.
-_DECLARATIONS = {"combat": "coachable.envs.combat.domain", "humanoid": "coachable.envs.humanoid.domain"}
+_DECLARATIONS = {
+    "combat": "coachable.envs.combat.domain",
+    "humanoid": "coachable.envs.humanoid.domain",
+    "racing_aggressiveness": "coachable.envs.racing.domains.aggressiveness",
+    "racing_drift": "coachable.envs.racing.domains.drift",
+    "racing_resources": "coachable.envs.racing.domains.resources",
+}
 
 
 class StyleMeasures(Protocol):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from coachable.envs.racing.circuits import load_track
@@ -9,6 +10,15 @@ from coachable.envs.racing.driver import LineFollower
 from coachable.envs.racing.env import RacingEnv
 from coachable.envs.racing.parameters import Resources, load_car
 from coachable.envs.racing.scenarios import Conditions, drift_scenarios, rolling_start
+from coachable.envs.racing.styles import (
+    aggressiveness_style_reward,
+    aggressiveness_style_space,
+    drift_style_reward,
+    drift_style_space,
+    resource_style_reward,
+    resource_style_space,
+)
+from coachable.styles import StyleReward, StyleSpace
 
 WEAR_RATE, FUEL_RATE = 9.0, 2.0  # a stint of about ten laps of Lakeside in the X2019
 RIVALS_GRIP = 0.85  # of the scripted opponents
@@ -57,3 +67,40 @@ def rival_env(num_envs: int = 64, **options: Any) -> RacingEnv:
     }
     settings: dict[str, Any] = {**defaults, **options, "track": course}
     return RacingEnv(num_envs, **settings)
+
+
+_FAMILIES: dict[str, tuple[Callable[..., RacingEnv], Callable[[], StyleSpace], Callable[..., StyleReward]]] = {
+    "drift": (drift_env, drift_style_space, drift_style_reward),
+    "resources": (resource_env, resource_style_space, resource_style_reward),
+    "aggressiveness": (rival_env, aggressiveness_style_space, aggressiveness_style_reward),
+}
+FAMILIES = tuple(_FAMILIES)
+
+
+def check_family(family: str) -> None:
+    """Refuses what is no family of styles.
+
+    Raises:
+        ValueError: naming the families.
+    """
+    if family not in _FAMILIES:
+        raise ValueError(f"unknown family {family!r}: expected drift, resources or aggressiveness")
+
+
+def family_env(num_envs: int = 64, *, family: str, **options: Any) -> RacingEnv:
+    """The environment of a family.
+
+    Args:
+        num_envs: cars that the agent drives.
+        family: drift, resources or aggressiveness.
+        **options: of `RacingEnv`.
+    """
+    check_family(family)
+    return _FAMILIES[family][0](num_envs, **options)
+
+
+def family_style(family: str) -> tuple[StyleSpace, Callable[..., StyleReward]]:
+    """Style space and `make_style_reward(space, **settings)` of a family."""
+    check_family(family)
+    _, make_space, make_reward = _FAMILIES[family]
+    return make_space(), make_reward

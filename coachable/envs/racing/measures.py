@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from coachable.envs.racing.families import check_family
 from coachable.envs.racing.referee import TELEMETRY
 from coachable.envs.racing.simulation import CONTROL_STEP
 from coachable.envs.racing.styles import GAP_COLUMNS, GAPS, RESOURCES
@@ -30,8 +31,7 @@ class RacingMeasures:
     """
 
     def __init__(self, family: str) -> None:
-        if family not in ("drift", "resources", "aggressiveness"):
-            raise ValueError(f"unknown family {family!r}: expected drift, resources or aggressiveness")
+        check_family(family)
         self.family = family
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:

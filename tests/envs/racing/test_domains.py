@@ -1,23 +1,26 @@
 """The three declarations: they make environments, measure and draw."""
 
-from importlib import import_module
+import math
 
 import numpy as np
 import pytest
 import torch
 
+from coachable.domain import load_domain
 from coachable.envs.racing import RacingEnv
-from coachable.envs.racing.families import race_env
+from coachable.envs.racing.events import racing_events
+from coachable.envs.racing.families import family_env, family_style, race_env
 from coachable.envs.racing.measures import RacingMeasures
+from coachable.envs.racing.referee import TELEMETRY
 from coachable.envs.racing.render import RacingRenderer
 from coachable.transforms import coachable_env
 
 
 @pytest.mark.parametrize("family", ["drift", "resources", "aggressiveness"])
 def test_a_domain_makes_measures_and_draws(family):
-    domain = import_module(f"coachable.envs.racing.domains.{family}").DOMAIN
+    domain = load_domain(f"racing_{family}")
     space = domain.make_space()
-    assert set(domain.grid) == set(space.names)
+    assert all(set(cell) == set(space.names) for cell in domain.cells())
     env = coachable_env(domain.make_env(num_envs=4, seed=0), space, domain.make_reward(space), seed=0)
     data = env.rollout(3, break_when_any_done=False)
     assert sum(width for _, width in domain.observation_groups) == data["observation"].shape[-1]
@@ -50,3 +53,37 @@ def test_pictures_follow_the_car():
     env.reset()
     renderer = RacingRenderer(160, 120)
     assert not np.array_equal(renderer.draw(env, 0), renderer.draw(env, 1))
+
+
+def test_a_domain_is_as_its_training_made_it():
+    settings = {"_target_": "x", "family": "resources", "num_envs": 256, "track": "ring", "car": "gt3"}
+    domain = load_domain("racing_resources", {"env": {**settings, "episode_steps": 20, "course_points": 5}})
+    env = domain.make_env(num_envs=2, seed=0)
+    assert (env.track.name, env.num_envs, domain.episode_steps) == ("ring", 2, 20)
+    assert sum(width for _, width in domain.observation_groups) == env.observation_size
+
+
+@pytest.mark.parametrize(
+    "family, names", [("drift", ["slide"]), ("aggressiveness", ["contact", "overtake", "slipstream"])]
+)
+def test_events_are_what_their_names_say(family, names):
+    events = racing_events(family)
+    assert list(events.names) == ["recovery", *names]
+    space, make_reward = family_style(family)
+    env = coachable_env(family_env(8, family=family, seed=0), space, make_reward(space), seed=0)
+    data = env.rollout(15, break_when_any_done=False).reshape(-1)
+    found = events(data)
+    assert found.shape == (120, 1 + len(names))
+    off = data["next", "telemetry"][:, TELEMETRY.index("off")] > 0
+    assert torch.equal(found[:, 0], off)
+    if family == "drift":
+        assert torch.equal(found[:, 1], data["next", "style_features"][:, 1] > math.radians(20.0))
+        assert found[:, 1].any()
+    else:
+        assert torch.equal(found[:, 1], data["next", "telemetry"][:, TELEMETRY.index("contact")] > 0)
+
+
+@pytest.mark.parametrize("make", [family_style, racing_events, lambda name: family_env(2, family=name)])
+def test_families_are_checked_everywhere(make):
+    with pytest.raises(ValueError, match="unknown family 'speed': expected drift, resources or aggressiveness"):
+        make("speed")

@@ -1,0 +1,70 @@
+"""What replay keeps tables of in racing: rare or hard moments (Kompella et al. 2023; racing.md, section 5.3)."""
+
+from __future__ import annotations
+
+import math
+
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from coachable.envs.racing.families import check_family
+from coachable.envs.racing.observation import observation_groups
+from coachable.envs.racing.styles import DRIFT_NAMES, GAPS, RESOURCE_NAMES, RESOURCES
+from coachable.keys import STYLE_FEATURES
+from coachable.replay import PredicateEvents
+
+SLIDE = math.radians(20.0)  # mean slip angle of the rear tyres
+TOW = 0.3  # strength of a slipstream that counts
+
+
+def racing_events(family: str = "resources") -> PredicateEvents:
+    """Tables of a family's training.
+
+    "recovery" (three wheels off the track) in all families; "slide" (rear slip angle above 20 degrees) alone on the
+    track; "contact", "overtake" (metres gained on a car ahead) and "slipstream" in races.
+
+    Args:
+        family: drift, resources or aggressiveness.
+
+    Raises:
+        ValueError: if there is no such family.
+    """
+    check_family(family)
+    tables = {"recovery": _off_course}
+    if family == "aggressiveness":
+        tables |= {"contact": _contact, "overtake": _overtake, "slipstream": _slipstream}
+    else:
+        tables |= {"slide": _slide}
+    return PredicateEvents(tables)
+
+
+def _flags(steps: TensorDictBase) -> Tensor:
+    """Off course, wall, contact, (N, 3)."""
+    before = 0
+    for name, width in observation_groups(1, pool=False):
+        if name == "flags":
+            return steps["next", "observation"][..., before : before + width]
+        before += width
+    raise RuntimeError("the observation has no flags")
+
+
+def _off_course(steps: TensorDictBase) -> Tensor:
+    return _flags(steps)[..., 0] > 0.5
+
+
+def _contact(steps: TensorDictBase) -> Tensor:
+    return _flags(steps)[..., 2] > 0.5
+
+
+def _slide(steps: TensorDictBase) -> Tensor:
+    return steps["next", STYLE_FEATURES][..., DRIFT_NAMES.index("slip_angle_rear")] > SLIDE
+
+
+def _overtake(steps: TensorDictBase) -> Tensor:
+    gained = steps["next", STYLE_FEATURES][..., RESOURCES.start + RESOURCE_NAMES.index("overtake")]
+    near = steps["next", STYLE_FEATURES][..., GAPS + 2 :: 3].any(-1)
+    return (gained > 0.0) & near
+
+
+def _slipstream(steps: TensorDictBase) -> Tensor:
+    return steps["next", "observation"][..., -1] > TOW

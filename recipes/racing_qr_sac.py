@@ -1,0 +1,25 @@
+"""Train a racing driver whose style is chosen at run time (QR-SAC, n-step returns, event tables).
+
+python recipes/racing_qr_sac.py                           tyre and fuel saving, cpu or gpu
+python recipes/racing_qr_sac.py family=drift              drifting on request
+python recipes/racing_qr_sac.py family=aggressiveness     margins to four scripted rivals
+python recipes/racing_qr_sac.py preset=smoke              every part once, within a minute
+"""
+
+from typing import Any
+
+from recipe_config import run_recipe
+from recipe_training import build_training
+
+from coachable.envs.racing.families import family_style
+from coachable.training.loop import Train
+
+
+def build(config: dict[str, Any]) -> Train:
+    """Composes the training."""
+    space, make_reward = family_style(config["family"])
+    return build_training(config, space, make_reward)
+
+
+if __name__ == "__main__":
+    run_recipe("racing_qr_sac", build)
