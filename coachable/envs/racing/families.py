@@ -20,7 +20,6 @@ from coachable.envs.racing.styles import (
 )
 from coachable.styles import StyleReward, StyleSpace
 
-WEAR_RATE, FUEL_RATE = 9.0, 2.0  # a stint of about ten laps of Lakeside in the X2019
 RIVALS_GRIP = 0.85  # of the scripted opponents
 
 
@@ -31,12 +30,12 @@ def drift_env(num_envs: int = 64, **options: Any) -> RacingEnv:
 
 
 def resource_env(num_envs: int = 64, **options: Any) -> RacingEnv:
-    """X2019 on Lakeside, tyres and fuel of any state."""
+    """X2019 on Lakeside, tyres and fuel of any state; stints last about ten laps."""
     defaults: dict[str, Any] = {
         "track": "lakeside",
         "car": "x2019",
         "conditions": Conditions.resources(),
-        "resources": Resources(wear=WEAR_RATE, fuel=FUEL_RATE),
+        "resources": Resources.calibrated("gt3" if options.get("car") == "gt3" else "x2019"),
     }
     return RacingEnv(num_envs, **(defaults | options))
 

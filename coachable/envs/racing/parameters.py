@@ -147,6 +147,21 @@ class Resources:
     fuel: float = 0.0
     fuel_exponent: float = 2.5
 
+    @classmethod
+    def calibrated(cls, car: str) -> Resources:
+        """Rates at which a stint on Lakeside lasts about ten laps, from `resources.toml`.
+
+        Args:
+            car: "gt3" or "x2019".
+
+        Raises:
+            ValueError: if there are none for this car.
+        """
+        table = tomllib.loads((files("coachable.envs.racing") / "resources.toml").read_text())
+        if car not in table:
+            raise ValueError(f"no calibrated wear and fuel rates of {car!r}: expected one of {', '.join(table)}")
+        return cls(**{name: entry["value"] for name, entry in table[car].items()})
+
 
 def car_pool(count: int = 530, seed: int = 0, archetype: str | None = None) -> Tensor:
     """Packed parameters (P, count) of a seeded pool of different cars (our choice, for the paper's 530).
