@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
@@ -94,8 +95,10 @@ class PictureView:
         if now < self._due or not clients:
             return
         picture = self._renderer.draw(self._session.env)
-        for client in clients.values():
-            client.scene.set_background_image(padded(picture, client.camera.aspect), format="jpeg", jpeg_quality=85)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # a browser has just gone away
+            for client in clients.values():
+                client.scene.set_background_image(padded(picture, client.camera.aspect), format="jpeg", jpeg_quality=85)
         taken = time.perf_counter() - now
         self._due = now + max(1.0 / _PICTURES_PER_SECOND, taken / _DRAWING_SHARE)
 

@@ -193,13 +193,13 @@ def _switches(
     }
     for name in runs[0].switching.metrics:
         row[name] = estimate(np.array([run.switching.metrics[name] for run in runs]))
-    row["switches"] = sum(run.switching.switches for run in runs)
-    write_csv([flat_row(row)], out / "switches.csv")
+    switches = sum(run.switching.switches for run in runs)
+    write_csv([flat_row(row | {"switches": switches})], out / "switches.csv")
     page.section(
         "Styles that change while the agent acts",
         paragraph(
-            f"{episodes} episodes per run, a new style every {SWITCH_PERIOD} steps ({period:g} s). Complied: the agent "
-            "did what was asked before the next switch."
+            f"{episodes} episodes per run, a new style every {SWITCH_PERIOD} steps ({period:g} s), {switches} switches. "
+            "Complied: the agent did what was asked before the next switch."
         ),
         picture(out / "switches.png", "share of switches complied with over time"),
         table([row], {**formats, "complied": ".0%", "median_seconds": ".2f"}),

@@ -5,6 +5,7 @@ import socket
 import threading
 import time
 import warnings
+from contextlib import contextmanager
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,10 +13,14 @@ import pytest
 
 viser = pytest.importorskip("viser")
 
+import msgspec  # noqa: E402, viser brings it
+import websockets.sync.client as websockets  # noqa: E402, viser brings it
+
 from coachable.coach import views  # noqa: E402
 from coachable.coach.page import CoachPage  # noqa: E402
 from coachable.coach.server import make_server  # noqa: E402
 from coachable.coach.session import CoachSession  # noqa: E402
+from coachable.styles import StyleRangeWarning  # noqa: E402
 from tests.coach.echo_domain import echo_session  # noqa: E402
 
 
@@ -98,6 +103,56 @@ def test_nan_from_a_browser_changes_nothing(page):
     speed = page.loop.speed
     page.speed.value = math.nan
     assert page.loop.speed == speed
+
+
+@contextmanager
+def wire(page):
+    """A browser's connection without the browser: yields a function that sends a widget's new value."""
+    from viser._messages import GuiUpdateMessage, ViewerCameraMessage
+
+    address = f"ws://127.0.0.1:{page.server.get_port()}"
+    protocol = f"viser-v{viser.__version__}"
+    with websockets.connect(address, subprotocols=[protocol], origin=address, max_size=None) as socket:
+
+        def send(message):
+            socket.send(msgspec.msgpack.encode(message.as_serializable_dict()))
+
+        known = set(page.server.get_clients())
+        send(ViewerCameraMessage((1, 0, 0, 0), (0, 0, 1), 1.0, 0.1, 10.0, 600, 800, (0, 0, 0), (0, 0, 1)))
+        wait_for(lambda: set(page.server.get_clients()) - known)  # only from then on is it heard
+        yield lambda handle, value: send(GuiUpdateMessage(handle._impl.uuid, {"value": value})), socket
+
+
+def test_bad_numbers_in_a_message(page):
+    target = page.widgets["target"].handle
+    with wire(page) as (send, _), warnings.catch_warnings():
+        warnings.simplefilter("ignore", StyleRangeWarning)
+        send(target, 0.5)
+        wait_for(lambda: page.session.style["target"] == pytest.approx(0.5))
+        for value in (math.nan, math.inf, -math.inf):
+            page.status.content = ""
+            send(target, value)
+            wait_for(lambda: "**Problem:**" in page.status.content or page.session.report().outside)
+            wait_for(lambda: page.widgets["target"].handle.value == pytest.approx(page.session.style["target"]))
+        send(target, 7.0)
+        wait_for(lambda: page.session.report().outside == {"target": 7.0})
+        assert page.session.style["target"] == pytest.approx(0.8)
+        send(target, 0.25)
+        wait_for(lambda: page.session.style["target"] == pytest.approx(0.25))
+
+
+def test_one_of_two_browsers_breaks_off_while_the_agent_acts(page):
+    page._press("Resume")
+    with wire(page) as (send, _), wire(page) as (_, dying):
+        dying.socket.shutdown(socket.SHUT_RDWR)  # no goodbye
+        wait_for(lambda: len(page.server.get_clients()) == 1)
+        count = page.session.step_count
+        wait_for(lambda: page.session.step_count > count + 3)
+        send(page.widgets["target"].handle, 0.5)
+        wait_for(lambda: page.session.style["target"] == pytest.approx(0.5))
+    count = page.session.step_count
+    wait_for(lambda: page.session.step_count > count + 3)
+    assert page.loop.problem == ""
 
 
 def say(page, phrase):
