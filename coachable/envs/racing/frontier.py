@@ -45,6 +45,9 @@ _TOO_FAST = 1e4  # [s], cost of a speed that the corner does not allow
 _CRUISE = (0.56, 0.34)  # engine speed over its highest at no and at full power: the middle of the gearbox's shift band
 
 
+Rows = list[dict[str, Any]]
+
+
 @dataclass(frozen=True)
 class Lap:
     """One lap of the programme's driver.
@@ -192,10 +195,11 @@ class LapProgramme:
                 for name in spent:
                     spent[name] += mean(np.broadcast_to(cost[name], after.shape))
                 speed = mean(after)
-        return [Lap(*(float(spent[n][i]) for n in ("time", "fuel", "tyre")), trace[:, i]) for i in range(prices)]
+        time, fuel, wear = (spent[name] for name in ("time", "fuel", "tyre"))
+        return [Lap(float(time[i]), float(fuel[i]), float(wear[i]), trace[:, i]) for i in range(prices)]
 
 
-def sweep(car: str, resource: str, prices: Sequence[float], *, exponent: float = 2.5, track: str = "lakeside") -> list:
+def sweep(car: str, resource: str, prices: Sequence[float], *, exponent: float = 2.5, track: str = "lakeside") -> Rows:
     """Rows of the trade-off, first the fastest lap, as dictionaries.
 
     Args:
@@ -234,7 +238,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("out", type=Path, help="folder")
     out: Path = parser.parse_args(arguments).out
     out.mkdir(parents=True, exist_ok=True)
-    prices = [1.0, 2.0, 4.0, 6.0, 8.0, 10.0, 13.0, 16.0, 20.0, 25.0, 32.0]
+    prices = [1.0, 2.0, 4.0, 6.0, 9.0, 12.0, 16.0, 24.0]
     curves = [
         sweep(car, resource, prices, exponent=exponent)
         for car in ("gt3", "x2019")
@@ -248,7 +252,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     draw(curves, out / "frontier.png")
 
 
-def draw(curves: Sequence[Sequence[dict[str, Any]]], path: Path) -> None:
+def draw(curves: Sequence[Rows], path: Path) -> None:
     """Range gained against seconds lost per lap, one curve per car and resource."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
