@@ -29,8 +29,8 @@ from coachable.training.checkpoint import CheckpointError, find_checkpoint, read
 from coachable.training.weights import load_policy  # noqa: E402
 from coachable.transforms import coachable_env  # noqa: E402
 
-SPEEDS = torch.linspace(0.0, 5.0, 11)
-STEPS, SETTLED = 600, 200  # [env-steps] of an episode, and before its speed counts
+SPEEDS = torch.linspace(0.0, 3.0, 13)
+STEPS, SETTLED = 200, 50  # [env-steps] of an episode, and before its speed counts
 
 
 def train(loss: str, seed: int, run_dir: Path, overrides: list[str]) -> None:
@@ -48,7 +48,7 @@ def train(loss: str, seed: int, run_dir: Path, overrides: list[str]) -> None:
 
 @torch.no_grad()
 def response(run_dir: Path) -> np.ndarray:
-    """Mean realised speed at each requested one, (11,) [m/s], deterministic policy."""
+    """Mean realised speed at each requested one, (13,) [m/s], deterministic policy."""
     actor = load_policy(run_dir).actor
     space = cheetah_space()
     env = coachable_env(cheetah_env(len(SPEEDS), seed=123), space, cheetah_style_reward(space), seed=0)

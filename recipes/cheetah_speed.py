@@ -27,10 +27,10 @@ SPEED = 0  # in the suite's velocity, and in the style features
 
 def cheetah_space() -> StyleSpace:
     """What can be asked for: one speed."""
-    return StyleSpace([Setpoint("speed", 0.0, 5.0, unit="m/s", help="forward speed")], name="cheetah")
+    return StyleSpace([Setpoint("speed", 0.0, 3.0, unit="m/s", help="forward speed")], name="cheetah")
 
 
-def cheetah_style_reward(space: StyleSpace, *, scale: float = 2.0, margin: float = 5.0) -> StyleReward:
+def cheetah_style_reward(space: StyleSpace, *, scale: float = 2.0, margin: float = 3.0) -> StyleReward:
     """Up to `scale` per step for the requested speed, linearly less down to nothing `margin` [m/s] off.
 
     The margin is as wide as the range: where a reward is flat, standing still looks as good as a little running.
@@ -63,9 +63,9 @@ class CheetahTask(Transform):
         return observation_spec
 
 
-def cheetah_env(num_envs: int = 8, seed: int = 0) -> EnvBase:
-    """`num_envs` cheetahs, one after the other in this process."""
-    cheetahs = SerialEnv(num_envs, lambda: DMControlEnv("cheetah", "run"))
+def cheetah_env(num_envs: int = 16, seed: int = 0, seconds: float = 10.0) -> EnvBase:
+    """`num_envs` cheetahs, one after the other in this process, in episodes of `seconds`, 25 steps per second."""
+    cheetahs = SerialEnv(num_envs, lambda: DMControlEnv("cheetah", "run", frame_skip=4, time_limit=seconds))
     env = TransformedEnv(
         cheetahs,
         Compose(
@@ -79,8 +79,8 @@ def cheetah_env(num_envs: int = 8, seed: int = 0) -> EnvBase:
 
 
 def cheetah_events() -> PredicateEvents:
-    """Table "fast", of steps above 4 m/s."""
-    return PredicateEvents({"fast": lambda steps: steps["next", STYLE_FEATURES][..., SPEED] > 4.0})
+    """Table "fast", of steps above 2.5 m/s."""
+    return PredicateEvents({"fast": lambda steps: steps["next", STYLE_FEATURES][..., SPEED] > 2.5})
 
 
 def build(config: dict[str, Any]) -> Train:
