@@ -1,6 +1,7 @@
 """The contestants of benchmarks/combat.py, each in a process of its own: `python combat_workers.py NAME`."""
 
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -43,6 +44,7 @@ def vizdoom() -> Callable[[int], None]:
     game.set_screen_resolution(doom.ScreenResolution.RES_160X120)
     game.set_objects_info_enabled(True)
     game.set_seed(0)
+    game.set_doom_config_path(str(Path(tempfile.mkdtemp()) / "vizdoom.ini"))  # otherwise written where one stands
     game.init()
     draw = random.Random(0)
     buttons = game.get_available_buttons_size()
