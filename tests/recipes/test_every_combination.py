@@ -29,7 +29,7 @@ def _choices(group):
 
 
 def test_recipes_were_found():
-    assert {"humanoid_sac", "combat_cat_rac", "cheetah_speed", "rare_targets"} <= set(RECIPES)
+    assert {"humanoid_sac", "combat_cat_rac", "racing_qr_sac", "cheetah_speed", "rare_targets"} <= set(RECIPES)
 
 
 @pytest.mark.parametrize("recipe, loss", _choices("loss"))
