@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -111,6 +112,8 @@ def write_report(
     _requests(page, styles, agent, runs, out)
     _switches(page, domain, runs, switch_episodes, formats, out)
     _tradeoffs(page, styles, runs, formats, out)
+    if domain.evaluation is not None:
+        _own(page, domain, agent, out, seed=seed, episodes=episodes, steps=steps, progress=progress)
     command = [f"coachable report {' '.join(agents)} --seed {seed} --episodes {episodes}"]
     command += [f"--switch-episodes {switch_episodes} --sweep-points {sweep_points}"]
     command += [f"--seeds {seeds}"] if len(agents) == 1 else []
@@ -198,7 +201,7 @@ def _switches(
     page.section(
         "Styles that change while the agent acts",
         paragraph(
-            f"{episodes} episodes per run, a new style every {SWITCH_PERIOD} steps ({period:g} s), {switches} switches. "
+            f"{episodes} episodes per run, another style every {period:g} s, {switches} switches. "
             "Complied: the agent did what was asked before the next switch."
         ),
         picture(out / "switches.png", "share of switches complied with over time"),
@@ -236,6 +239,28 @@ def _tradeoffs(page: Page, styles: StyleTable, runs: Sequence[Run], formats: Map
         picture(out / "tradeoffs.png", "task success against style score along each weight"),
         table([{name: row[name] for name in kept} for row in rows], formats),
     )
+
+
+def _own(page: Page, domain: Domain, agent: LoadedPolicy, out: Path, **settings: Any) -> None:
+    """What a domain measures in its own way, of the first agent: each table that it writes, with its figure."""
+    assert domain.evaluation is not None
+    folder = out / domain.name
+    domain.evaluation(domain, agent, folder, **settings)
+    for file in sorted(folder.glob("*.csv")):
+        with file.open(newline="", encoding="utf-8") as lines:
+            rows = [{name: _number(value) for name, value in row.items()} for row in csv.DictReader(lines)]
+        figure = file.with_suffix(".png")
+        parts = [picture(figure, f"{readable(file.stem)}, a figure")] if figure.is_file() else []
+        columns = {name: [value for row in rows if isinstance(value := row[name], float)] for name in rows[0]}
+        large = [name for name, values in columns.items() if values and max(values) >= 1000]
+        page.section(readable(file.stem).capitalize(), *parts, table(rows, dict.fromkeys(large, ".0f")))
+
+
+def _number(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def _success(runs: Sequence[Run], formats: Mapping[str, str]) -> str:

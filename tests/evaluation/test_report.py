@@ -2,6 +2,7 @@
 
 import csv
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -179,6 +180,18 @@ def test_the_page_is_one_file(folder):
     assert page.count("<img") == len(pictures)
     tables = {"styles.csv", "summary.csv", "requests.csv", "switches.csv", "tradeoffs.csv"}
     assert {path.name for path in folder.iterdir()} == {*pictures, *tables, "report.html", "text"}
+
+
+def test_what_a_domain_measures_itself_is_on_the_page(tmp_path):
+    def evaluation(domain, agent, out, *, episodes, steps, seed, progress):
+        out.mkdir()
+        (out / "wins.csv").write_text("style,easy_machine\nred,0.5\n")
+        (out / "wins.png").write_bytes((tmp_path / "styles.png").read_bytes())
+        return "not used"
+
+    write_report(replace(DOMAIN, evaluation=evaluation), {"toy.pt": AGENT}, tmp_path, **SMALL)
+    page = (tmp_path / "report.html").read_text()
+    assert ">Wins</h2>" in page and "wins, a figure" in page and "easy machine" in page and "0.5" in page
 
 
 def test_the_same_seed_gives_the_same_files(folder, tmp_path):
