@@ -11,7 +11,7 @@ import matplotlib
 import numpy as np
 import torch
 
-from coachable.envs.combat.tables import ELEMENTS, MACHINES, SITES, STYLES
+from coachable.envs.combat.tables import ELEMENTS, MACHINES, SITES, STYLES, UNSEEN_MACHINES
 from coachable.evaluation.rollouts import record_episodes
 from coachable.evaluation.statistics import rank_correlation
 from coachable.evaluation.style_grid import markdown_table, write_csv
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 SOURCES, STATES, PARTS = STYLES[:8], tuple(s for s in STYLES if s in ELEMENTS), STYLES[8:11]
 _COMPOSED_WEAPON = "corrosive_blastsling"  # whose ammunition carries several elements
+_PAIRS = ("Apex Thunderjaw", "Slaughterspine")  # of these, two at once are out of distribution
 _OUTCOMES = ("won", "died", "out_of_bounds", "timeout")
 
 
@@ -72,9 +73,9 @@ def evaluate_fights(
 ) -> str:
     """Fight every machine in every style and write tables, figures and a report.
 
-    Files: `damage.csv` (what was done under which style), `wins.csv` (by style and machine), `outcomes.csv` (by
-    machine), `sweep.csv` (share of a style's damage over its weight), `damage.png`, `sweep.png`, `report.md`,
-    `summary.json`.
+    Files: `damage.csv` (what was done under which style), `wins.csv` (by style and machine), `unseen.csv` (wins against
+    machines and pairs that no training has), `outcomes.csv` (by machine), `sweep.csv` (share of a style's damage over
+    its weight), `damage.png`, `sweep.png`, `report.md`, `summary.json`.
 
     Args:
         domain: combat, as the agent was trained in.
@@ -100,11 +101,23 @@ def evaluate_fights(
     cells = single_styles(space) + composed_styles(space)
     labels = [style_label(cell) for cell in cells]
     machines = list(agent.config["env"].get("machines") or MACHINES)
-    fights = _fight(domain, agent, cells, machines, episodes=episodes, steps=steps, seed=seed, progress=progress)
+    options: dict[str, Any] = {"episodes": episodes, "steps": steps, "seed": seed, "progress": progress}
+    fights = _fight(domain, agent, cells, [(name,) for name in machines], **options)
     damage, wins = _damage_rows(fights, labels), _win_rows(fights, labels, machines)
     outcomes = _outcomes(fights, machines)
-    sweep = _sweep(domain, agent, episodes=episodes, steps=steps, seed=seed, progress=progress)
-    for name, rows in {"damage": damage, "wins": wins, "outcomes": outcomes, "sweep": sweep}.items():
+    alone = _fight(domain, agent, cells, [(name,) for name in UNSEEN_MACHINES], **options)
+    pairs = _fight(domain, agent, cells, [(name, name) for name in _PAIRS], **options)
+    unseen = [
+        one | two
+        for one, two in zip(
+            _win_rows(alone, labels, list(UNSEEN_MACHINES)),
+            _win_rows(pairs, labels, [f"two {name}" for name in _PAIRS]),
+            strict=True,
+        )
+    ]
+    sweep = _sweep(domain, agent, **options)
+    tables = {"damage": damage, "wins": wins, "unseen": unseen, "outcomes": outcomes, "sweep": sweep}
+    for name, rows in tables.items():
         write_csv(rows, out / f"{name}.csv")
     draw_damage(damage, out / "damage.png")
     draw_sweep(sweep, out / "sweep.png")
@@ -117,7 +130,7 @@ def evaluate_fights(
         "seed": seed,
     }
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
-    report = _report(agent, damage, wins, outcomes, summary, episodes, steps, seed)
+    report = _report(agent, tables, summary, episodes, steps, seed)
     (out / "report.md").write_text(report)
     return report
 
@@ -126,23 +139,23 @@ def _fight(
     domain: Domain,
     agent: LoadedPolicy,
     cells: Sequence[Mapping[str, float]],
-    machines: Sequence[str],
+    opponents: Sequence[tuple[str, ...]],
     *,
     episodes: int,
     steps: int,
     seed: int,
     progress: bool,
 ) -> dict[str, np.ndarray]:
-    """Sums over each fight, by what was measured: (styles, machines, episodes)."""
-    space, shape = agent.space, (len(cells), len(machines), episodes)
+    """Sums over each fight, by what was measured: (styles, opponents, episodes); an opponent is one machine or two."""
+    space, shape = agent.space, (len(cells), len(opponents), episodes)
     theta = torch.stack([space.make(strict=True, **cell) for cell in cells])
-    theta = theta.repeat_interleave(len(machines) * episodes, 0)
-    simulation: Any = domain.make_env(num_envs=len(theta), seed=seed)
-    sites = np.random.default_rng(seed).choice(SITES, len(machines) * episodes)
-    names = [name for name in machines for _ in range(episodes)] * len(cells)
+    theta = theta.repeat_interleave(len(opponents) * episodes, 0)
+    simulation: Any = domain.make_env(num_envs=len(theta), seed=seed, num_enemies=len(opponents[0]))
+    sites = np.random.default_rng(seed).choice(SITES, len(opponents) * episodes)
+    names = [machines for machines in opponents for _ in range(episodes)] * len(cells)
     simulation.assign(names, [str(site) for site in sites] * len(cells))
     env = coachable_env(simulation, space, domain.make_reward(space), seed=seed)
-    label = f"{len(cells)} styles x {len(machines)} machines x {episodes} fights" if progress else None
+    label = f"{len(cells)} styles x {len(opponents)} opponents x {episodes} fights" if progress else None
     record = record_episodes(env, agent.actor, theta, domain.measures, steps=steps, seed=seed, progress=label)
     env.close()
     sums = domain.measures.summarise(record.measures, record.alive)
@@ -247,9 +260,7 @@ def draw_sweep(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 def _report(
     agent: LoadedPolicy,
-    damage: Sequence[Mapping[str, Any]],
-    wins: Sequence[Mapping[str, Any]],
-    outcomes: Sequence[Mapping[str, Any]],
+    tables: Mapping[str, Sequence[Mapping[str, Any]]],
     summary: Mapping[str, Any],
     episodes: int,
     steps: int,
@@ -259,11 +270,14 @@ def _report(
     after = f" after {', '.join(known)}" if known else ""
     text = f"# combat: requested and measured style\n\nDeterministic policy{after}; {episodes} fights of at most "
     text += f"{steps} steps per style and machine, seed {seed}.\n\n![damage by style](damage.png)\n\n"
-    table = [{**row, "score": "" if row["style_score"] is None else f"{row['style_score']:.2f}"} for row in damage]
+    scores = ["" if row["style_score"] is None else f"{row['style_score']:.2f}" for row in tables["damage"]]
+    table = [{**row, "score": score} for row, score in zip(tables["damage"], scores, strict=True)]
     columns = {"style": "", "won": ".0%", "score": "", "damage_per_fight": ".0f", "seconds": ".0f"}
     text += markdown_table(table, columns | dict.fromkeys(PARTS, ".2f"))
     text += "\nScore: share of the damage that counts for the requested style. Parts: units removed per fight.\n"
-    text += "\n## Wins by machine\n\n" + markdown_table(wins, {n: "" if n == "style" else ".0%" for n in wins[0]})
-    text += "\n## Outcomes\n\n" + markdown_table(outcomes, dict.fromkeys(outcomes[0], ""))
+    for name, title in {"wins": "Wins by machine", "unseen": "Wins against what no training has"}.items():
+        columns = {column: "" if column == "style" else ".0%" for column in tables[name][0]}
+        text += f"\n## {title}\n\n" + markdown_table(tables[name], columns)
+    text += "\n## Outcomes\n\n" + markdown_table(tables["outcomes"], dict.fromkeys(tables["outcomes"][0], ""))
     text += "\n## Weight and score\n\n![score over weight](sweep.png)\n\nRank correlation: "
     return text + ", ".join(f"{name} {value:.2f}" for name, value in summary["rank_correlation"].items()) + ".\n"

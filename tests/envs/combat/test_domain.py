@@ -83,9 +83,9 @@ def test_fights_are_counted_by_style_and_machine(tmp_path):
     again = evaluate_fights(domain, agent, tmp_path / "again", episodes=2, steps=30, progress=False)
     assert report == again and (tmp_path / "report.md").read_text() == report
     styles = ["default", "melee", "corrosive_blastsling", "acid", "corrosive_blastsling + acid"]
-    for name in ("damage", "wins", "outcomes", "sweep"):
+    for name in ("damage", "wins", "unseen", "outcomes", "sweep"):
         rows = list(csv.DictReader((tmp_path / f"{name}.csv").read_text().splitlines()))
-        if name in ("damage", "wins"):
+        if name in ("damage", "wins", "unseen"):
             assert [row["style"] for row in rows] == styles
         if name == "outcomes":
             assert [sum(int(row[key]) for key in row if key != "machine") for row in rows] == [10, 10]
