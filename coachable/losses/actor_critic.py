@@ -78,7 +78,7 @@ class ActorCriticLoss(SACLoss):
             raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
         policy = PolicyReader(actor_network, name, continuous_only=self._continuous_only, action_spec=action_spec)
         # TorchRL makes buffers of a list of one, and draws new weights for a critic on its own: these are put back.
-        single = TensorDict.from_module(critics[0]).data.clone() if len(critics) == 1 else None
+        single = cast(TensorDict, TensorDict.from_module(critics[0])).data.clone() if len(critics) == 1 else None
         super().__init__(
             actor_network,
             critics if single is None else critics[0],  # pyright: ignore[reportArgumentType]  # documented as a list too
