@@ -140,6 +140,33 @@ def our_loss(name, precision="bf16"):
     return run
 
 
+def gamepad(entropy_samples):
+    """Cat-RAC on the gamepad of the combat domain: six heads of buttons, four Gaussian axes."""
+    import torch
+
+    from coachable.losses import CatRACLoss
+    from coachable.networks.hl_gauss_critic import make_hl_gauss_critic
+    from coachable.networks.mixed import make_mixed_actor
+    from coachable.training import Learner
+    from coachable.transforms.gamepad import GAMEPAD
+
+    torch.manual_seed(0)
+    widths = [WIDTH] * LAYERS
+    critics = [make_hl_gauss_critic(OBS, GAMEPAD.action_dim, _Space(), widths) for _ in range(2)]
+    actor = make_mixed_actor(OBS, GAMEPAD, _Space(), widths)
+    loss = CatRACLoss(actor, critics, alpha=ALPHA, entropy_samples=entropy_samples)
+    loss.make_value_estimator(gamma=GAMMA)
+    learner = Learner(loss, actor_lr=LR, critic_lr=LR, tau=TAU, precision="bf16", update_order="policy_first")
+    batch = _batch()
+    batch["action"] = GAMEPAD.spec(batch.batch_size).rand()
+
+    def run(n):
+        for _ in range(n):
+            learner.update(batch)
+
+    return run
+
+
 def torchrl(network):
     """TorchRL's `SACLoss` as its own SAC recipe uses it: one critic module vmapped, plain Adam, one backward."""
     import torch
@@ -368,6 +395,8 @@ WORKERS = {
     "coachable-cat_rac": lambda: our_loss("cat_rac"),
     "coachable-cat_rac-fp32": lambda: our_loss("cat_rac", "fp32"),
     "coachable-sac_categorical": lambda: our_loss("sac_categorical"),
+    "coachable-cat_rac-gamepad": lambda: gamepad(1000),
+    "coachable-cat_rac-gamepad-1-sample": lambda: gamepad(1),
     "torchrl": lambda: torchrl("mlp"),
     "torchrl-resnet": lambda: torchrl("resnet"),
     "single-file-fp32": lambda: single_file("fp32"),
