@@ -15,7 +15,8 @@ SHIPPED = sorted(file.parent.name for file in Path(coachable.pretrained.__path__
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_weights_act_in_their_domain(name):
-    agent, domain = load_policy(name), load_domain(name)
+    agent = load_policy(name)
+    domain = load_domain(name, agent.config)
     assert agent.metadata["domain"] == name
     assert agent.space == domain.make_space()
     env = domain.make_env(num_envs=2, num_threads=1)
