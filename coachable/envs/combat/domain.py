@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 from typing import Any
 
 from coachable.domain import Domain
 from coachable.envs.combat.constants import CONTROL_STEP, EPISODE_STEPS
 from coachable.envs.combat.env import CombatEnv
-from coachable.envs.combat.evaluation import evaluate_fights, single_styles
 from coachable.envs.combat.features import observation_groups
 from coachable.envs.combat.measures import CombatMeasures
 from coachable.envs.combat.render import CombatRenderer
-from coachable.envs.combat.styles import combat_style_reward, combat_style_space
+from coachable.envs.combat.styles import combat_style_reward, combat_style_space, single_styles
 
 
 def make_combat_env(
@@ -22,6 +22,11 @@ def make_combat_env(
 ) -> CombatEnv:
     """A `CombatEnv` that emits `components` for the measures. `num_threads` is not used: threads are torch's own."""
     return CombatEnv(num_envs, seed=seed, components=True, **options)
+
+
+def _evaluate(*arguments: Any, **settings: Any) -> str:
+    """`evaluate_fights`, looked up when it is called: evaluation knows domains, not the other way round."""
+    return import_module("coachable.evaluation.fights").evaluate_fights(*arguments, **settings)
 
 
 def _as_trained(settings: Mapping[str, Any]) -> Domain:
@@ -52,5 +57,5 @@ DOMAIN = Domain(
     columns={"won": ".0%", "damage": ".0f", "style_score": ".2f"},
     observation_groups=observation_groups("full"),
     as_trained=_as_trained,
-    evaluation=evaluate_fights,
+    evaluation=_evaluate,
 )

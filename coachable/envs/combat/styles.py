@@ -55,6 +55,17 @@ def combat_style_space(
     return space.with_sampler(style_mixture(space, combat_component))
 
 
+def single_styles(space: StyleSpace) -> list[dict[str, float]]:
+    """No style, then each weight alone at the ends of the range that reports sweep (the lower end if it is not 0)."""
+    neutral = dict.fromkeys(space.names, 0.0)
+    cells = [neutral]
+    for weight in space.parameters:
+        assert isinstance(weight, Weight)
+        low, high = weight.evaluation_range
+        cells += [neutral | {weight.name: end} for end in (high, low) if end]
+    return cells
+
+
 def combat_style_reward(space: StyleSpace) -> StyleReward:
     """Style part of the reward, sum_i w_i g_i: `style_features` holds the g_i in the order of the space's weights.
 

@@ -78,7 +78,7 @@ class LapProgramme:
     Example:
         >>> programme = LapProgramme(load_track("ring"), load_car("gt3"), Resources(wear=1.0, fuel=1.0))
         >>> [lap] = programme.laps("fuel", [0.0])
-        >>> 25 < lap.time < 40
+        >>> 18 < lap.time < 22
         True
     """
 

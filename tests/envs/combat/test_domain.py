@@ -8,8 +8,8 @@ import torch
 
 from coachable.domain import load_domain
 from coachable.envs.combat.domain import DOMAIN
-from coachable.envs.combat.evaluation import evaluate_fights, style_label
 from coachable.envs.combat.tables import STYLES
+from coachable.evaluation.fights import evaluate_fights, style_label
 from coachable.transforms import coachable_env
 
 

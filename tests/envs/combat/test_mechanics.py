@@ -12,7 +12,7 @@ from coachable.envs.combat.damage import ACID, BURNING, FROST, PLASMA, SHOCK, To
 from coachable.envs.combat.rewards import COMPONENT_SLICES
 from coachable.envs.combat.state import ACTIVE, IDLE, SAFE, STAGGER, STAGGERED
 from coachable.envs.combat.tables import ALL_MACHINES, AMMO, ELEMENTS, MACHINES, WEAPONS, load_table, resistance
-from coachable.envs.combat.traits import KIND, MACHINE_NAMES, SPREAD
+from coachable.envs.combat.traits import DAMAGE, KIND, MACHINE_NAMES, SPREAD
 from coachable.transforms.gamepad import press
 
 NOTHING = press()
@@ -319,7 +319,7 @@ def test_a_bite_hits_once_hurts_as_the_table_says_and_a_dodge_avoids_it(machine)
         if dodging:
             assert lost == 0.0
         else:
-            hit = ALL_MACHINES[machine].hit
+            hit = ALL_MACHINES[machine].hit * env.traits.attacks[DAMAGE, 0].item()
             assert 0.85 * hit <= lost <= 1.15 * hit
             assert (s.timers[STAGGER].item() > 0) == (lost > 60)
             assert s.timers[SAFE].item() > 0

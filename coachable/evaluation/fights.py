@@ -11,12 +11,13 @@ import matplotlib
 import numpy as np
 import torch
 
+from coachable.envs.combat.styles import single_styles
 from coachable.envs.combat.tables import ELEMENTS, MACHINES, SITES, STYLES, UNSEEN_MACHINES
 from coachable.evaluation.rollouts import record_episodes
 from coachable.evaluation.statistics import rank_correlation
 from coachable.evaluation.style_grid import markdown_table, write_csv
 from coachable.evaluation.sweep import sweep_weights
-from coachable.styles import StyleSpace, Weight
+from coachable.styles import StyleSpace
 from coachable.transforms import coachable_env
 
 matplotlib.use("Agg")
@@ -30,17 +31,6 @@ SOURCES, STATES, PARTS = STYLES[:8], tuple(s for s in STYLES if s in ELEMENTS), 
 _COMPOSED_WEAPON = "corrosive_blastsling"  # whose ammunition carries several elements
 _PAIRS = ("Apex Thunderjaw", "Slaughterspine")  # of these, two at once are out of distribution
 _OUTCOMES = ("won", "died", "out_of_bounds", "timeout")
-
-
-def single_styles(space: StyleSpace) -> list[dict[str, float]]:
-    """No style, then each weight alone at the ends of the range that reports sweep (the lower end if it is not 0)."""
-    neutral = dict.fromkeys(space.names, 0.0)
-    cells = [neutral]
-    for weight in space.parameters:
-        assert isinstance(weight, Weight)
-        low, high = weight.evaluation_range
-        cells += [neutral | {weight.name: end} for end in (high, low) if end]
-    return cells
 
 
 def composed_styles(space: StyleSpace) -> list[dict[str, float]]:
