@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from combat_workers import FIGHTS
+from combat_workers import DRAWN, FIGHTS, advance
 from contest import Worker, measure
 
 from coachable.envs.combat import CombatEnv, env, fight, frame
@@ -57,15 +57,9 @@ def timed(function: Callable[..., Any], total: dict[str, float], name: str) -> C
     return call
 
 
-def advance(fights: CombatEnv, current: Any, actions: torch.Tensor, steps: int) -> Any:
-    for step in range(steps):
-        _, current = fights.step_and_maybe_reset(current.set("action", actions[step % len(actions)]))
-    return current
-
-
 def bench(num_envs: int, steps: int, device: str) -> dict[str, float]:
     fights = CombatEnv(num_envs, seed=0, device=device)
-    actions = fights.action_spec.rand((8,))
+    actions = fights.action_spec.rand((DRAWN,))
     current = advance(fights, fights.reset(), actions, 5)
     synchronize = torch.cuda.synchronize if device == "cuda" else lambda: None
     synchronize()
@@ -91,7 +85,7 @@ def split(num_envs: int, steps: int) -> dict[str, float]:
         setattr(module, name, timed(function, total, name))
     start = time.process_time()
     fights = CombatEnv(num_envs, seed=0)
-    advance(fights, fights.reset(), fights.action_spec.rand((8,)), steps)
+    advance(fights, fights.reset(), fights.action_spec.rand((DRAWN,)), steps)
     total["everything"] = time.process_time() - start
     for module, name, function in originals:
         setattr(module, name, function)

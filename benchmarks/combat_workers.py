@@ -4,11 +4,20 @@ import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from contest import serve
 
 FIGHTS = 2048
+DRAWN = 8  # different actions, in turn
 TICS = 7  # of 35 per second: the 0.2 s of a combat step
+
+
+def advance(fights: Any, current: Any, actions: Any, steps: int) -> Any:
+    """So many steps of all fights, finished ones reset."""
+    for step in range(steps):
+        _, current = fights.step_and_maybe_reset(current.set("action", actions[step % len(actions)]))
+    return current
 
 
 def ours() -> Callable[[int], None]:
@@ -19,15 +28,12 @@ def ours() -> Callable[[int], None]:
 
     torch.set_num_threads(1)
     fights = CombatEnv(FIGHTS, seed=0)
-    actions = fights.action_spec.rand((8,))
+    actions = fights.action_spec.rand((DRAWN,))
     current = fights.reset()
-    made = 0
 
     def run(steps: int) -> None:
-        nonlocal current, made
-        for _ in range(steps):
-            _, current = fights.step_and_maybe_reset(current.set("action", actions[made % len(actions)]))
-            made += 1
+        nonlocal current
+        current = advance(fights, current, actions, steps)
 
     return run
 

@@ -79,6 +79,14 @@ class _Space:
         return theta * 0.5
 
 
+def _updates(learner, batch):
+    def run(n):
+        for _ in range(n):
+            learner.update(batch)
+
+    return run
+
+
 def coachable(precision, fused=True, order="simultaneous"):
     import torch
     from torchrl.objectives import SACLoss
@@ -97,13 +105,7 @@ def coachable(precision, fused=True, order="simultaneous"):
     )
     loss.make_value_estimator(gamma=GAMMA)
     learner = Learner(loss, actor_lr=LR, critic_lr=LR, tau=TAU, precision=precision, fused=fused, update_order=order)
-    batch = _batch()
-
-    def run(n):
-        for _ in range(n):
-            learner.update(batch)
-
-    return run
+    return _updates(learner, _batch())
 
 
 def our_loss(name, precision="bf16"):
@@ -131,13 +133,7 @@ def our_loss(name, precision="bf16"):
     loss = make_loss(make_gaussian_actor(OBS, ACT, _Space(), widths), [critic(), critic()], alpha=ALPHA, **arguments)
     loss.make_value_estimator(gamma=GAMMA)
     learner = Learner(loss, actor_lr=LR, critic_lr=LR, tau=TAU, precision=precision, update_order="policy_first")
-    batch = _batch()
-
-    def run(n):
-        for _ in range(n):
-            learner.update(batch)
-
-    return run
+    return _updates(learner, _batch())
 
 
 def gamepad(entropy_samples):
@@ -159,12 +155,7 @@ def gamepad(entropy_samples):
     learner = Learner(loss, actor_lr=LR, critic_lr=LR, tau=TAU, precision="bf16", update_order="policy_first")
     batch = _batch()
     batch["action"] = GAMEPAD.spec(batch.batch_size).rand()
-
-    def run(n):
-        for _ in range(n):
-            learner.update(batch)
-
-    return run
+    return _updates(learner, batch)
 
 
 def torchrl(network):

@@ -9,7 +9,14 @@ from typing import Any
 
 from coachable.domain import Domain, load_domain
 from coachable.evaluation.figures import draw_style_grid
-from coachable.evaluation.style_grid import StyleGrid, evaluate_grid, markdown_table, mean_of, write_csv
+from coachable.evaluation.style_grid import (
+    StyleGrid,
+    evaluate_grid,
+    markdown_table,
+    mean_of,
+    training_counts,
+    write_csv,
+)
 from coachable.evaluation.switching import SwitchReport, evaluate_switching
 from coachable.training.weights import LoadedPolicy, load_policy
 
@@ -86,10 +93,10 @@ def _report(
     switching: SwitchReport,
     switch_episodes: int,
 ) -> str:
-    known = [f"{agent.metadata[name]:,} {name}" for name in ("frames", "updates") if agent.metadata.get(name)]
     columns = {name: "" for name in grid.cells[0]} | dict(domain.columns)
     text = f"# {domain.name}: requested and measured style\n\n"
-    text += f"Deterministic policy{' after ' + ', '.join(known) if known else ''}; {rows[0]['episodes']} episodes of "
+    trained = training_counts(agent)
+    text += f"Deterministic policy{' after ' + trained if trained else ''}; {rows[0]['episodes']} episodes of "
     text += f"{grid.steps} steps per style, seed {grid.seed}.\n\n![style grid](grid.png)\n\n"
     text += markdown_table(rows, columns)
     if response:

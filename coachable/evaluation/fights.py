@@ -13,9 +13,10 @@ import torch
 
 from coachable.envs.combat.styles import single_styles
 from coachable.envs.combat.tables import ELEMENTS, MACHINES, SITES, STYLES, UNSEEN_MACHINES
+from coachable.evaluation.figures import readable
 from coachable.evaluation.rollouts import record_episodes
 from coachable.evaluation.statistics import rank_correlation
-from coachable.evaluation.style_grid import markdown_table, write_csv
+from coachable.evaluation.style_grid import markdown_table, training_counts, write_csv
 from coachable.evaluation.sweep import sweep_weights
 from coachable.styles import StyleSpace
 from coachable.transforms import coachable_env
@@ -200,7 +201,7 @@ def _sweep(
 
 
 def _correlations(sweep: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Rank correlation of score and weight; a weight that is swept downwards is to lower its score."""
+    """Rank correlation of score and weight."""
     found = {}
     for name in dict.fromkeys(row["style"] for row in sweep):
         points = [row for row in sweep if row["style"] == name]
@@ -218,10 +219,10 @@ def draw_damage(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     for (i, j), share in np.ndenumerate(shares):
         axes.text(j, i, f"{share:.2f}", ha="center", va="center", fontsize=7, color="white" if share > 0.6 else "black")
     axes.axhline(len(SOURCES) - 0.5, color="0.4", lw=1)
-    names = [str(row["style"]).replace("_", " ") for row in rows]
+    names = [readable(row["style"]) for row in rows]
     axes.set_xticks(range(len(rows)), [f"{n}\n{row['won']:.0%} won" for n, row in zip(names, rows, strict=True)])
     axes.tick_params(axis="x", labelrotation=60, labelsize=8)
-    axes.set_yticks(range(len(kinds)), [kind.replace("_", " ") for kind in kinds], fontsize=8)
+    axes.set_yticks(range(len(kinds)), list(map(readable, kinds)), fontsize=8)
     axes.set(xlabel="requested style", title="share of the damage (below the line: while the state was active)")
     figure.savefig(path, dpi=130)
     plt.close(figure)
@@ -238,7 +239,7 @@ def draw_sweep(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         points = [row for row in rows if row["style"] == name]
         panel.plot([p["weight"] for p in points], [p["style_score"] for p in points], marker="o", ms=4, label="score")
         panel.plot([p["weight"] for p in points], [p["won"] for p in points], ls="--", marker="x", ms=4, label="won")
-        panel.set(title=name.replace("_", " "), xlabel="weight")
+        panel.set(title=readable(name), xlabel="weight")
         panel.set_ylim(-0.05, None)
         panel.grid(alpha=0.3)
     for panel in list(grid.flat)[len(names) :]:
@@ -256,10 +257,10 @@ def _report(
     steps: int,
     seed: int,
 ) -> str:
-    known = [f"{agent.metadata[name]:,} {name}" for name in ("frames", "updates") if agent.metadata.get(name)]
-    after = f" after {', '.join(known)}" if known else ""
-    text = f"# combat: requested and measured style\n\nDeterministic policy{after}; {episodes} fights of at most "
-    text += f"{steps} steps per style and machine, seed {seed}.\n\n![damage by style](damage.png)\n\n"
+    trained = training_counts(agent)
+    text = "# combat: requested and measured style\n\n"
+    text += f"Deterministic policy{' after ' + trained if trained else ''}; {episodes} fights of at most {steps} "
+    text += f"steps per style and machine, seed {seed}.\n\n![damage by style](damage.png)\n\n"
     scores = ["" if row["style_score"] is None else f"{row['style_score']:.2f}" for row in tables["damage"]]
     table = [{**row, "score": score} for row, score in zip(tables["damage"], scores, strict=True)]
     columns = {"style": "", "won": ".0%", "score": "", "damage_per_fight": ".0f", "seconds": ".0f"}

@@ -24,7 +24,7 @@ from coachable.evaluation.runs import (
     flat_row,
     response_rows,
 )
-from coachable.evaluation.style_grid import mean_of, write_csv
+from coachable.evaluation.style_grid import mean_of, training_counts, write_csv
 from coachable.styles import Setpoint
 from coachable.training.weights import LoadedPolicy, load_policy
 
@@ -135,14 +135,10 @@ def _formats(styles: StyleTable, domain: Domain) -> dict[str, str]:
 
 
 def _lead(agents: Mapping[str, LoadedPolicy], runs: Sequence[Run], episodes: int) -> str:
-    known = [
-        f"{agent.metadata[name]:,} {name}"
-        for agent in agents.values()
-        for name in ("frames", "updates")
-        if agent.metadata.get(name)
-    ]
-    trained = f", trained for {', '.join(known)}" if len(agents) == 1 and known else ""
-    subject = f"The deterministic policy of {next(iter(agents))}{trained}" if len(agents) == 1 else "Several agents"
+    (name, agent), *others = agents.items()
+    counts = training_counts(agent)
+    trained = f", trained for {counts}" if counts else ""
+    subject = "Several agents" if others else f"The deterministic policy of {name}{trained}"
     grid = runs[0].grid
     return (
         f"{subject}. {len(runs)} runs ({', '.join(run.label for run in runs)}) of {episodes} episodes in each of "

@@ -16,6 +16,7 @@ from coachable.domain import Domain
 from coachable.evaluation.rollouts import record_episodes
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
 from coachable.styles import Setpoint, StyleSpace
+from coachable.training.weights import LoadedPolicy
 from coachable.transforms import coachable_env
 
 
@@ -149,6 +150,12 @@ def markdown_table(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str]
     lines = ["| " + " | ".join(columns) + " |", "|" + "--|" * len(columns)]
     lines += ["| " + " | ".join(format(row[c], spec) for c, spec in columns.items()) + " |" for row in rows]
     return "\n".join(lines) + "\n"
+
+
+def training_counts(agent: LoadedPolicy) -> str:
+    """How long it was trained, such as "800,000 frames, 36,798 updates"; empty where that is not known."""
+    counts = {name: agent.metadata.get(name) for name in ("frames", "updates")}
+    return ", ".join(f"{count:,} {name}" for name, count in counts.items() if count)
 
 
 def _distinct(items: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -33,12 +33,13 @@ def _as_trained(settings: Mapping[str, Any]) -> Domain:
     """With the machines, styles and observation of a training, and its length of a fight."""
     options = {name: value for name, value in settings.items() if name not in ("_target_", "num_envs", "components")}
     styles: Sequence[str] | None = settings.get("styles")
+    make_space = partial(combat_style_space, styles, settings.get("reward_scale", "sim"))
     return replace(
         DOMAIN,
         make_env=partial(make_combat_env, **options),
-        make_space=partial(combat_style_space, styles, settings.get("reward_scale", "sim")),
+        make_space=make_space,
         measures=CombatMeasures(styles),
-        grid=single_styles(combat_style_space(styles)),
+        grid=single_styles(make_space()),
         episode_steps=settings.get("episode_steps", EPISODE_STEPS),
         observation_groups=observation_groups(settings.get("observation", "full")),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from coachable.envs.racing.circuits import load_track
 from coachable.envs.racing.driver import LineFollower
@@ -68,10 +68,18 @@ def rival_env(num_envs: int = 64, **options: Any) -> RacingEnv:
     return RacingEnv(num_envs, **settings)
 
 
-_FAMILIES: dict[str, tuple[Callable[..., RacingEnv], Callable[[], StyleSpace], Callable[..., StyleReward]]] = {
-    "drift": (drift_env, drift_style_space, drift_style_reward),
-    "resources": (resource_env, resource_style_space, resource_style_reward),
-    "aggressiveness": (rival_env, aggressiveness_style_space, aggressiveness_style_reward),
+class Family(NamedTuple):
+    """What a family of styles is trained with."""
+
+    make_env: Callable[..., RacingEnv]
+    make_space: Callable[[], StyleSpace]
+    make_reward: Callable[..., StyleReward]
+
+
+_FAMILIES = {
+    "drift": Family(drift_env, drift_style_space, drift_style_reward),
+    "resources": Family(resource_env, resource_style_space, resource_style_reward),
+    "aggressiveness": Family(rival_env, aggressiveness_style_space, aggressiveness_style_reward),
 }
 FAMILIES = tuple(_FAMILIES)
 
@@ -86,6 +94,16 @@ def check_family(family: str) -> None:
         raise ValueError(f"unknown family {family!r}: expected drift, resources or aggressiveness")
 
 
+def racing_family(family: str) -> Family:
+    """The family of that name.
+
+    Raises:
+        ValueError: naming the families.
+    """
+    check_family(family)
+    return _FAMILIES[family]
+
+
 def family_env(num_envs: int = 64, *, family: str, **options: Any) -> RacingEnv:
     """The environment of a family.
 
@@ -94,12 +112,10 @@ def family_env(num_envs: int = 64, *, family: str, **options: Any) -> RacingEnv:
         family: drift, resources or aggressiveness.
         **options: of `RacingEnv`.
     """
-    check_family(family)
-    return _FAMILIES[family][0](num_envs, **options)
+    return racing_family(family).make_env(num_envs, **options)
 
 
 def family_style(family: str) -> tuple[StyleSpace, Callable[..., StyleReward]]:
     """Style space and `make_style_reward(space, **settings)` of a family."""
-    check_family(family)
-    _, make_space, make_reward = _FAMILIES[family]
-    return make_space(), make_reward
+    found = racing_family(family)
+    return found.make_space(), found.make_reward

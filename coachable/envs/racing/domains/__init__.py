@@ -2,30 +2,60 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
 from coachable.domain import Domain
+from coachable.envs.racing.env import EPISODE_STEPS
+from coachable.envs.racing.families import racing_family
+from coachable.envs.racing.measures import RacingMeasures
 from coachable.envs.racing.observation import COURSE_POINTS, observation_groups
+from coachable.envs.racing.render import RacingRenderer
+from coachable.envs.racing.simulation import CONTROL_STEP
 
 
-def as_trained(domain: Domain, cars: int, settings: Mapping[str, Any]) -> Domain:
-    """A domain with the track, the car and the observation of a training, and its length of an episode.
+def racing_domain(
+    family: str,
+    cars: int,
+    grid: Mapping[str, Sequence[Any]] | Sequence[Mapping[str, Any]],
+    columns: Mapping[str, str],
+) -> Domain:
+    """The domain of a family of style.
 
     Args:
-        domain: to vary.
-        cars: of a race, unless the settings say otherwise.
-        settings: `env` of the training's configuration.
+        family: drift, resources or aggressiveness.
+        cars: of a race.
+        grid: see `Domain`.
+        columns: what is published beside survival, pace and time off course.
     """
-    options = {name: value for name, value in settings.items() if name not in ("_target_", "family", "num_envs")}
-    options |= {"compiled": False, "device": "cpu"}
-    pool = options.get("car") == "pool"
-    points = options.get("course_points", COURSE_POINTS)
-    return replace(
-        domain,
-        make_env=partial(domain.make_env, **options),
-        episode_steps=options.get("episode_steps", domain.episode_steps),
-        observation_groups=observation_groups(options.get("cars", cars), pool, points),
+    make_env, make_space, make_reward = racing_family(family)
+
+    def as_trained(settings: Mapping[str, Any]) -> Domain:
+        """With the track, the car and the observation of a training, and its length of an episode."""
+        options = {name: value for name, value in settings.items() if name not in ("_target_", "family", "num_envs")}
+        options |= {"compiled": False, "device": "cpu"}
+        pool, points = options.get("car") == "pool", options.get("course_points", COURSE_POINTS)
+        return replace(
+            domain,
+            make_env=partial(make_env, **options),
+            episode_steps=options.get("episode_steps", domain.episode_steps),
+            observation_groups=observation_groups(options.get("cars", cars), pool, points),
+        )
+
+    domain = Domain(
+        name=f"racing_{family}",
+        make_env=make_env,
+        make_space=make_space,
+        make_reward=make_reward,
+        measures=RacingMeasures(family),
+        make_renderer=RacingRenderer,
+        grid=grid,
+        control_step=CONTROL_STEP,
+        episode_steps=EPISODE_STEPS,
+        columns={"survived": ".0%", "pace": ".1f", "off": ".1%"} | dict(columns),
+        observation_groups=observation_groups(cars, pool=False),
+        as_trained=as_trained,
     )
+    return domain
