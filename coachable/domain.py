@@ -89,7 +89,8 @@ class Domain:
         as_trained: this domain as the settings of a training made it (`env` of its configuration: which machines,
             which cars); None where trainings do not differ.
         evaluation: what `coachable evaluate` does instead of running the grid and switched styles, with the arguments
-            of `coachable.evaluation.evaluate.evaluate` but `source`, preceded by the domain and the loaded policy.
+            of `coachable.evaluation.evaluate.evaluate` but `source`, preceded by the domain and the loaded policy; a
+            report also gives it the `sweeps` (`sweep_weights`) that it has made.
     """
 
     name: str
@@ -111,6 +112,20 @@ class Domain:
         if isinstance(self.grid, Mapping):
             return [dict(zip(self.grid, values, strict=True)) for values in product(*self.grid.values())]
         return [dict(cell) for cell in self.grid]
+
+
+def deferred(path: str) -> Callable[..., str]:
+    """A function looked up when it is called: evaluation knows domains, domains may only name their evaluation.
+
+    Args:
+        path: module and name, "package.module.function".
+    """
+    module, name = path.rsplit(".", 1)
+
+    def call(*arguments: Any, **settings: Any) -> str:
+        return getattr(import_module(module), name)(*arguments, **settings)
+
+    return call
 
 
 def domain_names() -> list[str]:

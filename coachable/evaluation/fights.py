@@ -1,4 +1,4 @@
-"""What a fighter does under every style: damage matrix, wins, outcomes, parts, and the response to a weight (paper)."""
+"""What a fighter does under every style: damage matrix, wins, parts, response to a weight, switches (paper)."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ import numpy as np
 import torch
 
 from coachable.envs.combat.styles import single_styles
-from coachable.envs.combat.tables import ELEMENTS, MACHINES, SITES, STYLES, UNSEEN_MACHINES
+from coachable.envs.combat.tables import MACHINES, SITES, STYLES, UNSEEN_MACHINES
+from coachable.evaluation.coached_fight import SOURCES, STATES, CoachedFights, draw_timeline, fight_coached, requests_of
 from coachable.evaluation.figures import readable
 from coachable.evaluation.rollouts import record_episodes
 from coachable.evaluation.statistics import rank_correlation
 from coachable.evaluation.style_grid import markdown_table, training_counts, write_csv
-from coachable.evaluation.sweep import sweep_weights
+from coachable.evaluation.sweep import WeightSweep, sweep_weights
 from coachable.styles import StyleSpace
 from coachable.transforms import coachable_env
 
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from coachable.domain import Domain
     from coachable.training.weights import LoadedPolicy
 
-SOURCES, STATES, PARTS = STYLES[:8], tuple(s for s in STYLES if s in ELEMENTS), STYLES[8:11]
+PARTS = STYLES[8:11]
 _COMPOSED_WEAPON = "corrosive_blastsling"  # whose ammunition carries several elements
 _PAIRS = ("Apex Thunderjaw", "Slaughterspine")  # of these, two at once are out of distribution
 _OUTCOMES = ("won", "died", "out_of_bounds", "timeout")
@@ -56,28 +57,32 @@ def evaluate_fights(
     out: Path,
     *,
     episodes: int = 20,
-    switch_episodes: int = 0,
+    switch_episodes: int = 60,
     steps: int | None = None,
     seed: int = 0,
     num_threads: int | None = None,
     progress: bool = True,
+    sweeps: Sequence[WeightSweep] | None = None,
 ) -> str:
     """Fight every machine in every style and write tables, figures and a report.
 
     Files: `damage.csv` (what was done under which style), `wins.csv` (by style and machine), `unseen.csv` (wins against
     machines and pairs that no training has), `outcomes.csv` (by machine), `sweep.csv` (share of a style's damage over
-    its weight), `damage.png`, `sweep.png`, `report.md`, `summary.json`.
+    its weight), `switches.csv` (what follows when the style switches during fights), `timeline.csv` (some fights in a
+    row, step by step), `damage.png`, `sweep.png`, `timeline.png`, `report.md`, `summary.json`.
 
     Args:
         domain: combat, as the agent was trained in.
         agent: the policy; acts deterministically.
         out: folder, created if missing.
         episodes: fights per style and machine, at sites drawn at random.
-        switch_episodes: not used: styles that switch during a fight are for `coachable render`.
+        switch_episodes: sequences of fights with a style that switches, each `steps` long; 0 for none. There are none
+            for an agent with fewer than two styles of damage.
         steps: length of a fight; default: the domain's.
         seed: of scenarios and fights. The same seed gives the same files.
         num_threads: not used: threads are torch's own.
         progress: show progress bars.
+        sweeps: of `sweep_weights`, where they exist already.
 
     Returns:
         The report, Markdown.
@@ -106,10 +111,19 @@ def evaluate_fights(
             strict=True,
         )
     ]
-    sweep = _sweep(domain, agent, **options)
+    if sweeps is None:
+        sweeps = sweep_weights(domain, agent.actor, agent.space, points=7, **options)
+    sweep = _sweep_rows(sweeps)
     tables = {"damage": damage, "wins": wins, "unseen": unseen, "outcomes": outcomes, "sweep": sweep}
+    coached = None
+    if switch_episodes and len(requests_of(space)) > 1:
+        coached = fight_coached(domain, agent, sequences=switch_episodes, steps=steps, seed=seed, progress=progress)
+        timeline = coached.timeline()
+        tables |= {"switches": coached.switches(), "timeline": timeline}
+        draw_timeline(timeline, out / "timeline.png")
     for name, rows in tables.items():
-        write_csv(rows, out / f"{name}.csv")
+        if rows:
+            write_csv(rows, out / f"{name}.csv")
     draw_damage(damage, out / "damage.png")
     draw_sweep(sweep, out / "sweep.png")
     scores = {row["style"]: row["style_score"] for row in damage if row["style_score"] is not None}
@@ -118,10 +132,13 @@ def evaluate_fights(
         "win_rate": {row["style"]: row["won"] for row in damage},
         "rank_correlation": _correlations(sweep),
         "fights_per_style": len(machines) * episodes,
+        "switching": {row["style"]: row for row in tables.get("switches", [])}.get("all styles"),
         "seed": seed,
     }
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     report = _report(agent, tables, summary, episodes, steps, seed)
+    if coached is not None:
+        report += _switch_report(coached, tables["switches"])
     (out / "report.md").write_text(report)
     return report
 
@@ -185,13 +202,10 @@ def _outcomes(fights: Mapping[str, np.ndarray], machines: Sequence[str]) -> list
     ]
 
 
-def _sweep(
-    domain: Domain, agent: LoadedPolicy, *, episodes: int, steps: int, seed: int, progress: bool
-) -> list[dict[str, Any]]:
+def _sweep_rows(sweeps: Sequence[WeightSweep]) -> list[dict[str, Any]]:
     """Share of the damage that counts for a weight, from 0 to its far end; units removed per fight for parts."""
     rows = []
-    options: dict[str, Any] = {"points": 7, "episodes": episodes, "steps": steps, "seed": seed, "progress": progress}
-    for sweep in sweep_weights(domain, agent.actor, agent.space, **options):
+    for sweep in sweeps:
         for position, value in enumerate(sweep.values):
             done, damage = sweep.episodes[sweep.weight][position], sweep.episodes["damage"][position]
             share = done.mean() if sweep.weight in PARTS else done.sum() / max(damage.sum(), 1e-9)
@@ -272,3 +286,22 @@ def _report(
     text += "\n## Outcomes\n\n" + markdown_table(tables["outcomes"], dict.fromkeys(tables["outcomes"][0], ""))
     text += "\n## Weight and score\n\n![score over weight](sweep.png)\n\nRank correlation: "
     return text + ", ".join(f"{name} {value:.2f}" for name, value in summary["rank_correlation"].items()) + ".\n"
+
+
+def _switch_report(coached: CoachedFights, rows: Sequence[Mapping[str, Any]]) -> str:
+    steps, sequences = coached.requests.shape
+    period, ends = coached.period * coached.control_step, coached.outcomes()
+    text = f"\n## Style switched every {period:g} s\n\n![damage, hits and health over time](timeline.png)\n\n"
+    text += "One sequence of fights, asked for every style in turn. "
+    text += (
+        f"{sequences} such sequences of {steps * coached.control_step:g} s, the others with styles in random order: "
+    )
+    text += f"{ends['fights']} fights ended, {ends['won']} of them won.\n\n"
+    if rows:
+        formats = {"style": "", "switches": "", "complied": ".0%", "median_seconds": ".1f", "share": ".0%"}
+        text += markdown_table(rows, formats)
+    return text + (
+        "\nComplied: damage that counts for the style was done before the next switch. Median: seconds from the "
+        "switch to the first of it (not complied: infinite). Share: of the damage between the switch and the next one. "
+        "Where a fight ends the next one starts, and the way to the machine counts.\n"
+    )

@@ -30,6 +30,8 @@ from coachable.training.weights import LoadedPolicy, load_policy
 
 __all__ = ["report", "write_report"]
 
+_LONGEST_TABLE = 100  # rows; longer ones stay in their files
+
 
 def report(sources: Sequence[str | Path], out: Path, **settings: Any) -> str:
     """Evaluate an agent, or several trained with different seeds, and write the report.
@@ -113,7 +115,8 @@ def write_report(
     _switches(page, domain, runs, switch_episodes, formats, out)
     _tradeoffs(page, styles, runs, formats, out)
     if domain.evaluation is not None:
-        _own(page, domain, agent, out, seed=seed, episodes=episodes, steps=steps, progress=progress)
+        settings: dict[str, Any] = {"seed": seed, "episodes": episodes, "steps": steps, "progress": progress}
+        _own(page, domain, agent, out, **settings, switch_episodes=switch_episodes, sweeps=runs[0].sweeps)
     command = [f"coachable report {' '.join(agents)} --seed {seed} --episodes {episodes}"]
     command += [f"--switch-episodes {switch_episodes} --sweep-points {sweep_points}"]
     command += [f"--seeds {seeds}"] if len(agents) == 1 else []
@@ -249,7 +252,12 @@ def _own(page: Page, domain: Domain, agent: LoadedPolicy, out: Path, **settings:
         parts = [picture(figure, f"{readable(file.stem)}, a figure")] if figure.is_file() else []
         columns = {name: [value for row in rows if isinstance(value := row[name], float)] for name in rows[0]}
         large = [name for name, values in columns.items() if values and max(values) >= 1000]
-        page.section(readable(file.stem).capitalize(), *parts, table(rows, dict.fromkeys(large, ".0f")))
+        parts.append(
+            table(rows, dict.fromkeys(large, ".0f"))
+            if len(rows) <= _LONGEST_TABLE
+            else paragraph(f"{len(rows)} rows: {file.relative_to(out)}")
+        )
+        page.section(readable(file.stem).capitalize(), *parts)
 
 
 def _number(text: str) -> float | str:

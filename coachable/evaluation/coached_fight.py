@@ -1,0 +1,262 @@
+"""Fights one after the other whose style is switched while they go on: what is done after a switch, and how soon."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import matplotlib
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from tqdm import tqdm
+
+from coachable.envs.combat.constants import PLAYER_HP
+from coachable.envs.combat.tables import ELEMENTS, STYLES
+from coachable.envs.combat.traits import MACHINE_NAMES
+from coachable.evaluation.figures import readable
+from coachable.evaluation.runs import SWITCH_PERIOD
+from coachable.keys import STYLE
+from coachable.styles import StyleSpace
+from coachable.transforms import coachable_env
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+if TYPE_CHECKING:
+    from coachable.domain import Domain
+    from coachable.training.weights import LoadedPolicy
+
+__all__ = ["SOURCES", "STATES", "CoachedFights", "draw_timeline", "fight_coached", "requests_of"]
+
+SOURCES = STYLES[:8]
+STATES = tuple(style for style in STYLES if style in ELEMENTS)
+_OUTCOMES = ("won", "died", "out_of_bounds")
+
+
+@dataclass(frozen=True)
+class CoachedFights:
+    """N sequences of fights, T steps each. Where a fight ends the next one starts; the request goes on.
+
+    Attributes:
+        names: styles that are requested, each alone and at its maximum.
+        requests: (T, N) number of the requested style; it changes every `period` steps. Sequence 0 has the styles in
+            their order, the others have them at random.
+        period: steps between switches.
+        control_step: [s].
+        measures: name to (T, N), what `CombatMeasures` measures in each step.
+        player, machine: (T, N) health after each step, as a share of full health.
+        opponent: (T, N) number of the machine in `MACHINE_NAMES`.
+        done: (T, N) bool, last steps of fights.
+    """
+
+    names: tuple[str, ...]
+    requests: np.ndarray
+    period: int
+    control_step: float
+    measures: Mapping[str, np.ndarray]
+    player: np.ndarray
+    machine: np.ndarray
+    opponent: np.ndarray
+    done: np.ndarray
+
+    def switches(self) -> list[dict[str, Any]]:
+        """What followed the switches to each style, until the next switch, and to all of them ("all styles").
+
+        Returns:
+            Rows with `style`; `switches`, their number; `complied`, share of them followed by damage that counts for
+            the style; `median_seconds` from the switch to the first of it, where none counts as infinite; and `share`,
+            what counts over all damage.
+        """
+        starts = range(self.period, len(self.requests) - self.period + 1, self.period)
+        if not starts:
+            return []
+
+        def windows(values: np.ndarray) -> np.ndarray:  # (T, N) -> (switches, period, N)
+            return np.stack([values[start : start + self.period] for start in starts])
+
+        asked, damage = windows(np.nan_to_num(self.measures["requested"])), windows(self.measures["damage"])
+        wanted = windows(self.requests)[:, 0]
+        first = np.where((asked > 0).any(1), ((asked > 0).argmax(1) + 1) * self.control_step, np.inf)
+        rows = []
+        for number, name in enumerate([*self.names, "all styles"]):
+            mine = wanted == number if number < len(self.names) else np.ones_like(wanted, dtype=bool)
+            if not mine.any():
+                continue
+            counted, total = asked.sum(1)[mine].sum(), damage.sum(1)[mine].sum()
+            rows.append(
+                {
+                    "style": name,
+                    "switches": int(mine.sum()),
+                    "complied": float(np.isfinite(first[mine]).mean()),
+                    "median_seconds": float(np.median(first[mine])),
+                    "share": float(counted / total) if total > 0 else float("nan"),
+                }
+            )
+        return rows
+
+    def outcomes(self) -> dict[str, int]:
+        """How many fights ended, and how; those that the end of a sequence cut are left out."""
+        ended = {name: int((self.measures[name] * self.done).sum()) for name in _OUTCOMES}
+        return {"fights": int(self.done.sum()), **ended}
+
+    def timeline(self) -> list[dict[str, Any]]:
+        """Sequence 0, one row per step, until every style was requested once.
+
+        `machine` is its type, `player_health` and `machine_health` are shares, sources are in HP of damage; `ended`
+        says how the fight ended in this step, if it did.
+        """
+        rows, fight = [], 0
+        for step in range(min(len(self.names) * self.period, len(self.requests))):
+            ended = next((name for name in _OUTCOMES if self.measures[name][step, 0]), "timeout")
+            row: dict[str, Any] = {"seconds": (step + 1) * self.control_step, "fight": fight}
+            row["machine"] = MACHINE_NAMES[self.opponent[step, 0]]
+            row["requested"] = self.names[self.requests[step, 0]]
+            row |= {"player_health": float(self.player[step, 0]), "machine_health": float(self.machine[step, 0])}
+            row |= {name: float(self.measures[name][step, 0]) for name in SOURCES}
+            row["counted"] = float(np.nan_to_num(self.measures["requested"][step, 0]))
+            row["ended"] = ended if self.done[step, 0] else ""
+            fight += bool(self.done[step, 0])
+            rows.append(row)
+        return rows
+
+
+def requests_of(space: StyleSpace) -> tuple[str, ...]:
+    """The styles that ask for damage of a kind, which can be told from every hit: sources and states, not parts."""
+    return tuple(name for name in space.names if name in (*SOURCES, *STATES))
+
+
+@torch.no_grad()
+def fight_coached(
+    domain: Domain, agent: LoadedPolicy, *, sequences: int, steps: int, seed: int, progress: bool
+) -> CoachedFights:
+    """Run the fights with the deterministic policy.
+
+    Args:
+        domain: combat, as the agent was trained in; its machines and sites are drawn at random.
+        agent: with at least two styles that `requests_of` names.
+        sequences: N.
+        steps: T.
+        seed: of scenarios, fights and requests.
+        progress: show a bar.
+
+    Raises:
+        ValueError: if there is nothing to switch between.
+    """
+    names = requests_of(agent.space)
+    if len(names) < 2 or sequences < 1:
+        raise ValueError(f"{sequences} sequences with the styles {list(names)}: expected at least 1 and 2 styles")
+    high = dict(zip(agent.space.names, agent.space.high.tolist(), strict=True))
+    theta = torch.stack([agent.space.make(strict=True, **{name: high[name]}) for name in names])
+    period = max(1, min(SWITCH_PERIOD, steps // len(names)))
+    requests = _draw_requests(len(names), -(-steps // period), sequences, seed).repeat_interleave(period, 0)[:steps]
+
+    simulation: Any = domain.make_env(num_envs=sequences, seed=seed)
+    env = coachable_env(simulation, agent.space, domain.make_reward(agent.space), seed=seed)
+    env.set_seed(seed)
+    current = env.reset(TensorDict({STYLE: theta[requests[0]]}, env.batch_size))
+    rows: list[dict[str, torch.Tensor]] = []
+    label = f"{sequences} sequences of fights, style switched every {period} steps" if progress else None
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        for request in tqdm(requests, desc=label, disable=True if label is None else None, leave=False):
+            transition = env.step(agent.actor(current.set(STYLE, theta[request])))
+            row = domain.measures.step(transition)
+            state = simulation.state
+            row |= {"player health": state.hp / PLAYER_HP, "opponent": state.machine[0].clone()}
+            row |= {"machine health": state.enemy_hp.sum(0) / simulation.traits.hp.sum(0)}
+            row["done"] = transition.get(("next", "done"))[:, 0]
+            rows.append(row)
+            current = env.maybe_reset(step_mdp(transition))
+    env.close()
+    record = {name: torch.stack([row[name] for row in rows]).numpy() for name in rows[0]}
+    player, machine = (record.pop(f"{who} health").clip(0.0, 1.0) for who in ("player", "machine"))
+    opponent, done = record.pop("opponent"), record.pop("done")
+    return CoachedFights(names, requests.numpy(), period, domain.control_step, record, player, machine, opponent, done)
+
+
+def _draw_requests(styles: int, windows: int, sequences: int, seed: int) -> torch.Tensor:
+    """(windows, sequences) numbers of styles, never the same twice in a row."""
+    generator = torch.Generator().manual_seed(seed)
+    further = torch.randint(1, styles, (windows, sequences), generator=generator)
+    further[0] = torch.randint(styles, (sequences,), generator=generator)
+    further[:, 0] = 1
+    further[0, 0] = 0
+    return further.cumsum(0) % styles
+
+
+def draw_timeline(rows: Sequence[Mapping[str, Any]], path: Path, *, bin_seconds: float = 1.0) -> None:
+    """Damage by source and health over time, under bands of the requested style (paper, timeline of a fight).
+
+    Args:
+        rows: of `CoachedFights.timeline`.
+        path: PNG file to write.
+        bin_seconds: width of the bars [s].
+    """
+    times = np.array([row["seconds"] for row in rows])
+    step = float(times[0])
+    colours = {source: f"C{number}" for number, source in enumerate(SOURCES)}
+    size = (min(24.0, 4.0 + 0.09 * float(times[-1])), 5.0)
+    figure, (top, ticks, bottom) = plt.subplots(
+        3, 1, figsize=size, sharex=True, height_ratios=[3, 0.4, 2], layout="constrained"
+    )
+
+    edges = np.arange(0.0, times[-1] + bin_seconds, bin_seconds)
+    requested = {row["requested"] for row in rows}
+    base = np.zeros(len(edges) - 1)
+    for source in SOURCES:
+        done = np.array([row[source] for row in rows])
+        height = np.histogram(times - step / 2, edges, weights=done)[0] / bin_seconds
+        if done.any() or source in requested:
+            top.bar(edges[:-1], height, bin_seconds, base, align="edge", color=colours[source], label=readable(source))
+        base += height
+    damage = np.array([sum(row[source] for source in SOURCES) for row in rows])
+    counted = np.array([row["counted"] for row in rows])
+    for hits, level, colour in ((counted > 0, 1, "tab:green"), ((damage > 0) & (counted <= 0), 0, "tab:red")):
+        ticks.eventplot(times[hits], lineoffsets=level, linelengths=0.8, colors=colour)
+    for fight in dict.fromkeys(row["fight"] for row in rows):
+        own = [row for row in rows if row["fight"] == fight]
+        for name, style in (("player", "k-"), ("machine", "r--")):
+            health = [row[f"{name}_health"] for row in own]
+            bottom.plot([row["seconds"] for row in own], health, style, label=None if fight else name)
+        start, ended = own[0]["seconds"] - step, readable(own[-1]["ended"])
+        text = f"{own[0]['machine']}\n{ended}".strip()
+        bottom.text(start + 0.3, 1.06, text, fontsize=7, va="bottom", clip_on=False)
+    _mark(rows, colours, (top, ticks, bottom))
+
+    top.set_ylabel("damage [HP/s]")
+    top.set_ylim(0, max(1.0, 1.2 * float(base.max())))
+    top.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    ticks.set_yticks([0, 1], ["other hits", "as requested"], fontsize=7)
+    ticks.set_ylim(-0.6, 1.6)
+    bottom.set(ylabel="health", xlabel="time [s]", xlim=(0, times[-1]))
+    bottom.set_ylim(0, 1.45)
+    bottom.set_yticks([0, 0.5, 1])
+    bottom.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def _mark(rows: Sequence[Mapping[str, Any]], colours: Mapping[str, Any], panels: Sequence[Any]) -> None:
+    """Bands of the requested style, and lines where fights end."""
+    step = rows[0]["seconds"]
+    starts = [i for i, row in enumerate(rows) if i == 0 or row["requested"] != rows[i - 1]["requested"]]
+    for start, end in zip(starts, [*starts[1:], len(rows)], strict=True):
+        name, left, right = rows[start]["requested"], start * step, end * step
+        for panel in panels:
+            panel.axvspan(left, right, color=colours.get(name, "0.6"), alpha=0.15, lw=0)
+        panels[0].text(
+            (left + right) / 2,
+            0.99,
+            readable(name),
+            transform=panels[0].get_xaxis_transform(),
+            ha="center",
+            va="top",
+            fontsize=8,
+        )
+    for row in rows:
+        if row["ended"]:
+            for panel in panels:
+                panel.axvline(row["seconds"], color="0.3", lw=0.8, ls=":")
