@@ -89,8 +89,8 @@ class Domain:
         as_trained: this domain as the settings of a training made it (`env` of its configuration: which machines,
             which cars); None where trainings do not differ.
         evaluation: what `coachable evaluate` does instead of running the grid and switched styles, with the arguments
-            of `coachable.evaluation.evaluate.evaluate` but `source`, preceded by the domain and the loaded policy; a
-            report also gives it the `sweeps` (`sweep_weights`) that it has made.
+            of `coachable.evaluation.evaluate.evaluate` but `source`, preceded by the domain and the loaded policy.
+        evaluation_reads_sweeps: whether it also takes `sweeps`, which a report has made already (`sweep_weights`).
     """
 
     name: str
@@ -106,6 +106,7 @@ class Domain:
     observation_groups: Sequence[tuple[str, int]] = ()
     as_trained: Callable[[Mapping[str, Any]], Domain] | None = None
     evaluation: Callable[..., str] | None = None
+    evaluation_reads_sweeps: bool = False
 
     def cells(self) -> list[dict[str, Any]]:
         """The styles of the evaluation grid, by parameter name."""

@@ -115,8 +115,9 @@ def write_report(
     _switches(page, domain, runs, switch_episodes, formats, out)
     _tradeoffs(page, styles, runs, formats, out)
     if domain.evaluation is not None:
-        settings: dict[str, Any] = {"seed": seed, "episodes": episodes, "steps": steps, "progress": progress}
-        _own(page, domain, agent, out, **settings, switch_episodes=switch_episodes, sweeps=runs[0].sweeps)
+        own: dict[str, Any] = {"episodes": episodes, "switch_episodes": switch_episodes, "steps": steps, "seed": seed}
+        own |= {"sweeps": runs[0].sweeps} if domain.evaluation_reads_sweeps else {}
+        _own(page, domain, agent, out, num_threads=num_threads, progress=progress, **own)
     command = [f"coachable report {' '.join(agents)} --seed {seed} --episodes {episodes}"]
     command += [f"--switch-episodes {switch_episodes} --sweep-points {sweep_points}"]
     command += [f"--seeds {seeds}"] if len(agents) == 1 else []

@@ -131,8 +131,9 @@ def test_the_evaluation_has_the_switches(domain, tmp_path):
         domain, agent, tmp_path, episodes=1, switch_episodes=2, steps=20, progress=False, sweeps=sweeps
     )
     assert "## Style switched every 2 s" in report and "| skykiller |" in report
-    assert len(list(csv.DictReader((tmp_path / "sweep.csv").open()))) == 6  # those given, not its own
-    timeline = list(csv.DictReader((tmp_path / "timeline.csv").open()))
+    rows = {name: (tmp_path / f"{name}.csv").read_text().splitlines() for name in ("sweep", "timeline")}
+    assert len(rows["sweep"]) == 1 + 6  # those given, not its own
+    timeline = list(csv.DictReader(rows["timeline"]))
     assert [row["requested"] for row in timeline] == ["melee"] * 10 + ["skykiller"] * 10
     assert (tmp_path / "timeline.png").stat().st_size > 5_000
     without = evaluate_fights(domain, agent, tmp_path / "b", episodes=1, switch_episodes=0, steps=5, progress=False)

@@ -183,14 +183,19 @@ def test_the_page_is_one_file(folder):
 
 
 def test_what_a_domain_measures_itself_is_on_the_page(tmp_path):
-    def evaluation(domain, agent, out, *, episodes, steps, seed, progress):
+    def evaluation(domain, agent, out, *, episodes, sweeps, **settings):
+        assert settings == {"switch_episodes": 4, "steps": None, "seed": 0, "num_threads": None, "progress": False}
+        assert [sweep.weight for sweep in sweeps] == ["bold"] and episodes == 2
         out.mkdir()
+        (out / "every_step.csv").write_text("step\n" + "1\n" * 101)
         (out / "wins.csv").write_text("style,easy_machine\nred,0.5\n")
         (out / "wins.png").write_bytes((tmp_path / "styles.png").read_bytes())
         return "not used"
 
-    write_report(replace(DOMAIN, evaluation=evaluation), {"toy.pt": AGENT}, tmp_path, **SMALL)
+    domain = replace(DOMAIN, evaluation=evaluation, evaluation_reads_sweeps=True)
+    write_report(domain, {"toy.pt": AGENT}, tmp_path, **SMALL)
     page = (tmp_path / "report.html").read_text()
+    assert "101 rows: toy/every_step.csv" in page
     assert ">Wins</h2>" in page and "wins, a figure" in page and "easy machine" in page and "0.5" in page
 
 
