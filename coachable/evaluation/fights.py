@@ -98,11 +98,11 @@ def evaluate_fights(
     labels = [style_label(cell) for cell in cells]
     machines = list(agent.config["env"].get("machines") or MACHINES)
     options: dict[str, Any] = {"episodes": episodes, "steps": steps, "seed": seed, "progress": progress}
-    fights = _fight(domain, agent, cells, [(name,) for name in machines], **options)
-    damage, wins = _damage_rows(fights, labels), _win_rows(fights, labels, machines)
+    fights = fight_matrix(domain, agent, cells, [(name,) for name in machines], **options)
+    damage, wins = damage_rows(fights, labels), _win_rows(fights, labels, machines)
     outcomes = _outcomes(fights, machines)
-    alone = _fight(domain, agent, cells, [(name,) for name in UNSEEN_MACHINES], **options)
-    pairs = _fight(domain, agent, cells, [(name, name) for name in _PAIRS], **options)
+    alone = fight_matrix(domain, agent, cells, [(name,) for name in UNSEEN_MACHINES], **options)
+    pairs = fight_matrix(domain, agent, cells, [(name, name) for name in _PAIRS], **options)
     unseen = [
         one | two
         for one, two in zip(
@@ -143,7 +143,7 @@ def evaluate_fights(
     return report
 
 
-def _fight(
+def fight_matrix(
     domain: Domain,
     agent: LoadedPolicy,
     cells: Sequence[Mapping[str, float]],
@@ -172,7 +172,7 @@ def _fight(
     return {name: value.reshape(shape).double().numpy() for name, value in sums.items()}
 
 
-def _damage_rows(fights: Mapping[str, np.ndarray], labels: Sequence[str]) -> list[dict[str, Any]]:
+def damage_rows(fights: Mapping[str, np.ndarray], labels: Sequence[str]) -> list[dict[str, Any]]:
     """Per requested style: share of all damage by source and in each elemental state, units removed per fight."""
     rows = []
     for index, label in enumerate(labels):
