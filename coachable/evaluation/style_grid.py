@@ -91,6 +91,7 @@ def evaluate_grid(
     cells: Sequence[Mapping[str, Any]] | None = None,
     num_threads: int | None = None,
     progress: bool = True,
+    env_options: Mapping[str, Any] | None = None,
 ) -> StyleGrid:
     """Run `episodes` episodes in every cell, all of them in one batch.
 
@@ -104,15 +105,15 @@ def evaluate_grid(
         cells: styles by parameter name; default: the domain's grid.
         num_threads: physics threads.
         progress: show a bar.
+        env_options: further arguments of the domain's `make_env`.
     """
     if episodes < 1:
         raise ValueError(f"episodes per cell must be at least 1, got {episodes}")
     steps = steps or domain.episode_steps
     cells = domain.cells() if cells is None else [dict(cell) for cell in cells]
     theta = torch.stack([space.make(strict=True, **cell) for cell in cells]).repeat_interleave(episodes, 0)
-    env = coachable_env(
-        domain.make_env(num_envs=len(theta), num_threads=num_threads), space, domain.make_reward(space), seed=seed
-    )
+    simulation = domain.make_env(num_envs=len(theta), num_threads=num_threads, **(env_options or {}))
+    env = coachable_env(simulation, space, domain.make_reward(space), seed=seed)
     label = f"{len(cells)} styles x {episodes} episodes" if progress else None
     record = record_episodes(env, policy, theta, domain.measures, steps=steps, seed=seed, progress=label)
     env.close()

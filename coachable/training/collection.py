@@ -10,6 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import nn
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -18,6 +19,7 @@ from coachable.training.rng import preserved_rng
 
 __all__ = [
     "ResumableEnv",
+    "SelfPlayEnv",
     "collector_state",
     "evaluate_policy",
     "load_collector_state",
@@ -37,6 +39,15 @@ class ResumableEnv(Protocol):
 
     def load_simulator_state(self, state: dict[str, Any]) -> None:
         """Restores what `simulator_state` returned."""
+        ...
+
+
+@runtime_checkable
+class SelfPlayEnv(Protocol):
+    """An env in which the agent meets its own past."""
+
+    def follow(self, policy: nn.Module) -> None:
+        """The policy to take copies of."""
         ...
 
 
@@ -84,6 +95,9 @@ def make_collector(
         collector = Collector(make_env(seed), policy, use_buffers=False, trust_policy=True, **common, **plain)
         if next(collector.policy.parameters()) is not next(policy.parameters()):  # the loop relies on shared weights
             raise RuntimeError(f"the collector copied the policy: build it on {policy_device}, where it is to run")
+        simulation = simulation_env(collector.env)
+        if isinstance(simulation, SelfPlayEnv):
+            simulation.follow(policy)
         return collector
     if backend in ("process", "ray"):
         factories = [_SeededFactory(make_env, seed + i) for i in range(num_collectors)]

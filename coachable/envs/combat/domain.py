@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from importlib import import_module
 from typing import Any
 
-from coachable.domain import Domain
+from coachable.domain import Domain, deferred
 from coachable.envs.combat.constants import CONTROL_STEP, EPISODE_STEPS
 from coachable.envs.combat.env import CombatEnv
 from coachable.envs.combat.features import observation_groups
@@ -22,11 +21,6 @@ def make_combat_env(
 ) -> CombatEnv:
     """A `CombatEnv` that emits `components` for the measures. `num_threads` is not used: threads are torch's own."""
     return CombatEnv(num_envs, seed=seed, components=True, **options)
-
-
-def _evaluate(*arguments: Any, **settings: Any) -> str:
-    """`evaluate_fights`, looked up when it is called: evaluation knows domains, not the other way round."""
-    return import_module("coachable.evaluation.fights").evaluate_fights(*arguments, **settings)
 
 
 def _as_trained(settings: Mapping[str, Any]) -> Domain:
@@ -59,5 +53,5 @@ DOMAIN = Domain(
     observation_groups=observation_groups("full"),
     as_trained=_as_trained,
     evaluation_reads_sweeps=True,
-    evaluation=_evaluate,
+    evaluation=deferred("coachable.evaluation.fights.evaluate_fights"),
 )

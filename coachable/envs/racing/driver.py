@@ -78,8 +78,14 @@ class LineFollower:
         self._stiffness = math.tan(math.pi / 2 / car.shape)
         self._peak = tangent(car.peak_slip_angle)
 
-    def __call__(self, env: RacingEnv, observation: Tensor) -> Tensor:
-        """Actions (M, 2) for the last M cars of an env."""
+    def __call__(self, env: RacingEnv, observation: Tensor, share: Tensor | float = 1.0) -> Tensor:
+        """Actions (M, 2) for the last M cars of an env.
+
+        Args:
+            env: whose cars it drives.
+            observation: (M, D), not used: it looks at the state.
+            share: of its grip that each car of the env uses, (N,).
+        """
         m = len(observation)
         if self.speeds.device != observation.device:
             for name in ("speeds", "gains", "line"):
@@ -88,7 +94,7 @@ class LineFollower:
         tyres = tyre_view(env.garage.car, env.simulation.wheels, env.state, env.compound[0])
         speed = torch.sqrt(state.vx**2 + state.vy**2)
         steer = self._steer(env, state, run, tyres, speed)
-        pedal = self._pedal(env, state, run, tyres, speed)
+        pedal = self._pedal(env, state, run, tyres, speed, share)
         return torch.stack([steer, pedal], dim=-1)[len(speed) - m :]
 
     def _steer(self, env: RacingEnv, state: CarState, run: Run, tyres: TyreView, speed: Tensor) -> Tensor:
@@ -117,12 +123,14 @@ class LineFollower:
         steer = torch.where(lost, torch.sign(bearing) * car.steer_max, steer)
         return (steer / car.steer_max).clamp(-1.0, 1.0)
 
-    def _pedal(self, env: RacingEnv, state: CarState, run: Run, tyres: TyreView, speed: Tensor) -> Tensor:
+    def _pedal(
+        self, env: RacingEnv, state: CarState, run: Run, tyres: TyreView, speed: Tensor, share: Tensor | float
+    ) -> Tensor:
         """Throttle (positive) or brake (negative) in [-1, 1]."""
         car = self.car
         node = env.course.node(run.s + _REACTION * speed)
         expected = car.grip + car.grip_per_load * 1e-3 * (tyres.load.mean(0) - car.reference_load)
-        grip = (tyres.grip.mean(0) / expected).clamp(max=1.0)  # of cold, worn or hard tyres
+        grip = share * (tyres.grip.mean(0) / expected).clamp(max=1.0)  # of cold, worn or hard tyres
         wanted = self.speeds[node] * torch.sqrt(grip)
         wanted = torch.where((run.off > 0.5) | (run.along < 0.7), wanted.clamp(max=_LOST_SPEED), wanted)
         if env.cars > 1:

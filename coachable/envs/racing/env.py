@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
@@ -17,6 +17,7 @@ from coachable.envs.racing.observation import COURSE_POINTS, observation_groups
 from coachable.envs.racing.parameters import Resources, compound_table
 from coachable.envs.racing.profile import Envelope, speed_profile
 from coachable.envs.racing.referee import TELEMETRY, Referee
+from coachable.envs.racing.rivals import Rivals
 from coachable.envs.racing.run import RUN_ROWS, Run
 from coachable.envs.racing.scenarios import Conditions, Scenario, Starter, race_scenarios
 from coachable.envs.racing.simulation import SUBSTEPS, Simulation, maybe_compile
@@ -62,7 +63,7 @@ class RacingEnv(EnvBase):
         seed: of the starts; race b gets a stream of its own.
         num_threads: ignored; torch's own threads are used.
 
-    Keys written: `observation` (N, D), `task_reward` (N, 1), `style_features` (N, 8 + 3 (A - 1)), `telemetry` (N, 11),
+    Keys written: `observation` (N, D), `task_reward` (N, 1), `style_features` (N, 8 + 3 (A - 1)), `telemetry` (N, 12),
     `scenario` (N, 1) int64, `done`, `terminated`, `truncated` (N, 1).
 
     Raises:
@@ -249,7 +250,8 @@ class RacingEnv(EnvBase):
     def simulator_state(self) -> dict[str, Any]:
         """Everything that the next step depends on, as tensors, for exact resumption."""
         tensors = {name: getattr(self, name).clone() for name in _STATE}
-        return tensors | {"observation_now": self._observation.clone()} | self.garage.state()
+        state = tensors | {"observation_now": self._observation.clone()} | self.garage.state()
+        return state | ({"rivals": self.driver.state()} if isinstance(self.driver, Rivals) else {})
 
     def load_simulator_state(self, state: dict[str, Any]) -> None:
         """Restores what `simulator_state` returned.
@@ -265,6 +267,13 @@ class RacingEnv(EnvBase):
         self._observation = state["observation_now"].to(self.device, copy=True)
         self.garage.load_state(state)
         self.simulation.set_cars(self.garage.car)
+        if isinstance(self.driver, Rivals):
+            self.driver.load_state(state["rivals"])
+
+    def follow(self, policy: nn.Module) -> None:
+        """Lets rivals that are copies of the agent know its policy."""
+        if isinstance(self.driver, Rivals):
+            self.driver.follow(policy)
 
     @property
     def telemetry_names(self) -> tuple[str, ...]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 from coachable.envs.racing.circuits import load_track
 from coachable.envs.racing.driver import LineFollower
 from coachable.envs.racing.env import RacingEnv
 from coachable.envs.racing.parameters import Resources, load_car
+from coachable.envs.racing.rivals import Rivals
 from coachable.envs.racing.scenarios import Conditions, drift_scenarios, rolling_start
 from coachable.envs.racing.styles import (
     aggressiveness_style_reward,
@@ -20,7 +22,8 @@ from coachable.envs.racing.styles import (
 )
 from coachable.styles import StyleReward, StyleSpace
 
-RIVALS_GRIP = 0.85  # of the scripted opponents
+RIVALS_GRIP = 0.97  # of the fastest scripted opponents; the slowest use 0.8
+AGENTS, CARS = 3, 5  # in a race of the aggressiveness family
 
 
 def drift_env(num_envs: int = 64, **options: Any) -> RacingEnv:
@@ -51,21 +54,22 @@ def race_env(num_envs: int = 65, **options: Any) -> RacingEnv:
     return RacingEnv(num_envs, **(defaults | options))
 
 
-def rival_env(num_envs: int = 64, **options: Any) -> RacingEnv:
-    """One agent among four scripted GT3 rivals, rolling start: a row is a race."""
+def rival_env(num_envs: int = AGENTS * 21, **options: Any) -> RacingEnv:
+    """Three agents among two rivals, scripted or copies of the policy (`Rivals`), GT3 cars, rolling start.
+
+    One agent among four rivals where `num_envs` is no multiple of three.
+    """
     track, car = options.get("track", "endurance"), options.get("car", "gt3")
     course = load_track(track) if isinstance(track, str) else track
-    rivals = LineFollower(course, load_car(car), grip=RIVALS_GRIP, lanes=(0.0, 2.2, -2.2))
+    driver = LineFollower(course, load_car(car), grip=RIVALS_GRIP, lanes=(0.0, 2.2, -2.2))
     defaults: dict[str, Any] = {
-        "cars": 5,
-        "controlled": 1,
-        "driver": rivals,
-        "track": course,
+        "cars": CARS,
+        "controlled": AGENTS if num_envs % AGENTS == 0 else 1,
+        "driver": Rivals(driver, aggressiveness_style_space(), slowest=0.8 / RIVALS_GRIP),
         "car": car,
-        "scenarios": rolling_start(5),
+        "scenarios": rolling_start(CARS),
     }
-    settings: dict[str, Any] = {**defaults, **options, "track": course}
-    return RacingEnv(num_envs, **settings)
+    return RacingEnv(num_envs, **{**defaults, **options, "track": course})
 
 
 class Family(NamedTuple):
@@ -79,7 +83,7 @@ class Family(NamedTuple):
 _FAMILIES = {
     "drift": Family(drift_env, drift_style_space, drift_style_reward),
     "resources": Family(resource_env, resource_style_space, resource_style_reward),
-    "aggressiveness": Family(rival_env, aggressiveness_style_space, aggressiveness_style_reward),
+    "aggressiveness": Family(rival_env, partial(aggressiveness_style_space, AGENTS), aggressiveness_style_reward),
 }
 FAMILIES = tuple(_FAMILIES)
 

@@ -56,6 +56,7 @@ class RacingMeasures:
             "place": told("place"),
         }
         if self.family == "drift":
+            found["heading"] = told("heading")
             asked = theta[:, 1] > 1.0
             angle = found["slip_angle_rear"]
             found["complied"] = torch.where(asked, angle >= DRIFT_ANGLE_DEG, angle <= GRIP_ANGLE_DEG).float()
@@ -66,11 +67,18 @@ class RacingMeasures:
         return found
 
     def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
-        """See `StyleMeasures.summarise`: means over the steps that count; wear and fuel per kilometre of progress."""
+        """See `StyleMeasures.summarise`: means over the steps that count; wear and fuel per kilometre of progress.
+
+        For drift also "turns", the largest rotation against the track in one direction, in whole turns.
+        """
+        record = dict(record)
+        heading = record.pop("heading", None)
         means = {name: torch.where(alive, values, torch.nan).nanmean(0) for name, values in record.items()}
         kilometres = (means["pace"] * CONTROL_STEP / 1000.0).clamp(min=1e-6)
         for name in ("wear", "fuel"):
             means[f"{name}_per_km"] = means.pop(name) / kilometres
+        if heading is not None:
+            means["turns"] = whole_turns(heading, alive)
         return means
 
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
@@ -79,6 +87,16 @@ class RacingMeasures:
         Drifting above 20 degrees where asked for and below 8 where not; on the track; margins kept.
         """
         return record["complied"] > 0
+
+
+def whole_turns(heading: Tensor, alive: Tensor) -> Tensor:
+    """Largest rotation in one direction, in whole turns, (N,), of a heading (T, N) [rad] in the steps that count."""
+    steps = torch.diff(heading, dim=0)
+    steps = torch.remainder(steps + math.pi, 2.0 * math.pi) - math.pi
+    angle = torch.cat([torch.zeros_like(heading[:1]), torch.where(alive[1:], steps, 0.0).cumsum(0)])
+    up = (angle - angle.cummin(0).values).amax(0)
+    down = (angle.cummax(0).values - angle).amax(0)
+    return torch.floor(torch.maximum(up, down) / (2.0 * math.pi))
 
 
 def _margins_kept(features: Tensor, theta: Tensor) -> Tensor:

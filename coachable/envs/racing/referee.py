@@ -50,6 +50,7 @@ TELEMETRY = (
     "contact",
     "place",  # 1 is first of the group
     "beta",  # body slip angle [rad]
+    "heading",  # relative to the track [rad]
 )
 
 
@@ -61,7 +62,7 @@ class Verdict(NamedTuple):
     observation: Tensor  # (N, D)
     reward: Tensor  # (N,) of the task
     features: Tensor  # (N, F)
-    telemetry: Tensor  # (N, 11)
+    telemetry: Tensor  # (N, 12)
     terminated: Tensor  # (N,) bool
 
 
@@ -259,6 +260,7 @@ class Referee:
                 run.contact,
                 rank,
                 torch.atan2(s.vy, s.vx.abs().clamp(min=1e-3)),
+                torch.atan2(run.across, run.along),
             ],
             dim=-1,
         )

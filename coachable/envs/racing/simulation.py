@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.compiler import nested_compile_region
 
 from coachable.envs.racing.contact import Bodies, collide
 from coachable.envs.racing.dynamics import WheelSet, substep, total_mass
@@ -38,7 +39,7 @@ class Simulation:
         resources: wear and fuel rates.
         cars: A.
         substeps: per control step; 10 by default, 40 for accurate runs.
-        compile: whether to compile a substep (about half a minute, then 5 to 10 times faster on a CPU).
+        compile: whether to compile the substeps (about half a minute, then 5 to 10 times faster on a CPU).
         device: where.
         dtype: float32, or float64 for checks.
     """
@@ -60,7 +61,7 @@ class Simulation:
         self.cars, self.substeps, self.h = cars, substeps, CONTROL_STEP / substeps
         self.car, self.resources = car, resources
         self.wheels = WheelSet.of(car, self.device, dtype)
-        self._move = maybe_compile(self._one_car if cars == 1 else self._many_cars, self.device, compile)
+        self._advance = maybe_compile(self._substeps, self.device, compile)
 
     def set_cars(self, car: Car) -> None:
         """Replaces the parameters of cars that have one each, as tensors (N,)."""
@@ -82,15 +83,35 @@ class Simulation:
         if self.cars > 1:
             races = state.shape[1] // self.cars
             impact = state.new_zeros(self.cars // 2, self.cars, races)
-        for _ in range(self.substeps):
-            if impact is None:
-                state = self._move(state, inputs, self.car, self.wheels)
-            else:
-                state, impact = self._move(state, inputs, self.car, self.wheels, group, impact)
-        return state, impact
+        return self._advance(state, inputs, self.car, self.wheels, group, impact)
 
-    def _one_car(self, state: Tensor, inputs: Tensor, car: Car, wheels: WheelSet) -> Tensor:
-        return substep(state, inputs, car, wheels, self.resources, self.h)
+    def _substeps(
+        self,
+        state: Tensor,
+        inputs: Tensor,
+        car: Car,
+        wheels: WheelSet,
+        group: Tensor | None,
+        impact: Tensor | None,
+    ) -> tuple[Tensor, Tensor | None]:
+        # Compiled as a whole, so that guards are checked once per control step, but the code of a substep once.
+        if group is None or impact is None:
+
+            @nested_compile_region
+            def move(state: Tensor) -> Tensor:
+                return substep(state, inputs, car, wheels, self.resources, self.h)
+
+            for _ in range(self.substeps):
+                state = move(state)
+            return state, None
+
+        @nested_compile_region
+        def move_all(state: Tensor, impact: Tensor) -> tuple[Tensor, Tensor]:
+            return self._many_cars(state, inputs, car, wheels, group, impact)
+
+        for _ in range(self.substeps):
+            state, impact = move_all(state, impact)
+        return state, impact
 
     def _many_cars(
         self, state: Tensor, inputs: Tensor, car: Car, wheels: WheelSet, group: Tensor, impact: Tensor

@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from coachable.domain import Domain
+from coachable.domain import Domain, deferred
 from coachable.envs.racing.env import EPISODE_STEPS
 from coachable.envs.racing.families import racing_family
 from coachable.envs.racing.measures import RacingMeasures
@@ -21,6 +21,7 @@ def racing_domain(
     cars: int,
     grid: Mapping[str, Sequence[Any]] | Sequence[Mapping[str, Any]],
     columns: Mapping[str, str],
+    evaluation: str,
 ) -> Domain:
     """The domain of a family of style.
 
@@ -29,6 +30,7 @@ def racing_domain(
         cars: of a race.
         grid: see `Domain`.
         columns: what is published beside survival, pace and time off course.
+        evaluation: function of `coachable.evaluation` that `coachable evaluate` calls, "module.function".
     """
     make_env, make_space, make_reward = racing_family(family)
 
@@ -57,5 +59,6 @@ def racing_domain(
         columns={"survived": ".0%", "pace": ".1f", "off": ".1%"} | dict(columns),
         observation_groups=observation_groups(cars, pool=False),
         as_trained=as_trained,
+        evaluation=deferred(f"coachable.evaluation.{evaluation}"),
     )
     return domain

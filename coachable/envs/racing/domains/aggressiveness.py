@@ -7,4 +7,5 @@ DOMAIN = racing_domain(
     cars=5,
     grid={"longitudinal": (0.5, 1.0, 1.5), "lateral": (0.0, 0.25, 0.5, 0.75, 1.0)},
     columns={"contact": ".2%", "place": ".2f"},
+    evaluation="races.evaluate_aggressiveness",
 )

@@ -12,4 +12,5 @@ DOMAIN = racing_domain(
         "slip_ratio_rear": (0.0,),
     },
     columns={"slip_angle_front": ".1f", "slip_angle_rear": ".1f"},
+    evaluation="drifts.evaluate_drift",
 )

@@ -12,4 +12,5 @@ DOMAIN = racing_domain(
         + [(0.0, fuel) for fuel in (26.0, 52.0, 79.0, 105.0)]
     ],
     columns={"wear_per_km": ".4f", "fuel_per_km": ".2f"},
+    evaluation="stints.evaluate_resources",
 )

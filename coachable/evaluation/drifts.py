@@ -1,0 +1,146 @@
+"""How far a car drives sideways under rising weights of rear slip, and what that costs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import matplotlib
+import numpy as np
+
+from coachable.envs.racing.measures import DRIFT_ANGLE_DEG, GRIP_ANGLE_DEG
+from coachable.envs.racing.scenarios import Scenario
+from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
+from coachable.evaluation.style_grid import evaluate_grid, markdown_table, training_counts, write_csv
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+if TYPE_CHECKING:
+    from coachable.domain import Domain
+    from coachable.training.weights import LoadedPolicy
+
+WEIGHT = "slip_angle_rear"
+WEIGHTS = (-0.4, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
+_STARTS = (Scenario("solo", 1.0, "solo"),)
+_METRICS = ("slip_angle_rear", "slip_angle_front", "pace", "off", "turns", "survived")
+
+
+def evaluate_drift(
+    domain: Domain,
+    agent: LoadedPolicy,
+    out: Path,
+    *,
+    episodes: int = 20,
+    switch_episodes: int = 0,
+    steps: int | None = None,
+    seed: int = 0,
+    num_threads: int | None = None,
+    progress: bool = True,
+) -> str:
+    """Drive under rising weights of the rear slip angle, the other weights neutral, from ordinary starts.
+
+    Files: `drift.csv` (by weight), `drift.png`, `report.md`, `summary.json`.
+
+    Args:
+        domain: racing_drift, as the agent was trained in.
+        agent: the policy; acts deterministically.
+        out: folder, created if missing.
+        episodes: per weight, each from its own place on the track.
+        switch_episodes: not used.
+        steps: length of an episode in control steps; default: the domain's.
+        seed: of the starts. The same seed gives the same files.
+        num_threads: not used: threads are torch's own.
+        progress: show a progress bar.
+
+    Returns:
+        The report, Markdown.
+
+    Raises:
+        ValueError: if `episodes` is below 1.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    cells = [{WEIGHT: weight} for weight in WEIGHTS]
+    grid = evaluate_grid(
+        domain,
+        agent.actor,
+        agent.space,
+        episodes=episodes,
+        steps=steps,
+        seed=seed,
+        cells=cells,
+        progress=progress,
+        env_options={"scenarios": _STARTS},
+    )
+    rows = _rows(grid.episodes)
+    angles, weights = grid.episodes[WEIGHT], np.repeat(np.array(WEIGHTS)[:, None], episodes, 1)
+    full, none = rows[-1], rows[WEIGHTS.index(0.0)]
+    summary = {
+        "rank_correlation": rank_correlation(weights.ravel(), angles.ravel()),
+        "angle_at_full": full["slip_angle_rear"],
+        "angle_at_none": none["slip_angle_rear"],
+        "pace_kept_at_full": full["pace_kept"],
+        "most_turns": float(np.nanmax(grid.episodes["turns"])),
+        "episodes_per_weight": episodes,
+        "seed": seed,
+    }
+    write_csv(rows, out / "drift.csv")
+    draw_drift(rows, out / "drift.png")
+    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    report = _report(agent, rows, summary, grid.steps)
+    (out / "report.md").write_text(report)
+    return report
+
+
+def _rows(episodes: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
+    """Means by weight, with 95 % intervals of the angle."""
+    neutral = float(np.nanmean(episodes["pace"][WEIGHTS.index(0.0)]))
+    rows = []
+    for index, weight in enumerate(WEIGHTS):
+        low, high = bootstrap_interval(episodes[WEIGHT][index])
+        row: dict[str, Any] = {"weight": weight}
+        row |= {name: float(np.nanmean(episodes[name][index])) for name in _METRICS}
+        row |= {"angle_low": low, "angle_high": high, "pace_kept": row["pace"] / max(neutral, 1e-9)}
+        rows.append(row | {"most_turns": float(np.nanmax(episodes["turns"][index]))})
+    return rows
+
+
+def draw_drift(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Slip angles, and pace and time off the track, over the weight."""
+    weights = [row["weight"] for row in rows]
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.8), layout="constrained")
+    angle = np.array([row["slip_angle_rear"] for row in rows])
+    error = np.abs(np.array([[row["angle_low"], row["angle_high"]] for row in rows]) - angle[:, None]).T
+    left.errorbar(weights, angle, error, marker="o", capsize=3, label="rear, 95 % interval")
+    left.plot(weights, [row["slip_angle_front"] for row in rows], marker="s", ls="--", label="front")
+    left.axhline(DRIFT_ANGLE_DEG, color="0.6", lw=1, ls=":")
+    left.axhline(GRIP_ANGLE_DEG, color="0.6", lw=1, ls=":")
+    left.set(xlabel="requested weight of the rear slip angle", ylabel="mean slip angle [deg]")
+    right.plot(weights, [row["pace_kept"] for row in rows], marker="o", label="progress, share of that at 0")
+    right.plot(weights, [row["off"] for row in rows], marker="s", ls="--", label="share of time off the track")
+    right.set(xlabel="requested weight of the rear slip angle")
+    for panel in (left, right):
+        panel.set_ylim(0.0, None)
+        panel.grid(alpha=0.3)
+        panel.legend(fontsize=8)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Mapping[str, Any], steps: int) -> str:
+    trained = training_counts(agent)
+    text = "# racing, drift: requested and measured style\n\n"
+    text += (
+        f"Deterministic policy{' after ' + trained if trained else ''}; {summary['episodes_per_weight']} episodes of "
+    )
+    text += f"{steps} steps per weight, ordinary starts, the other weights 0, seed {summary['seed']}.\n\n"
+    text += "![slip angle over weight](drift.png)\n\n"
+    formats = {"weight": "g", "slip_angle_rear": ".1f", "slip_angle_front": ".1f", "pace": ".1f", "pace_kept": ".0%"}
+    text += markdown_table(rows, formats | {"off": ".1%", "turns": ".1f", "most_turns": ".0f", "survived": ".0%"})
+    text += (
+        "\nSlip angles in degrees (0 below 5 m/s), pace in m/s along the track, turns: largest rotation against the "
+    )
+    text += "track in one direction, in whole turns, mean and most over episodes.\n\n"
+    return text + f"Rank correlation of weight and rear slip angle: {summary['rank_correlation']:.2f}.\n"
