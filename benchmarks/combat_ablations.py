@@ -128,9 +128,6 @@ def finished(runs: Path) -> dict[str, list[Path]]:
     found: dict[str, list[Path]] = {}
     for variant in VARIANTS:
         for folder in sorted(runs.glob(f"{variant}_[0-9]*")):
-            name, seed = folder.name.rsplit("_", 1)
-            if name != variant or not seed.isdigit():  # such as impersonation_0 of seed 3
-                continue
             try:
                 state = read_state(find_checkpoint(folder))
             except CheckpointError:

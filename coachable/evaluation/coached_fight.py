@@ -80,7 +80,8 @@ class CoachedFights:
 
         asked, damage = windows(np.nan_to_num(self.measures["requested"])), windows(self.measures["damage"])
         wanted = windows(self.requests)[:, 0]
-        first = np.where((asked > 0).any(1), ((asked > 0).argmax(1) + 1) * self.control_step, np.inf)
+        seconds = ((asked > 0).argmax(1) + 1) * self.control_step
+        first = np.where((asked > 0).any(1), seconds.round(6), np.inf)
         rows = []
         for number, name in enumerate([*self.names, "all styles"]):
             mine = wanted == number if number < len(self.names) else np.ones_like(wanted, dtype=bool)
