@@ -1,88 +1,112 @@
 """Car-steps per second of the racing simulator, eager and compiled, as one table.
 
-    OMP_NUM_THREADS=1 python benchmarks/racing.py --threads 1
+    OMP_NUM_THREADS=1 python benchmarks/racing.py --threads 1 --peers .venv-bench/bin/python
 
 A car-step is one control step of 0.1 s (10 substeps) of one car. "physics" is the car alone; "step" is `RacingEnv.step`
-with projection, observation, task reward, style features and TensorDict; "race" the same with five cars and contact.
-The rate counts CPU seconds of this process times the threads that it was given, best of k, so that other work on the
-machine disturbs it little; the wall rate is given beside it.
+with projection, observation, task reward, style features and TensorDict; "race" the same with five cars and contact;
+"policy" is "step" with actions sampled by a network of 3 x 256. The rate counts CPU seconds of this process times the
+threads that it was given, best of k, so that other work on the machine disturbs it little; the wall rate is given
+beside it. `--peers` names an interpreter with highway-env and gymnasium[box2d], whose environments then step in turn
+with ours, each in a process of its own with one thread.
 """
 
 import argparse
+import json
 import resource
+import statistics
+import sys
 import time
+from pathlib import Path
+from typing import Any
 
 import torch
+from contest import Worker, measure
+from racing_workers import CARS, KINDS, OURS, PEERS, make_env
 
-from coachable.envs.racing import RacingEnv
-from coachable.envs.racing.parameters import Resources, load_car
-from coachable.envs.racing.simulation import Simulation
-from coachable.envs.racing.state import HEATS, INPUT_ROWS, ROW, SPINS, STATE_ROWS, CarInputs
-
-KINDS = ("physics", "step", "race")
+MODES = ("eager", "compiled")
 
 
-def physics(n, compile, device):
-    simulation = Simulation(load_car("gt3"), Resources(1.0, 1.0), compile=compile, device=device)
-    state = torch.zeros(STATE_ROWS, n, device=device)
-    state[ROW["vx"]], state[SPINS], state[HEATS], state[ROW["fuel"]], state[ROW["gear"]] = 50.0, 150.0, 80.0, 30.0, 4.0
-    inputs = torch.zeros(INPUT_ROWS, n, device=device)
-    rows = {name: row for row, name in enumerate(CarInputs._fields)}
-    for name in ("drag_factor", "front_lift_factor", "grip_factor", "wear_factor", "node_tx"):
-        inputs[rows[name]] = 1.0
-    for name in ("left", "right", "margin"):
-        inputs[rows[name]] = 1e6
-    inputs[rows["throttle"]] = torch.rand(n, device=device)
-    inputs[rows["steer_step"]] = 0.01 * torch.rand(n, device=device)
-    return lambda: simulation.step(state, inputs)
+def cpu_seconds() -> float:
+    """Of this process and the compilers that it started."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(usage.ru_utime + usage.ru_stime for usage in used)
 
 
-def stepping(n, compile, device, cars):
-    env = RacingEnv(n - n % cars, cars=cars, compiled=compile, device=device, seed=0, resources=Resources(9.0, 3.0))
-    current = env.reset()
-    current["action"] = torch.rand(env.num_envs, 2, device=device) * 2 - 1
-    return lambda: env.step(current)
-
-
-def measure(run, n, device, rounds):
-    synchronise = torch.cuda.synchronize if device == "cuda" else lambda: None
-    start = time.perf_counter()
-    run()
-    synchronise()
-    first = time.perf_counter() - start
-    cpu, wall = [], []
+def bench(kind: str, num_cars: int, compiled: bool, device: str, rounds: int) -> dict[str, float]:
+    """First call [s], and car-steps per CPU second and per second, best of so many rounds."""
+    synchronize = torch.cuda.synchronize if device == "cuda" else lambda: None
+    step = KINDS[kind](num_cars, compiled, device)
+    wall, cpu = time.perf_counter(), cpu_seconds()
+    step()
+    synchronize()
+    row = {"first_wall": time.perf_counter() - wall, "first_cpu": cpu_seconds() - cpu}
+    for _ in range(2):
+        step()
+    walls, cpus = [], []
     for _ in range(rounds):
-        begin = time.perf_counter(), time.process_time()
-        run()
-        synchronise()
-        wall.append(time.perf_counter() - begin[0])
-        cpu.append(time.process_time() - begin[1])
-    return first, n / min(cpu), n / min(wall)
+        synchronize()
+        wall, cpu = time.perf_counter(), time.process_time()
+        step()
+        synchronize()
+        cpus.append(time.process_time() - cpu)
+        walls.append(time.perf_counter() - wall)
+    stepped = num_cars - num_cars % 5 if kind == "race" else num_cars
+    torch.compiler.reset()
+    return row | {"per_cpu": stepped / min(cpus), "per_wall": stepped / min(walls)}
 
 
-def main():
+def memory(cars: int) -> dict[str, float]:
+    """Bytes per car, beyond the observation: kept between steps, and written by a step for the learner."""
+    env = make_env(1000, False, "cpu", cars)
+    kept = [t for name, t in env.simulator_state().items() if name != "observation_now" and isinstance(t, torch.Tensor)]
+    written = [t for name, t in env.rand_step(env.reset())["next"].items() if name != "observation"]
+    return {name: sum(t.nbytes for t in some) / env.num_envs for name, some in (("kept", kept), ("written", written))}
+
+
+def beside_peers(peers: str, rounds: int, seconds: float) -> dict[str, float]:
+    """Steps per CPU second of one process of each, in turn, median of the rounds; each works about so many seconds."""
+    pythons = dict.fromkeys(OURS, sys.executable) | dict.fromkeys(PEERS, peers)
+    workers = [Worker("racing_workers.py", name, python, threads=1) for name, python in pythons.items()]
+    work = {name: round((50 if name in OURS else 100) * seconds) for name in pythons}
+    times = measure(workers, rounds, work)
+    cars = {name: {"race": CARS - CARS % 5}.get(name, CARS) if name in OURS else 1 for name in times}
+    return {name: cars[name] / statistics.median(t["cpu"] for t in taken) for name, taken in times.items()}
+
+
+def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--sizes", type=int, nargs="*", default=[256, 1024, 4096, 16384, 65536])
-    parser.add_argument("--kinds", nargs="*", choices=KINDS, default=list(KINDS))
-    parser.add_argument("--modes", nargs="*", choices=("eager", "compiled"), default=["eager", "compiled"])
+    parser.add_argument("--cars", type=int, nargs="*", default=[256, 1024, 4096, 16384, 65536])
+    parser.add_argument("--kinds", nargs="*", choices=OURS, default=OURS)
+    parser.add_argument("--modes", nargs="*", choices=MODES, default=MODES)
     parser.add_argument("--rounds", type=int, default=10)
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--peers", help="interpreter with highway-env and gymnasium[box2d]")
+    parser.add_argument("--json", type=Path, help="where to write the numbers")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
+    found: dict[str, Any] = {"threads": args.threads, "rounds": args.rounds, "rows": []}
     print(f"threads {args.threads}, device {args.device}, 10 substeps, best of {args.rounds}")
-    print("| what | mode | cars | first call s | car-steps / CPU s | car-steps / s (wall) |\n|-|-|-|-|-|-|")
-    for kind in args.kinds:
-        for mode in args.modes:
-            for n in args.sizes:
-                make = {"physics": physics, "step": stepping, "race": stepping}[kind]
-                options = {} if kind == "physics" else {"cars": 5 if kind == "race" else 1}
-                run = make(n, mode == "compiled", args.device, **options)
-                first, cpu, wall = measure(run, n, args.device, args.rounds)
-                cpu *= args.threads
-                print(f"| {kind} | {mode} | {n} | {first:.1f} | {cpu:,.0f} | {wall:,.0f} |", flush=True)
-                torch.compiler.reset()
-    print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MiB")
+    print("| what | mode | cars | first call, CPU s (wall) | car-steps / CPU s | car-steps / s (wall) |\n|-|-|-|-|-|-|")
+    for num_cars in args.cars:
+        for kind in args.kinds:
+            for mode in args.modes:
+                row = bench(kind, num_cars, mode == "compiled", args.device, args.rounds)
+                row["per_cpu"] *= args.threads
+                found["rows"].append({"kind": kind, "mode": mode, "cars": num_cars} | row)
+                print(f"| {kind} | {mode} | {num_cars} | {row['first_cpu']:.1f} ({row['first_wall']:.1f})", end="")
+                print(f" | {row['per_cpu']:,.0f} | {row['per_wall']:,.0f} |", flush=True)
+    for name, cars in (("single cars", 1), ("races of five", 5)):
+        found[name] = memory(cars)
+        print("bytes per car, {}: {kept:.0f} kept, {written:.0f} written".format(name, **found[name]))
+    if args.peers:
+        rates = found["beside"] = beside_peers(args.peers, 5, 1.0)
+        print("| in turn, one thread | steps / CPU s | times highway-env |\n|-|-|-|")
+        for name, rate in rates.items():
+            ratio = rate / rates["highway-env"] if "highway-env" in rates else float("nan")
+            print(f"| {name} | {rate:,.0f} | {ratio:,.2f} |")
+    if args.json:
+        args.json.write_text(json.dumps(found))
 
 
 if __name__ == "__main__":

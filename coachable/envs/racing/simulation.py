@@ -102,7 +102,7 @@ class Simulation:
                 return substep(state, inputs, car, wheels, self.resources, self.h)
 
             for _ in range(self.substeps):
-                state = move(state)
+                state = move(state)  # pyright: ignore[reportAssignmentType]
             return state, None
 
         @nested_compile_region
@@ -110,7 +110,7 @@ class Simulation:
             return self._many_cars(state, inputs, car, wheels, group, impact)
 
         for _ in range(self.substeps):
-            state, impact = move_all(state, impact)
+            state, impact = move_all(state, impact)  # pyright: ignore[reportCallIssue]
         return state, impact
 
     def _many_cars(
