@@ -83,6 +83,21 @@ def bootstrap_interval(
     return float(low), float(high)
 
 
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """Wilson's 95 % interval of a probability, from a number of successes in a number of trials.
+
+    Raises:
+        ValueError: if there are no trials, or more successes than trials.
+    """
+    if not 0 <= successes <= trials or trials < 1:
+        raise ValueError(f"{successes} successes in {trials} trials: expected 0 to trials, and at least one trial")
+    z, share = 1.959964, successes / trials
+    middle = share + z * z / (2 * trials)
+    spread = z * np.sqrt(share * (1.0 - share) / trials + z * z / (4 * trials * trials))
+    scale = 1.0 + z * z / trials
+    return float((middle - spread) / scale), float((middle + spread) / scale)
+
+
 def rank_correlation(x: np.ndarray, y: np.ndarray) -> float:
     """Spearman's rank correlation of two (n,) arrays; ties share their mean rank. NaN pairs are left out."""
     keep = ~(np.isnan(x) | np.isnan(y))

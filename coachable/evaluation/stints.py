@@ -51,7 +51,7 @@ class Stint:
         laps: times of its completed laps, from where it started, the first one included [s].
         clean: of each lap, whether it never had three wheels off the track.
         left: resource left at the end of each lap: litres, or wear.
-        per_km: resource used per kilometre.
+        per_km: resource used per kilometre after the first lap, or in all if there is no other.
     """
 
     laps: np.ndarray
@@ -216,15 +216,15 @@ def _stint(measured: Mapping[str, np.ndarray], alive: np.ndarray, row: int, leng
     distance, off, left = distance[running], off[running], left[running]
     furthest = np.maximum.accumulate(distance)
     ends = length * np.arange(1, int(furthest[-1] // length) + 1)
-    steps = np.searchsorted(furthest, ends)
+    steps = np.searchsorted(furthest, ends)  # in which each lap ends
     before = np.where(steps > 0, furthest[np.maximum(steps - 1, 0)], 0.0)
     crossed = CONTROL_STEP * (steps + (ends - before) / (furthest[steps] - before))
-    spent = abs(left[-1] - left[0])
+    first, last = (steps[0], steps[-1]) if len(steps) > 1 else (0, -1)  # the first lap has the start in it
     return Stint(
         laps=np.diff(crossed, prepend=0.0),
         clean=np.diff(off[steps], prepend=0.0) == 0.0,
         left=left[steps],
-        per_km=spent / max((distance[-1] - distance[0]) / 1000.0, 1e-9),
+        per_km=abs(left[last] - left[first]) / max((distance[last] - distance[first]) / 1000.0, 1e-9),
     )
 
 

@@ -1,0 +1,267 @@
+"""Races of five agents with different margins: places, contacts and wins of a pair that attacks or defends (paper).
+
+Two of five cars get the lateral margin under test, the other three moderate ones. The pair starts last ("pursuer") or
+first ("leader"), as in Werner et al. (2023).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import matplotlib
+import numpy as np
+import torch
+
+from coachable.envs.racing.referee import TELEMETRY
+from coachable.envs.racing.scenarios import rolling_start
+from coachable.envs.racing.simulation import CONTROL_STEP
+from coachable.evaluation.rollouts import record_episodes
+from coachable.evaluation.statistics import bootstrap_interval, rank_correlation, wilson_interval
+from coachable.evaluation.style_grid import markdown_table, training_counts, write_csv
+from coachable.transforms import coachable_env
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+if TYPE_CHECKING:
+    from tensordict import TensorDictBase
+    from torch import Tensor
+
+    from coachable.domain import Domain
+    from coachable.training.weights import LoadedPolicy
+
+CARS = 5
+SETTINGS = {"pursuer": (3, 4), "leader": (0, 1)}  # slots of the pair, 0 in front
+LATERAL = (0.0, 0.25, 0.5, 0.75, 1.0)  # [m], of the pair
+OTHERS = tuple(product((0.5, 0.75), repeat=3))  # [m], of the other three
+LONGITUDINAL = 1.0  # [m], of all
+LAPS = 4
+RACE_STEPS = 10_000
+_AGAIN = 1.0  # [s], after which touching counts as another contact
+_METRICS = {"win_rate": "wins", "places_gained": "places gained", "contacts": "contacts per race"}
+
+
+class _Positions:
+    """What decides a race, step by step."""
+
+    def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
+        told = transition.get(("next", "telemetry"))
+        return {name: told[:, TELEMETRY.index(name)] for name in ("distance", "contact", "off")}
+
+    def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
+        return {}
+
+    def complies(self, record: Mapping[str, Tensor]) -> Tensor:
+        return record["contact"] == 0.0
+
+
+def evaluate_aggressiveness(
+    domain: Domain,
+    agent: LoadedPolicy,
+    out: Path,
+    *,
+    episodes: int = 3,
+    switch_episodes: int = 0,
+    steps: int | None = None,
+    seed: int = 0,
+    num_threads: int | None = None,
+    progress: bool = True,
+) -> str:
+    """Race pairs with rising lateral margins against three other copies of the agent.
+
+    Files: `races.csv` (by setting and margin), `radar.png`, `report.md`, `summary.json`.
+
+    Args:
+        domain: racing_aggressiveness, as the agent was trained in.
+        agent: the policy of all five cars; acts deterministically.
+        out: folder, created if missing.
+        episodes: races per setting, margin and combination of the others' margins, of which there are eight.
+        switch_episodes: not used.
+        steps: control steps after which a race is over at the latest; default 10000. Otherwise it ends when the first
+            car has driven four laps.
+        seed: of the starts. The same seed gives the same files.
+        num_threads: not used: threads are torch's own.
+        progress: show a progress bar.
+
+    Returns:
+        The report, Markdown.
+
+    Raises:
+        ValueError: if `episodes` is below 1.
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes per combination must be at least 1, got {episodes}")
+    out.mkdir(parents=True, exist_ok=True)
+    cells = [(setting, lateral) for setting in SETTINGS for lateral in LATERAL]
+    races = [(setting, lateral, others) for setting, lateral in cells for others in OTHERS for _ in range(episodes)]
+    found = _race(domain, agent, races, steps or RACE_STEPS, seed, progress)
+    rows = _rows(cells, {name: values.reshape(len(cells), -1, 2) for name, values in found.items()})
+    summary: dict[str, Any] = {
+        setting: {
+            name: rank_correlation(
+                *(np.array([r[key] for r in rows if r["setting"] == setting]) for key in ("lateral", name))
+            )
+            for name in _METRICS
+        }
+        for setting in SETTINGS
+    }
+    summary |= {"races_per_row": len(OTHERS) * episodes, "seed": seed}
+    write_csv(rows, out / "races.csv")
+    draw_radar(rows, out / "radar.png")
+    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    report = _report(agent, rows, summary)
+    (out / "report.md").write_text(report)
+    return report
+
+
+def _race(
+    domain: Domain,
+    agent: LoadedPolicy,
+    races: Sequence[tuple[str, float, tuple[float, ...]]],
+    steps: int,
+    seed: int,
+    progress: bool,
+) -> dict[str, np.ndarray]:
+    """Of each race and car of its pair, (races, 2): top_two, won, places_gained, contacts, off, metres."""
+    space, count = agent.space, len(races)
+    simulation: Any = domain.make_env(
+        num_envs=CARS * count,
+        cars=CARS,
+        controlled=CARS,
+        driver=None,
+        scenarios=rolling_start(CARS),
+        episode_steps=steps + 1,
+    )
+    env = coachable_env(simulation, space, domain.make_reward(space), seed=seed)
+    # Who starts where is drawn with the start: look, then start again with the same seed.
+    env.set_seed(seed)
+    env.reset()
+    ahead = simulation.run[4].reshape(CARS, count)  # distance: 0 for the first car, then negative
+    slots = (-ahead).argsort(0).argsort(0)
+    theta = space.default.repeat(CARS * count, 1).reshape(CARS, count, -1)
+    theta[..., space.slices["longitudinal"]] = LONGITUDINAL
+    lateral = torch.empty(CARS, count)
+    pair = torch.zeros(CARS, count, dtype=torch.bool)
+    for race, (setting, margin, others) in enumerate(races):
+        by_slot = list(others)
+        for slot in SETTINGS[setting]:
+            by_slot.insert(slot, margin)
+            pair[slots[:, race] == slot, race] = True
+        lateral[:, race] = torch.tensor(by_slot)[slots[:, race]]
+    theta[..., space.slices["lateral"]] = lateral[..., None]
+    record = record_episodes(
+        env,
+        agent.actor,
+        theta.reshape(CARS * count, -1),
+        _Positions(),
+        steps=steps,
+        seed=seed,
+        progress=f"{count} races of {CARS} cars" if progress else None,
+    )
+    env.close()
+    shaped = {name: value.reshape(len(value), CARS, count).numpy() for name, value in record.measures.items()}
+    finish = LAPS * simulation.course.length
+    cars = [
+        _pair_results(
+            {name: values[:, :, race] for name, values in shaped.items()}, slots[:, race].numpy(), chosen, finish
+        )
+        for race, chosen in enumerate(pair.T.numpy())
+    ]
+    return {name: np.stack([car[name] for car in cars]) for name in cars[0]}
+
+
+def _pair_results(
+    race: Mapping[str, np.ndarray], slots: np.ndarray, chosen: np.ndarray, finish: float
+) -> dict[str, np.ndarray]:
+    """Of the two chosen cars of one race, whose steps are (T, A)."""
+    distance = race["distance"]
+    done = np.flatnonzero(distance.max(1) >= finish)
+    end = int(done[0]) + 1 if len(done) else len(distance)
+    places = (-distance[end - 1]).argsort().argsort()
+    touched = race["contact"][:end] > 0
+    return {
+        "top_two": (places < 2)[chosen].astype(float),
+        "won": (places == 0)[chosen].astype(float),
+        "places_gained": (slots - places)[chosen].astype(float),
+        "contacts": np.array([_count(touched[:, car]) for car in np.flatnonzero(chosen)], dtype=float),
+        "off": race["off"][:end, chosen].mean(0),
+        "metres": distance[end - 1, chosen].astype(float),
+    }
+
+
+def _count(touched: np.ndarray) -> int:
+    """Contacts of one car, steps (T,) bool; those within a second of the last one are the same."""
+    steps = np.flatnonzero(touched)
+    return int((np.diff(steps, prepend=-np.inf) > _AGAIN / CONTROL_STEP).sum()) if len(steps) else 0
+
+
+def _rows(cells: Sequence[tuple[str, float]], found: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
+    """Means by setting and margin with 95 % intervals, of values (cells, races, 2)."""
+    rows = []
+    for index, (setting, lateral) in enumerate(cells):
+        of = {name: values[index] for name, values in found.items()}
+        row: dict[str, Any] = {"setting": setting, "lateral": lateral, "races": len(of["won"])}
+        row["win_rate"] = float(of["top_two"].mean())
+        row["win_rate_low"], row["win_rate_high"] = wilson_interval(int(of["top_two"].sum()), of["top_two"].size)
+        row["either_won"] = float(of["won"].max(1).mean())
+        for name in ("places_gained", "contacts"):
+            per_race = of[name].mean(1)
+            row[name] = float(per_race.mean())
+            row[f"{name}_low"], row[f"{name}_high"] = bootstrap_interval(per_race)
+        rows.append(row | {"off": float(of["off"].mean()), "kilometres": float(of["metres"].mean() / 1000.0)})
+    return rows
+
+
+def draw_radar(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """One radar per setting, one polygon per margin; every axis runs from the lowest to the highest value on it."""
+    angles = np.linspace(0.0, 2.0 * np.pi, len(_METRICS), endpoint=False) + np.pi / 2
+    figure, axes = plt.subplots(
+        1, len(SETTINGS), figsize=(9.5, 4.6), subplot_kw={"projection": "polar"}, layout="constrained"
+    )
+    for panel, setting in zip(axes, SETTINGS, strict=True):
+        own = [row for row in rows if row["setting"] == setting]
+        table = np.array([[row[name] for name in _METRICS] for row in own])
+        low, high = table.min(0), table.max(0)
+        scaled = 0.15 + 0.85 * (table - low) / np.maximum(high - low, 1e-9)
+        for index, row in enumerate(own):
+            color = plt.get_cmap("viridis")(0.9 * index / max(len(own) - 1, 1))
+            closed = np.append(scaled[index], scaled[index, 0])
+            panel.plot(
+                np.append(angles, angles[0]), closed, color=color, marker="o", ms=3, label=f"{row['lateral']:g} m"
+            )
+        labels = [f"{text}\n{a:.2f} to {b:.2f}" for text, a, b in zip(_METRICS.values(), low, high, strict=True)]
+        panel.set_xticks(angles, labels, fontsize=8)
+        panel.set_yticks([])
+        panel.set_ylim(0.0, 1.05)
+        panel.set_title(setting)
+    axes[-1].legend(title="lateral margin", loc="upper left", bbox_to_anchor=(1.1, 1.0), fontsize=8)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Mapping[str, Any]) -> str:
+    trained = training_counts(agent)
+    text = "# racing, aggressiveness: requested margin and what came of it\n\n"
+    text += (
+        f"Deterministic policy{' after ' + trained if trained else ''} in all five cars; {summary['races_per_row']} "
+    )
+    text += (
+        f"races per row, {LAPS} laps, rolling start, seed {summary['seed']}. Two cars, which start last (pursuer) or "
+    )
+    text += (
+        f"first (leader), keep the lateral margin, the other three 0.5 or 0.75 m; longitudinal {LONGITUDINAL:g} m.\n\n"
+    )
+    text += "![radar](radar.png)\n\n"
+    formats = {"setting": "", "lateral": "g", "win_rate": ".0%", "either_won": ".0%", "places_gained": "+.2f"}
+    text += markdown_table(rows, formats | {"contacts": ".1f", "off": ".1%", "kilometres": ".1f"})
+    text += "\nWin rate: share of the pair that ends among the first two. Contacts: per car and race, those within a "
+    text += "second count once.\n\nRank correlation with the margin: "
+    parts = [
+        f"{setting}: " + ", ".join(f"{_METRICS[name]} {value:.2f}" for name, value in summary[setting].items())
+        for setting in SETTINGS
+    ]
+    return text + "; ".join(parts) + ".\n"
