@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 from collections.abc import Callable
+from dataclasses import fields, replace
 from typing import Any
 
 import torch
@@ -59,14 +60,13 @@ class Simulation:
             raise ValueError(f"substeps is {substeps}: expected at least 1 per control step")
         self.device = torch.device(device)
         self.cars, self.substeps, self.h = cars, substeps, CONTROL_STEP / substeps
-        self.car, self.resources = car, resources
-        self.wheels = WheelSet.of(car, self.device, dtype)
+        self.resources = resources
+        self.car, self.wheels = _apart(car), WheelSet.of(car, self.device, dtype)
         self._advance = maybe_compile(self._substeps, self.device, compile)
 
     def set_cars(self, car: Car) -> None:
         """Replaces the parameters of cars that have one each, as tensors (N,)."""
-        self.car = car
-        self.wheels = WheelSet.of(car, self.device, self.wheels.x.dtype)
+        self.car, self.wheels = _apart(car), WheelSet.of(car, self.device, self.wheels.x.dtype)
 
     def step(self, state: Tensor, inputs: Tensor, group: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
         """One control step.
@@ -125,11 +125,22 @@ class Simulation:
         return torch.cat([state[:2] + change[:2], state[2:3], state[3:6] + change[2:], state[6:]]), impact
 
 
+def _apart(car: Car) -> Car:
+    """The cars in tensors that share no memory: a compiled region refuses views of one."""
+
+    def copied(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return tuple(copied(entry) for entry in value)
+        return value.clone() if isinstance(value, Tensor) else value
+
+    return replace(car, **{field.name: copied(getattr(car, field.name)) for field in fields(car)})
+
+
 def bodies_of(state: Tensor, car: Car, cars: int) -> Bodies:
     """The cars as rectangles, (A, B)."""
     yaw, vx, vy = state[ROW["yaw"]], state[ROW["vx"]], state[ROW["vy"]]
     cos, sin = torch.cos(yaw), torch.sin(yaw)
-    fields = (
+    rectangle = (
         state[ROW["x"]],
         state[ROW["y"]],
         cos,
@@ -142,4 +153,4 @@ def bodies_of(state: Tensor, car: Car, cars: int) -> Bodies:
         0.5 * car.length,
         0.5 * car.width,
     )
-    return Bodies(*(f.reshape(cars, -1) if isinstance(f, Tensor) else f for f in fields))
+    return Bodies(*(f.reshape(cars, -1) if isinstance(f, Tensor) else f for f in rectangle))

@@ -1,6 +1,7 @@
 """`RacingEnv` as a TorchRL environment, its rewards, starts and endings."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -287,3 +288,15 @@ def test_one_step_is_the_same_on_a_gpu():
         start = env.reset()
         ends.append(env.step(start.set("action", actions(50, 1)[0].to(device)))["next"]["observation"].cpu())
     torch.testing.assert_close(*ends, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # of the compiler, about itself
+@pytest.mark.parametrize(("cars", "car"), [(1, "gt3"), (5, "gt3"), (5, "pool")])
+def test_what_would_be_compiled_is_the_same(monkeypatch, cars, car):
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="aot_eager"))  # traced, without a C++ compiler
+    seen = []
+    for compiled in (False, True):
+        env = RacingEnv(10, cars=cars, car=car, track="ring", seed=0, compiled=compiled)
+        seen.append(roll(env, actions(10, 2)))
+    torch.testing.assert_close(seen[0]["observation"], seen[1]["observation"])
