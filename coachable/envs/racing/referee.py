@@ -180,7 +180,9 @@ class Referee:
         reward = task_reward(self.weights, s, run, tyres, outcome)
         features = style_features(old, new, tyres, outcome, bodies, group)
         lost = beyond(arc.offset, run.left, run.right) > run.margin + _BEHIND_WALL
-        terminated = (run.wrong_time > WRONG_WAY_TIME) | (run.stopped_time > STOPPED_TIME) | lost | broken
+        stranded = (run.wrong_time > WRONG_WAY_TIME) | (run.stopped_time > STOPPED_TIME) | lost
+        reward = reward - self.weights.stranded * stranded.to(reward.dtype)
+        terminated = stranded | broken
         packed_run = torch.stack(list(run))
         observation = self.observe(new, packed_run, compound, car, wheels, group)
         return Verdict(

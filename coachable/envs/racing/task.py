@@ -29,6 +29,8 @@ class TaskWeights:
         passing: per metre gained on cars near.
         contact: of any contact.
         rear_end: of contact with a car ahead, times the squared relative speed.
+        stranded: once, when a car that stands, goes backwards or is outside the walls ends its episode (our choice:
+            without it drivers learn to park beside the track for good, as that costs nothing).
     """
 
     progress: float = 1.0
@@ -38,6 +40,7 @@ class TaskWeights:
     passing: float = 0.5
     contact: float = 4.0
     rear_end: float = 0.1
+    stranded: float = 100.0
 
 
 class Outcome(NamedTuple):
