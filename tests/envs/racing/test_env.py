@@ -221,12 +221,16 @@ def test_wrong_way_and_standing_end_an_episode():
     env.state[ROW["yaw"], 0] += math.pi
     env.state[ROW["vx"]] = torch.tensor([20.0, 0.0])
     env.state[6:10] = env.state[ROW["vx"]] / 0.335
-    ends = []
+    ends, rewards = [], []
     for _ in range(102):
         after = env.step(start.set("action", torch.tensor([[0.0, 0.0], [0.0, -1.0]])))["next"]
         ends.append(after["terminated"].flatten())
+        rewards.append(after["task_reward"].flatten())
     first = torch.stack(ends).int().argmax(0).tolist()
     assert 29 <= first[0] <= 31 and 99 <= first[1] <= 101
+    standing = torch.stack(rewards)[:, 1]
+    torch.testing.assert_close(standing[first[1]], torch.tensor(-100.0), atol=0.1, rtol=0)
+    assert standing[: first[1]].abs().max() < 0.1
 
 
 def test_episodes_are_truncated_together():
