@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from torch.autograd.graph import increment_version
 
 from coachable.networks.memory import Arena
 
@@ -25,12 +26,24 @@ class FlatBuffers:
         self.tensors = [tensor.detach() for tensor in tensors]
         self.low = self.tensors if low_dtype is None else self._views(low_dtype)[1]
         self.grad, self.grads = self._views(self.tensors[0].dtype) if trained else (torch.zeros(0), [])
-        self._rounds = low_dtype is not None
+        self.rounds = low_dtype is not None
+        self._versions: list[int] = []
 
     def refresh(self) -> None:
-        """Renew the rounded copies."""
-        if self._rounds:
+        """Renew the rounded copies, if the tensors changed (through `.data` they change unseen, see `forget`)."""
+        versions = [tensor._version for tensor in self.tensors]
+        if self.rounds and versions != self._versions:
             torch._foreach_copy_(self.low, self.tensors)
+            self._versions = versions
+
+    def forget(self) -> None:
+        """Make the next `refresh` renew the copies in any case."""
+        self._versions = []
+
+    def renewed(self) -> None:
+        """Take note that a kernel changed the tensors, of which torch knows nothing, and renewed their copies."""
+        increment_version(self.tensors)
+        self._versions = [tensor._version for tensor in self.tensors]
 
     def _views(self, dtype: torch.dtype) -> tuple[Tensor, list[Tensor]]:
         """A buffer of zeros, and its parts in the shapes of the tensors."""

@@ -16,13 +16,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from coachable.networks.native import load_kernels
+from coachable.networks.native import KERNEL_THREADS, load_kernels
 from coachable.networks.passes import Layer, Member, TorchPasses
 from coachable.networks.workspace import Workspace
 
 __all__ = ["Layer", "Member", "Plan", "residual_network"]
 
-_KERNEL_THREADS = 4  # the kernels run on one thread; beside many, the parallel operations of torch are faster
 _SIZES = 4  # batch sizes for which memory is kept ready
 _ROWS = 32  # granularity of the row-sparse backward: few distinct sizes keep oneDNN's cache of kernels small
 
@@ -91,7 +90,7 @@ class Plan:
         own = self.members[0].parameters[0]
         normed = all(layer.norm for layer in self.layers)
         threads = torch.get_num_threads()
-        return normed and threads <= _KERNEL_THREADS and own.device.type == "cpu" and own.dtype == torch.float32
+        return normed and threads <= KERNEL_THREADS and own.device.type == "cpu" and own.dtype == torch.float32
 
 
 def residual_network(plan: Plan, inputs: Sequence[Tensor]) -> Tensor:

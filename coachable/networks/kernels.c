@@ -1,4 +1,5 @@
-/* Element-wise halves of a residual layer, one pass over memory each: see workspace.py.
+/* Element-wise halves of a residual layer, one pass over memory each: see workspace.py; and the optimiser's step, see
+ * adam.py.
  *
  * The layer is out = relu(gamma * (z + bias - mean) * rstd + beta) + skip, row by row, with z the matrix product in
  * bfloat16 or float32 (the file includes itself once for each) and everything else here in float32. Plain C without
@@ -33,6 +34,60 @@ static inline float total_of(const float *part) {
     return total;
 }
 
+typedef struct {
+    int64_t size;
+    float *value, *first, *second; /* the parameter and its moments */
+    const float *grad;
+    uint16_t *rounded; /* or null */
+    float *target; /* or null */
+    uint16_t *target_rounded; /* if there is a target and a rounded copy of the parameter */
+} Parameter;
+
+static inline __attribute__((always_inline)) float adam_on(
+    int64_t from, int64_t to, float *restrict value, float *restrict first, float *restrict second,
+    const float *restrict grad, uint16_t *restrict rounded, float *restrict target, uint16_t *restrict target_rounded, int rounds, int follows,
+    float rate, float beta1, float beta2, float root, float eps, float tau) {
+    float squares = 0.0f;
+    for (int64_t j = from; j < to; j++) {
+        const float g = grad[j], m = first[j] + (1.0f - beta1) * (g - first[j]);
+        const float v = beta2 * second[j] + (1.0f - beta2) * g * g;
+        const float x = value[j] - rate * m / (sqrtf(v) * root + eps);
+        first[j] = m;
+        second[j] = v;
+        value[j] = x;
+        if (rounds) rounded[j] = narrow(x);
+        if (follows) {
+            const float y = target[j] + tau * (x - target[j]);
+            target[j] = y;
+            if (rounds) target_rounded[j] = narrow(y);
+        }
+        squares += g * g;
+    }
+    return squares;
+}
+
+/* One step of Adam with rate = learning rate / (1 - beta1^t) and root = 1 / sqrt(1 - beta2^t); the targets, if there
+ * are any, then move by tau, and the rounded copies, if any, are renewed. Returns the gradient's squared norm. */
+double adam(const Parameter *parameters, int64_t count, float rate, float beta1, float beta2, float root, float eps,
+          float tau) {
+    double squares = 0.0;
+    for (int64_t i = 0; i < count; i++) {
+        const Parameter p = parameters[i];
+        for (int64_t from = 0; from < p.size; from += 4096) { /* short sums round little */
+            const int64_t to = from + 4096 < p.size ? from + 4096 : p.size;
+#define ADAM(rounds, follows)                                                                                       \
+    adam_on(from, to, p.value, p.first, p.second, p.grad, p.rounded, p.target, p.target_rounded, rounds, follows, rate, \
+            beta1, beta2, root, eps, tau)
+            if (p.rounded)
+                squares += p.target ? ADAM(1, 1) : ADAM(1, 0);
+            else
+                squares += p.target ? ADAM(0, 1) : ADAM(0, 0);
+#undef ADAM
+        }
+    }
+    return squares;
+}
+
 #define ELEMENT uint16_t
 #define LOAD(x) widen(x)
 #define STORE(x) narrow(x)
@@ -42,6 +97,202 @@ static inline float total_of(const float *part) {
 #undef LOAD
 #undef STORE
 #undef NAME
+
+/* Products of bfloat16 matrices with float32 sums, on one thread. The right factor is packed first, into memory that
+ * stays in the cache from product to product: blocks of BLOCK columns, each (inner / 2, BLOCK, 2). An odd inner
+ * dimension is filled up with zeros. ROWS x BLOCK sums stay in registers, which leaves 8 of 32. */
+#ifdef __AVX512BF16__
+#include <immintrin.h>
+#include <stdlib.h>
+
+#define ROWS 6
+#define BLOCK 64
+#define EACH_ROW(DO) DO(0) DO(1) DO(2) DO(3) DO(4) DO(5)
+
+static inline int64_t smaller(int64_t a, int64_t b) { return a < b ? a : b; }
+
+/* sums (ROWS, BLOCK) from ROWS addresses of pairs, `step` elements apart, and one block of the right factor. */
+static inline void tile(const uint16_t *const *left, int64_t step, const uint16_t *right, int64_t pairs, float *sums) {
+    __m512bh x;
+    int32_t pair;
+#define START(r)                                                                                     \
+    const uint16_t *p##r = left[r];                                                                  \
+    __m512 s##r##0 = _mm512_setzero_ps(), s##r##1 = s##r##0, s##r##2 = s##r##0, s##r##3 = s##r##0;
+#define MULTIPLY(r)                                     \
+    memcpy(&pair, p##r + k * step, sizeof pair);        \
+    x = (__m512bh)_mm512_set1_epi32(pair);              \
+    s##r##0 = _mm512_dpbf16_ps(s##r##0, x, y0);         \
+    s##r##1 = _mm512_dpbf16_ps(s##r##1, x, y1);         \
+    s##r##2 = _mm512_dpbf16_ps(s##r##2, x, y2);         \
+    s##r##3 = _mm512_dpbf16_ps(s##r##3, x, y3);
+#define FINISH(r)                                       \
+    _mm512_storeu_ps(sums + r * BLOCK, s##r##0);        \
+    _mm512_storeu_ps(sums + r * BLOCK + 16, s##r##1);   \
+    _mm512_storeu_ps(sums + r * BLOCK + 32, s##r##2);   \
+    _mm512_storeu_ps(sums + r * BLOCK + 48, s##r##3);
+    EACH_ROW(START)
+    for (int64_t k = 0; k < pairs; k++) {
+        const uint16_t *y = right + k * 2 * BLOCK;
+        const __m512bh y0 = (__m512bh)_mm512_loadu_si512(y), y1 = (__m512bh)_mm512_loadu_si512(y + 32);
+        const __m512bh y2 = (__m512bh)_mm512_loadu_si512(y + 64), y3 = (__m512bh)_mm512_loadu_si512(y + 96);
+        EACH_ROW(MULTIPLY)
+    }
+    EACH_ROW(FINISH)
+}
+
+/* Addresses of ROWS rows of a row-major matrix from row i; beyond the last, the last again. */
+static inline void rows_from(const uint16_t *matrix, int64_t stride, int64_t i, int64_t rows, const uint16_t **left) {
+    for (int r = 0; r < ROWS; r++) left[r] = matrix + smaller(i + r, rows - 1) * stride;
+}
+
+static int64_t packed_size(int64_t inner, int64_t n) {
+    return (inner + 1) / 2 * 2 * ((n + BLOCK - 1) / BLOCK * BLOCK);
+}
+
+/* The thread's memory for packed factors. */
+static uint16_t *packing_memory(int64_t size) {
+    static _Thread_local uint16_t *memory;
+    static _Thread_local int64_t held;
+    if (size > held) {
+        free(memory);
+        held = (size + 1023) / 1024 * 1024;
+        memory = aligned_alloc(64, held * sizeof *memory);
+    }
+    return memory;
+}
+
+/* Transpose 16 x 16 numbers of 32 bits: exchange halves, then quarters, and so on. */
+static inline void transpose(__m512i *m) {
+    const __m512i column = _mm512_set_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0);
+#pragma GCC unroll 4
+    for (int d = 8; d; d /= 2) {
+        const __mmask16 right = _mm512_test_epi32_mask(column, _mm512_set1_epi32(d));
+        const __m512i shift = _mm512_set1_epi32(d), other = _mm512_set1_epi32(16);
+        const __m512i upper = _mm512_mask_add_epi32(column, right, _mm512_sub_epi32(column, shift), other);
+        const __m512i lower = _mm512_mask_add_epi32(_mm512_add_epi32(column, shift), right, column, other);
+#pragma GCC unroll 16
+        for (int r = 0; r < 16; r++) {
+            if (r & d) continue;
+            const __m512i one = m[r], two = m[r + d];
+            m[r] = _mm512_permutex2var_epi32(one, upper, two);
+            m[r + d] = _mm512_permutex2var_epi32(one, lower, two);
+        }
+    }
+}
+
+/* Right factor from a matrix (n, inner) of which the transpose is wanted. */
+static void pack_transposed(const uint16_t *matrix, int64_t n, int64_t inner, uint16_t *packed) {
+    const int64_t pairs = (inner + 1) / 2;
+    for (int64_t j = 0; j < n; j += 16) {
+        uint16_t *to = packed + j / BLOCK * pairs * 2 * BLOCK + j % BLOCK * 2;
+        for (int64_t k = 0; k < inner; k += 32) {
+            const __mmask32 present = (__mmask32)(((uint64_t)1 << smaller(32, inner - k)) - 1);
+            __m512i m[16];
+            for (int64_t r = 0; r < 16; r++) {
+                const uint16_t *from = matrix + (j + r) * inner + k;
+                m[r] = j + r < n ? _mm512_maskz_loadu_epi16(present, from) : _mm512_setzero_si512();
+                _mm_prefetch(from + 16 * inner, _MM_HINT_T0); /* the processor does not guess this order */
+            }
+            transpose(m);
+            for (int64_t r = 0; r < smaller(16, pairs - k / 2); r++)
+                _mm512_storeu_si512(to + (k / 2 + r) * 2 * BLOCK, m[r]);
+        }
+    }
+}
+
+/* Right factor from a matrix (inner, n) with rows `stride` apart. */
+static void pack(const uint16_t *matrix, int64_t inner, int64_t n, int64_t stride, uint16_t *packed) {
+    const int64_t pairs = (inner + 1) / 2;
+    for (int64_t k = 0; k < inner; k += 2)
+        for (int64_t j = 0; j < n; j += BLOCK) {
+            const int64_t columns = smaller(BLOCK, n - j);
+            const uint16_t *one = matrix + k * stride + j, *two = one + stride;
+            uint32_t pair[BLOCK] = {0};
+            for (int64_t ahead = 8; ahead < 10; ahead++) {
+                _mm_prefetch(one + ahead * stride, _MM_HINT_T0);
+                _mm_prefetch(one + ahead * stride + 32, _MM_HINT_T0);
+            }
+            if (k + 1 < inner)
+                for (int64_t c = 0; c < columns; c++) pair[c] = one[c] | (uint32_t)two[c] << 16;
+            else
+                for (int64_t c = 0; c < columns; c++) pair[c] = one[c];
+            memcpy(packed + 2 * j * pairs + k * BLOCK, pair, sizeof pair);
+        }
+}
+
+/* z = x times the transpose of weight (n, inner), and then layer_forward with its arguments; x (rows, inner) is also
+ * the skip. If inner is odd, a column of zeros follows in x. */
+void dense_forward(int64_t inner, const uint16_t *weight, uint16_t *z, const float *bias, const float *gamma,
+                   const float *beta, const uint16_t *x, int64_t x_stride, int64_t from, int64_t to, int64_t width,
+                   float eps, int64_t rows, int64_t n, uint16_t *out, float *mean, float *rstd, float *scratch) {
+    const int64_t pairs = (inner + 1) / 2;
+    uint16_t *packed = packing_memory(packed_size(inner, n));
+    const uint16_t *left[ROWS];
+    float sums[ROWS * BLOCK];
+    pack_transposed(weight, n, inner, packed);
+    for (int64_t i = 0; i < rows; i += ROWS) {
+        const int64_t count = smaller(ROWS, rows - i);
+        rows_from(x, x_stride, i, rows, left);
+        for (int64_t j = 0; j < n; j += BLOCK) {
+            const int64_t columns = smaller(BLOCK, n - j);
+            tile(left, 2, packed + j * 2 * pairs, pairs, sums);
+            for (int64_t r = 0; r < count; r++)
+                for (int64_t c = 0; c < columns; c++) z[(i + r) * n + j + c] = narrow(sums[r * BLOCK + c]);
+        }
+        layer_forward_bf16(z + i * n, bias, gamma, beta, x + i * x_stride, x_stride, from, to, width, eps, count, n,
+                           out + i * n, mean + i, rstd + i, scratch);
+    }
+}
+
+/* Gradient of a layer's input: below (rows, n) = dz (rows, inner) times weight (inner, n; rows `stride` apart),
+ * plus columns from `to` of grad (rows, inner) at columns from `from`, which may be negative; an even inner dimension. */
+void dense_backward(const uint16_t *dz, int64_t rows, int64_t inner, const uint16_t *weight, int64_t stride, int64_t n,
+                    const uint16_t *restrict grad, int64_t from, int64_t to, int64_t width, uint16_t *restrict below) {
+    const int64_t pairs = inner / 2;
+    uint16_t *packed = packing_memory(packed_size(inner, n));
+    const uint16_t *left[ROWS];
+    float sums[ROWS * BLOCK];
+    pack(weight, inner, n, stride, packed);
+    for (int64_t i = 0; i < rows; i += ROWS) {
+        rows_from(dz, inner, i, rows, left);
+        for (int64_t j = 0; j < n; j += BLOCK) {
+            const int64_t first = from > j ? from - j : 0, last = smaller(from + width, j + BLOCK) - j;
+            tile(left, 2, packed + j * 2 * pairs, pairs, sums);
+            for (int64_t r = 0; r < smaller(ROWS, rows - i); r++) {
+                float *restrict s = sums + r * BLOCK;
+                const uint16_t *restrict g = grad + (i + r) * inner + to - from + j;
+                for (int64_t c = first; c < last; c++) s[c] += widen(g[c]);
+                for (int64_t c = 0; c < smaller(BLOCK, n - j); c++) below[(i + r) * n + j + c] = narrow(s[c]);
+            }
+        }
+    }
+}
+
+/* Gradient of a weight (m, n), added to what is there if `add`: the transpose of dz (rows, m) times x (rows, n). */
+void weight_gradient(const uint16_t *dz, int64_t m, const uint16_t *x, int64_t n, int64_t x_stride, int64_t rows,
+                     int add, float *restrict grad) {
+    const int64_t pairs = (rows + 1) / 2, size = packed_size(rows, m);
+    uint16_t *dz_packed = packing_memory(size + packed_size(rows, n)), *x_packed = dz_packed + size;
+    const uint16_t *left[ROWS];
+    float sums[ROWS * BLOCK];
+    pack(dz, rows, m, m, dz_packed);
+    pack(x, rows, n, x_stride, x_packed);
+    for (int64_t i = 0; i < m; i += ROWS) {
+        for (int64_t r = 0; r < ROWS; r++) { /* a column of dz, which lies where it would in a right factor */
+            const int64_t row = smaller(i + r, m - 1);
+            left[r] = dz_packed + row / BLOCK * pairs * 2 * BLOCK + row % BLOCK * 2;
+        }
+        for (int64_t j = 0; j < n; j += BLOCK) {
+            tile(left, 2 * BLOCK, x_packed + j * 2 * pairs, pairs, sums);
+            for (int64_t r = 0; r < smaller(ROWS, m - i); r++)
+                for (int64_t c = 0; c < smaller(BLOCK, n - j); c++) {
+                    float *to = grad + (i + r) * n + j + c;
+                    *to = (add ? *to : 0.0f) + sums[r * BLOCK + c];
+                }
+        }
+    }
+}
+#endif
 
 #define ELEMENT float
 #define LOAD(x) (x)
@@ -152,6 +403,43 @@ void NAME(layer_backward)(const ELEMENT *grad, const ELEMENT *z, const float *bi
         NAME(backward)(grad, z, bias, gamma, beta, mean, rstd, index, count, n, 1, dz, dgamma, dbeta, dbias, scratch);
     } else {
         NAME(backward)(grad, z, bias, gamma, beta, mean, rstd, index, count, n, 0, dz, dgamma, dbeta, dbias, scratch);
+    }
+}
+
+/* A linear head of few outputs: y (rows, outputs) from x (rows, n). */
+void NAME(head_forward)(const ELEMENT *restrict x, const float *restrict weight, const float *restrict bias, int64_t rows,
+                        int64_t n, int64_t outputs, float *restrict y) {
+    const int64_t even = n - n % LANES;
+    for (int64_t r = 0; r < rows; r++, x += n)
+        for (int64_t o = 0; o < outputs; o++) {
+            const float *restrict w = weight + o * n;
+            float sums[LANES] = {0};
+            for (int64_t j = 0; j < even; j += LANES)
+                for (int k = 0; k < LANES; k++) sums[k] += LOAD(x[j + k]) * w[j + k];
+            for (int64_t j = even; j < n; j++) sums[0] += LOAD(x[j]) * w[j];
+            y[r * outputs + o] = total_of(sums) + bias[o];
+        }
+}
+
+/* Its gradients from grad (count, outputs): dx (count, n), and, if `trained`, dweight and dbias, overwritten or added to
+ * as above. scratch: n floats. */
+void NAME(head_backward)(const float *restrict grad, const ELEMENT *restrict x, const float *restrict weight,
+                         int64_t count, int64_t n, int64_t outputs, int trained, int add, ELEMENT *restrict dx,
+                         float *restrict dweight, float *restrict dbias, float *restrict scratch) {
+    if (trained && !add) {
+        memset(dweight, 0, outputs * n * sizeof(float));
+        memset(dbias, 0, outputs * sizeof(float));
+    }
+    for (int64_t r = 0; r < count; r++, grad += outputs, x += n, dx += n) {
+        memset(scratch, 0, n * sizeof(float));
+        for (int64_t o = 0; o < outputs; o++) {
+            const float g = grad[o];
+            for (int64_t j = 0; j < n; j++) scratch[j] += g * weight[o * n + j];
+            if (!trained) continue;
+            for (int64_t j = 0; j < n; j++) dweight[o * n + j] += g * LOAD(x[j]);
+            dbias[o] += g;
+        }
+        for (int64_t j = 0; j < n; j++) dx[j] = STORE(scratch[j]);
     }
 }
 

@@ -16,7 +16,10 @@ from typing import Any
 
 import torch
 
+KERNEL_THREADS = 4  # the kernels run on one thread; beside many, the parallel operations of torch are faster
+
 _LOG = logging.getLogger(__name__)
+_TYPES = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int)
 _SOURCE = Path(__file__).with_name("kernels.c")
 _FLAGS = (
     *("-O3", "-march=native", "-mprefer-vector-width=512", "-std=c11", "-shared", "-fPIC"),
@@ -26,11 +29,24 @@ _FLAGS = (
 
 
 @dataclass(frozen=True)
+class Products:
+    """Products of bfloat16 matrices with what follows them, on one thread."""
+
+    dense_forward: Any
+    dense_backward: Any
+    weight_gradient: Any
+
+
+@dataclass(frozen=True)
 class Kernels:
     """The functions of `kernels.c` for one dtype; their arguments are addresses and numbers, see there."""
 
     layer_forward: Any
     layer_backward: Any
+    head_forward: Any
+    head_backward: Any
+    adam: Any
+    products: Products | None
 
 
 @functools.cache
@@ -81,13 +97,37 @@ def _cache() -> Path:
     return Path(tempfile.mkdtemp(prefix="coachable-"))
 
 
+def _products(library: ctypes.CDLL) -> Products | None:
+    """Those of the kernels where the processor multiplies bfloat16 in vector registers; with AMX, torch's are faster."""
+    capabilities = torch.cpu.get_capabilities()
+    if not capabilities.get("avx512_bf16") or capabilities.get("amx_bf16") or not hasattr(library, "dense_forward"):
+        return None
+    p, i, flag = _TYPES
+    arguments = {
+        "dense_forward": [i, p, p, p, p, p, p, i, i, i, i, ctypes.c_float, i, i, p, p, p, p],
+        "dense_backward": [p, i, i, p, i, i, p, i, i, i, p],
+        "weight_gradient": [p, i, p, i, i, i, flag, p],
+    }
+    functions = {name: library[name] for name in arguments}
+    for name, function in functions.items():
+        function.argtypes, function.restype = arguments[name], None
+    return Products(**functions)
+
+
 def _bind(library: ctypes.CDLL) -> dict[torch.dtype, Kernels]:
-    p, i, flag = ctypes.c_void_p, ctypes.c_int64, ctypes.c_int
+    p, i, flag = _TYPES
     kernels = {}
+    adam = library.adam
+    adam.argtypes = [p, i, *[ctypes.c_float] * 6]
+    adam.restype = ctypes.c_double
     for dtype, name in ((torch.bfloat16, "bf16"), (torch.float32, "fp32")):
         forward, backward = library[f"layer_forward_{name}"], library[f"layer_backward_{name}"]
         forward.argtypes = [p, p, p, p, p, i, i, i, i, ctypes.c_float, i, i, p, p, p, p]
         backward.argtypes = [p, p, p, p, p, p, p, p, i, flag, flag, i, p, p, p, p, p]
-        forward.restype = backward.restype = None
-        kernels[dtype] = Kernels(forward, backward)
+        head, head_backward = library[f"head_forward_{name}"], library[f"head_backward_{name}"]
+        head.argtypes = [p, p, p, i, i, i, p]
+        head_backward.argtypes = [p, p, p, i, i, i, flag, flag, p, p, p, p]
+        forward.restype = backward.restype = head.restype = head_backward.restype = None
+        products = _products(library) if dtype == torch.bfloat16 else None
+        kernels[dtype] = Kernels(forward, backward, head, head_backward, adam, products)
     return kernels

@@ -13,8 +13,10 @@ import torch
 from torch import Tensor
 
 from coachable.networks.memory import Arena
-from coachable.networks.native import Kernels
+from coachable.networks.native import Kernels, Products
 from coachable.networks.passes import Layer, Member
+
+_FEW_OUTPUTS = 4  # of a head; beyond, torch's products are faster than the kernels
 
 
 class Workspace:
@@ -42,7 +44,8 @@ class Workspace:
         self._arena, self._dtype = Arena(), members[0].products[0].dtype
         widest = max(layer.out_features for layer in layers)
         self._scratch = self._arena.empty(2 * widest)
-        self._input = self._arena.empty(rows, sum(widths), dtype=self._dtype)
+        width = sum(widths)
+        self._input = self._arena.zeros(rows, width + width % 2, dtype=self._dtype)[:, :width]
         self._slots = self._input.split(list(widths), -1)
         if keep:
             self._flow = [self._arena.empty(rows, widest, dtype=self._dtype) for _ in range(2)]
@@ -89,10 +92,13 @@ class _MemberSpace:
     ) -> None:
         self._space, self._layers = space, layers
         self._layer_forward, self._layer_backward = kernels.layer_forward, kernels.layer_backward
+        even = all(layer.out_features % 2 == 0 for layer in layers)
+        self._own_products = kernels.products if even else None
         # Addresses do not keep tensors alive.
         self._own, self._low, self._buffers, self._grads = member.parameters, member.products, buffers, member.grads
-        self._forward_steps: list[tuple[Tensor, Tensor, Tensor, tuple[Any, ...]]] = []
+        self._forward_steps: list[tuple[Any, ...]] = []
         self._backward_steps: list[tuple[Any, ...]] = []
+        self._product_steps: list[tuple[Any, ...]] = []
         x, i, rows = space._input, 0, space.rows
         scratch = space._scratch.data_ptr()
         for index, layer in enumerate(layers):
@@ -100,9 +106,10 @@ class _MemberSpace:
             bias, gamma, beta = (t.data_ptr() for t in self._own[i + 1 : i + 4])
             start, to, width = layer.skip_columns
             statistics = (mean.data_ptr(), rstd.data_ptr())
-            arguments = (z.data_ptr(), bias, gamma, beta, x.data_ptr(), x.shape[1], start, to, width, layer.eps)
+            arguments = (z.data_ptr(), bias, gamma, beta, x.data_ptr(), x.stride(0), start, to, width, layer.eps)
             arguments += (rows, layer.out_features, out.data_ptr(), *statistics, scratch)
-            self._forward_steps.append((x, self._low[i].t(), z, arguments))
+            weight_address = self._low[i].data_ptr()
+            self._forward_steps.append((x, self._low[i].t(), z, layer.in_features, weight_address, arguments))
             if space.keep:
                 n, m = layer.in_features, layer.out_features
                 # The gradient alternates between two buffers: the last layer's arrives in the first.
@@ -117,19 +124,40 @@ class _MemberSpace:
                 dw = space._dw[: m * n].view(m, n)
                 weight = grads[0] if grads else None
                 self._backward_steps.append((layer, x, here, below, dz, dz.t(), dw, weight, self._low[i], first, last))
+                factors = (dz.data_ptr(), m, x.data_ptr(), n, x.stride(0), rows)
+                target = weight.data_ptr() if weight is not None else None
+                self._product_steps.append((factors, target, weight_address, (start, to, width)))
             x, i = out, i + 4
         self._features = x
         self._head = (self._own[i], self._own[i].t(), self._own[i + 1]) if i < len(self._own) else None
         self._head_grads = self._grads[i:]
+        self._small_head = None
+        if self._head is not None and self._head[0].shape[0] <= _FEW_OUTPUTS:
+            weight, _, bias = self._head
+            self._small_head = kernels.head_forward, kernels.head_backward
+            self._head_sizes = x.shape[1], weight.shape[0]
+            self._head_addresses = x.data_ptr(), weight.data_ptr(), bias.data_ptr()
+            self._head_targets = [g.data_ptr() for g in self._head_grads] or [None] * 2
+            return
         self._hidden = x if x.dtype == torch.float32 else space._arena.empty(*x.shape)  # what the head sees
+        self._head_gradient = space._arena.empty(*x.shape) if space.keep else x
+
+    def _products(self) -> Products | None:
+        return self._own_products if torch.get_num_threads() == 1 else None
 
     def forward(self, out: Tensor) -> None:
-        kernel = self._layer_forward
-        for x, weight, z, arguments in self._forward_steps:
-            torch.mm(x, weight, out=z)
-            kernel(*arguments)
+        products = self._products()
+        if products is not None:
+            for _, _, _, inner, address, arguments in self._forward_steps:
+                products.dense_forward(inner, address, *arguments)
+        else:
+            for x, weight, z, _, _, arguments in self._forward_steps:
+                torch.mm(x, weight, out=z)
+                self._layer_forward(*arguments)
         if self._head is None:
             out.copy_(self._features)
+        elif self._small_head is not None:
+            self._small_head[0](*self._head_addresses, self._space.rows, *self._head_sizes, out.data_ptr())
         else:
             if self._hidden is not self._features:
                 self._hidden.copy_(self._features)
@@ -138,8 +166,12 @@ class _MemberSpace:
     def backward(self, grad: Tensor, trained: bool, add: bool, rows: Tensor | None, columns: slice | None) -> Tensor:
         if rows is not None:
             grad = grad.index_select(0, rows)
-        count = grad.shape[0]
-        if self._head is not None:
+        count, top = grad.shape[0], self._backward_steps[-1][2]
+        if self._small_head is not None:
+            grad = grad.contiguous()
+            arguments = (grad.data_ptr(), *self._head_addresses[:2], count, *self._head_sizes, trained, add)
+            self._small_head[1](*arguments, top.data_ptr(), *self._head_targets, self._space._scratch.data_ptr())
+        elif self._head is not None:
             if trained:
                 weight, bias = self._head_grads
                 if add:
@@ -148,14 +180,27 @@ class _MemberSpace:
                 else:
                     torch.mm(grad.t(), self._hidden, out=weight)
                     torch.sum(grad, 0, out=bias)
-            grad = torch.mm(grad, self._head[0])
-        kernel = self._layer_backward
+            top[:count].copy_(torch.mm(grad, self._head[0], out=self._head_gradient[:count]))
+        else:
+            top[:count].copy_(grad)
+        kernel, products = self._layer_backward, self._products()
         address = None if rows is None else rows.data_ptr()
         for index in reversed(range(len(self._layers))):
             layer, x, here, below, dz, dz_t, dw, into, weight, first, last = self._backward_steps[index]
-            if index == len(self._layers) - 1:
-                here[:count].copy_(grad)
             kernel(*first, address, count, trained, add, *last)
+            if products is not None:
+                factors, target, address_of_weight, (start, *skip) = self._product_steps[index]
+                if trained:
+                    products.weight_gradient(*factors, add, target)
+                span = columns if below is None else slice(0, layer.in_features)
+                if span is not None:
+                    if below is None:
+                        below = torch.empty(count, span.stop - span.start, dtype=dz.dtype)
+                    weight_part = address_of_weight + span.start * dz.itemsize, layer.in_features, below.shape[1]
+                    skip_part = here.data_ptr(), start - span.start, *skip, below.data_ptr()
+                    products.dense_backward(dz.data_ptr(), count, layer.out_features, *weight_part, *skip_part)
+                    grad = below
+                continue
             if trained:
                 if add:
                     into.add_(torch.mm(dz_t, x))

@@ -59,16 +59,20 @@ class Acceleration:
         self.frozen_critics = _critics(critic, plans(self.critic, False))
         self.target_critics = _critics(critic, plans(self.target, False))
         self._ensemble = CriticEnsemble(critic, self._choose, members)
+        self._buffers = (self.actor, self.critic, self.target)
+        loss.register_load_state_dict_post_hook(self._forget)
 
     @staticmethod
     def supports(loss_module: LossModule) -> bool:
         """Whether all networks are residual ones, on a CPU, and the critics are evaluated in SACLoss's way."""
         loss: Any = loss_module
         critic = getattr(loss, "qvalue_network", None)
-        trained = {name.split(".")[0] for name, p in loss_module.named_parameters() if p.requires_grad}
+        networks = {"actor_network_params", "qvalue_network_params"}
+        parts = {(name.split(".")[0], p.requires_grad) for name, p in loss_module.named_parameters()}
         return (
             hasattr(loss, "_vmap_qnetworkN0")
-            and trained <= {"actor_network_params", "qvalue_network_params", "log_alpha"}
+            and {part for part, trained in parts if trained} <= networks | {"log_alpha"}
+            and not any(part in networks for part, trained in parts if not trained)
             and all(p.device.type == "cpu" for p in loss_module.parameters())
             and isinstance(critic, TensorDictModule)
             and isinstance(critic.module, nn.Module)
@@ -97,7 +101,7 @@ class Acceleration:
         """Evaluate policy and critics with the hand-written passes inside the block."""
         loss = self._loss
         ordinary = loss._vmap_qnetworkN0
-        for flat in (self.actor, self.critic, self.target):
+        for flat in self._buffers:
             flat.refresh()
         for plan in (*self._actor_plans.values(), *self._critic_plans.values()):
             plan.begin()
@@ -113,19 +117,20 @@ class Acceleration:
             for network in self._policies.values():
                 network.use_plan(None)
 
+    def _forget(self, *_: Any) -> None:
+        """Loading goes through `.data`, so that versions do not tell of it."""
+        for flat in self._buffers:
+            flat.forget()
+
+    def buffers(self, name: str) -> tuple[FlatBuffers, FlatBuffers | None]:
+        """Buffers of the `"actor"` or the `"critic"`, and those of its target network."""
+        return (self.actor, None) if name == "actor" else (self.critic, self.target)
+
     def gradient(self, name: str) -> Tensor:
         """Gradient of the `"actor"` or the `"critic"` as one vector, after the backward pass."""
         for plan in (self._actor_plans if name == "actor" else self._critic_plans).values():
             plan.finish()
         return (self.actor if name == "actor" else self.critic).grad
-
-    def refresh(self, name: str) -> None:
-        """Renew the rounded weights of the `"actor"` or the `"critic"` after its optimiser's step."""
-        (self.actor if name == "actor" else self.critic).refresh()
-
-    def move_targets(self, tau: float) -> None:
-        """Polyak averaging of the target networks."""
-        torch._foreach_lerp_(self.target.tensors, self.critic.tensors, tau)
 
 
 def _critics(critic: TensorDictModule, plans: dict[str, Plan]) -> nn.Module:

@@ -8,15 +8,15 @@ import os
 import shutil
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import LossModule, SoftUpdate
 
-from coachable.networks.memory import Arena
 from coachable.training.acceleration import Acceleration
+from coachable.training.adam import FlatAdam, place_moments
 from coachable.training.lean_sac import LeanSAC
 from coachable.training.precision import Precision, resolve_precision
 
@@ -112,15 +112,10 @@ class Learner:
                 self._lean = LeanSAC(loss_module, self._acceleration)
         self._params = params
         rates = {"actor": actor_lr, "critic": critic_lr, "alpha": alpha_lr}
-        self.optimizers: dict[str, torch.optim.Optimizer] = {
-            name: torch.optim.Adam(group, lr=rates[name], eps=adam_eps, fused=device.type in ("cpu", "cuda"))
-            for name, group in params.items()
-            if group
+        self.optimizers: dict[str, torch.optim.Adam] = {
+            name: self._adam(name, group, rates[name], adam_eps) for name, group in params.items() if group
         }
         self._rates = rates
-        if device.type == "cpu":
-            for optimizer in self.optimizers.values():
-                _move_moments(optimizer)
         loss: Any = loss_module
         self._losses = _Losses(loss.forward, loss.actor_loss, _critic_loss_of(loss))
         if compile and self._acceleration is None and _can_compile(device):
@@ -150,8 +145,6 @@ class Learner:
             metrics = update(batch, losses)
         if self._acceleration is None:
             self.target_updater.step()
-        else:
-            self._acceleration.move_targets(self.tau)
         self.updates += 1
         # A sum over updates stays NaN or infinite once a part was. The norms are in it because a NaN parameter can hide
         # behind a rectifier in the losses, but not in the gradients.
@@ -191,11 +184,21 @@ class Learner:
         self.loss_module.load_state_dict(state["loss_module"])
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
-            if self._device_type == "cpu":
-                _move_moments(optimizer)
+            if self._device_type == "cpu" and not isinstance(optimizer, FlatAdam):
+                place_moments(optimizer)
         self.scale_learning_rates(1.0)
         self.updates = int(state["updates"])
         self._watch.zero_()
+
+    def _adam(self, name: str, params: list[nn.Parameter], lr: float, eps: float) -> torch.optim.Adam:
+        acceleration = self._acceleration
+        if acceleration is not None and name != "alpha":
+            flat, target = acceleration.buffers(name)
+            return FlatAdam(params, flat, target, self.tau, lr=lr, eps=eps)
+        optimizer = torch.optim.Adam(params, lr=lr, eps=eps, fused=self._device_type in ("cpu", "cuda"))
+        if self._device_type == "cpu":
+            place_moments(optimizer)
+        return optimizer
 
     def _networks(self) -> AbstractContextManager[None]:
         return nullcontext() if self._acceleration is None else self._acceleration.active()
@@ -208,18 +211,20 @@ class Learner:
     def _step(self, name: str) -> Tensor:
         """Clip, step, and return the norm of the gradient before clipping."""
         params, optimizer = self._params[name], self.optimizers[name]
-        acceleration = self._acceleration if name != "alpha" else None
-        if acceleration is not None:
-            norm = torch.linalg.vector_norm(acceleration.gradient(name))
+        limit = self.max_grad_norm if name != "alpha" else None
+        if isinstance(optimizer, FlatAdam):
+            grad = cast(Acceleration, self._acceleration).gradient(name)
+            if limit is None:
+                optimizer.step()
+                return optimizer.grad_norm
+            norm = torch.linalg.vector_norm(grad)
         else:
             norm = torch.nn.utils.get_total_norm([p.grad for p in params if p.grad is not None])
-        if self.max_grad_norm is not None and name != "alpha":
-            torch.nn.utils.clip_grads_with_norm_(params, self.max_grad_norm, norm)
+        if limit is not None:
+            torch.nn.utils.clip_grads_with_norm_(params, limit, norm)
         optimizer.step()
-        if acceleration is None:
+        if not isinstance(optimizer, FlatAdam):
             optimizer.zero_grad(set_to_none=True)
-        elif self.update_order != "simultaneous":
-            acceleration.refresh(name)
         return norm
 
     def _simultaneous(self, batch: TensorDictBase, functions: _Losses) -> dict[str, Tensor]:
@@ -293,18 +298,6 @@ def _can_compile(device: torch.device) -> bool:
         return True
     _LOG.warning("compile=True has no effect: torch.compile needs a C++ compiler on a CPU (g++ or clang++, or set CXX)")
     return False
-
-
-def _move_moments(optimizer: torch.optim.Optimizer) -> None:
-    """Place Adam's moments on huge pages, zeros if there are none yet."""
-    arena = Arena()
-    for group in optimizer.param_groups:
-        for p in group["params"]:
-            state = optimizer.state[p]
-            state.setdefault("step", torch.zeros(()))
-            for name in ("exp_avg", "exp_avg_sq"):
-                moment = arena.zeros(*p.shape, dtype=p.dtype)
-                state[name] = moment.copy_(state[name]) if name in state else moment
 
 
 def _critic_loss_of(loss_module: LossModule) -> Callable[..., Any]:

@@ -14,6 +14,8 @@ SHAPES = {
     "all_beginning": (40, (64, 80, 64), {"padding": "beginning"}),
     "no_norm": (40, (64, 64), {"layer_norm": False}),
     "no_head": (40, (64, 64), {}),
+    "wide_head": (40, (64, 64), {}),
+    "odd": (37, (63, 40), {}),
 }
 KERNELS = bool(native.load_kernels())
 
@@ -22,7 +24,7 @@ def build(kind, members, low=None, trained=True):
     """Networks, their stacked parameters by name, buffers and plan."""
     in_features, widths, options = SHAPES[kind]
     torch.manual_seed(0)
-    out = None if kind == "no_head" else 3
+    out = {"no_head": None, "wide_head": 12}.get(kind, 3)
     nets = [ResidualMLP(in_features, out, widths, **options) for _ in range(max(members, 1))]
     for net in nets:
         for p in net.parameters():  # generic values also for biases and layer norms
@@ -83,6 +85,22 @@ def test_bfloat16_is_close_to_float32(kind, members, compiled, monkeypatch):
     (low * weights.to(low.dtype)).sum().backward()
     for got, want in [(z.grad, y.grad), *zip(rounded.grads, exact.grads, strict=True)]:
         assert torch.cosine_similarity(got.flatten(), want.flatten(), dim=0) > 0.985  # masks of rectifiers flip
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_products_of_torch_and_of_our_own_agree(kind, monkeypatch):
+    """With two threads the products are torch's."""
+    torch.set_num_threads(1)
+    results = []
+    for threads in (1, 2):
+        monkeypatch.setattr(torch, "get_num_threads", lambda threads=threads: threads)
+        _, buffers, plan = build(kind, 2, torch.bfloat16)
+        torch.manual_seed(1)
+        x, y = inputs_of(kind, requires_grad=True)
+        fused.residual_network(plan, [x, y]).float().square().sum().backward()
+        results.append([y.grad, *buffers.grads])
+    for got, want in zip(*results, strict=True):
+        assert torch.cosine_similarity(got.flatten(), want.flatten(), dim=0) > 0.99
 
 
 @pytest.mark.parametrize("low", [None, torch.bfloat16])

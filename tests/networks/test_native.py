@@ -68,6 +68,77 @@ def test_layer_backward(n, rows, dtype):
             torch.testing.assert_close(got, offset + want if trained else torch.ones(n), rtol=1e-4, atol=1e-4)
 
 
+@needs_compiler
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("n", [63, 512])
+def test_small_head(n, dtype):
+    torch.manual_seed(0)
+    x, weight, bias, grad = torch.randn(5, n).to(dtype), torch.randn(3, n), torch.randn(3), torch.randn(5, 3)
+    y, dx, dweight, dbias, scratch = torch.empty(5, 3), torch.empty_like(x), *map(torch.ones, ((3, n), 3, n))
+    address, functions = [t.data_ptr() for t in (x, weight, bias)], kernels[dtype]
+    functions.head_forward(*address, 5, n, 3, y.data_ptr())
+    torch.testing.assert_close(y, F.linear(x.float(), weight, bias), rtol=1e-4, atol=1e-4)
+    last = [t.data_ptr() for t in (dx, dweight, dbias, scratch)]
+    for add in (1, 0):
+        functions.head_backward(grad.data_ptr(), *address[:2], 5, n, 3, 1, add, *last)
+        torch.testing.assert_close(dx.float(), grad @ weight, **DTYPES[dtype])
+        torch.testing.assert_close(dweight, add + grad.t() @ x.float(), rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(dbias, add + grad.sum(0), rtol=1e-4, atol=1e-4)
+
+
+products = kernels[torch.bfloat16].products if kernels else None
+needs_products = pytest.mark.skipif(products is None, reason="no bfloat16 products in vector registers")
+
+
+def rounded(*shape):
+    return torch.randn(shape).to(torch.bfloat16)
+
+
+@needs_products
+@pytest.mark.parametrize(("rows", "inner", "n"), [(1, 2, 1), (7, 33, 70), (13, 109, 128), (64, 128, 200)])
+def test_product_of_the_forward_pass(rows, inner, n):
+    torch.manual_seed(0)
+    stride = inner + inner % 2
+    x, weight, z, out = (
+        torch.zeros(rows, stride).to(torch.bfloat16),
+        rounded(n, inner),
+        rounded(rows, n),
+        rounded(rows, n),
+    )
+    x[:, :inner] = rounded(rows, inner)
+    (bias, gamma, beta), (mean, rstd) = torch.randn(3, n), torch.empty(2, rows)
+    width, scratch = min(inner, n), torch.empty(n)
+    first = [t.data_ptr() for t in (weight, z, bias, gamma, beta, x)]
+    last = [t.data_ptr() for t in (out, mean, rstd, scratch)]
+    products.dense_forward(inner, *first, stride, 0, 0, width, 1e-5, rows, n, *last)
+    torch.testing.assert_close(z.float(), x[:, :inner].float() @ weight.float().t(), rtol=1e-2, atol=1e-2)
+    expected = F.relu(F.layer_norm(z.float() + bias, (n,), gamma, beta))
+    expected[:, :width] += x[:, :width].float()
+    torch.testing.assert_close(out.float(), expected, rtol=1e-2, atol=1e-2)
+
+
+@needs_products
+@pytest.mark.parametrize(
+    ("rows", "inner", "n", "to"), [(1, 2, 1, 0), (7, 64, 71, 0), (13, 128, 109, 19), (64, 200, 128, 72)]
+)
+def test_products_of_the_backward_pass(rows, inner, n, to):
+    """Gradient of some columns of the input, and of the weight."""
+    torch.manual_seed(0)
+    dz, weight, grad, x = rounded(rows, inner), rounded(inner, n), rounded(rows, inner), rounded(rows, n)
+    width = min(inner - to, n)
+    skip = F.pad(grad[:, to : to + width].float(), (0, n - width))
+    expected = dz.float() @ weight.float() + skip
+    for start in (0, n // 3):
+        below = rounded(rows, n - start)
+        place = weight[:, start:].data_ptr(), n, n - start, grad.data_ptr(), -start, to, width, below.data_ptr()
+        products.dense_backward(dz.data_ptr(), rows, inner, *place)
+        torch.testing.assert_close(below.float(), expected[:, start:], rtol=1e-2, atol=1e-2)
+    into = torch.ones(inner, n)
+    for add in (1, 0):
+        products.weight_gradient(dz.data_ptr(), inner, x.data_ptr(), n, n, rows, add, into.data_ptr())
+        torch.testing.assert_close(into, add + dz.float().t() @ x.float(), rtol=1e-3, atol=1e-3)
+
+
 def test_without_a_compiler_there_are_no_kernels(fresh, monkeypatch, caplog):
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("CC", raising=False)

@@ -69,6 +69,13 @@ def test_networks_of_other_kinds_are_left_to_torch():
     assert all(torch.isfinite(value) for value in metrics.values())
 
 
+def test_networks_that_are_trained_in_part_are_left_to_torch():
+    loss = make_loss()
+    assert Acceleration.supports(loss)
+    next(iter(loss.actor_network_params.values(True, True))).requires_grad_(False)
+    assert not Acceleration.supports(loss)
+
+
 def test_a_residual_network_beside_other_parameters_is_left_to_torch():
     """Half a network by hand and half by autograd is not worth the trouble."""
     loss = make_loss()

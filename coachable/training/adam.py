@@ -1,0 +1,113 @@
+"""Adam in one pass over memory, which also renews the rounded copies and moves the target network."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.graph import increment_version
+
+from coachable.networks.flat import FlatBuffers
+from coachable.networks.memory import Arena
+from coachable.networks.native import KERNEL_THREADS, load_kernels
+
+__all__ = ["FlatAdam", "place_moments"]
+
+
+class FlatAdam(torch.optim.Adam):
+    """Adam for a network of the hand-written passes.
+
+    The same numbers as `torch.optim.Adam`, whose state it keeps, and its state dict.
+
+    Args:
+        params: The trained parameters.
+        flat: Their buffers: gradients, and rounded copies, which every step renews.
+        target: The target network's buffers, or `None`.
+        tau: Polyak rate by which the target moves after every step.
+        lr: Learning rate.
+        eps: Adam's epsilon.
+
+    Attributes:
+        grad_norm: Norm of the gradient of the last step.
+    """
+
+    def __init__(
+        self,
+        params: list[nn.Parameter],
+        flat: FlatBuffers,
+        target: FlatBuffers | None,
+        tau: float,
+        *,
+        lr: float,
+        eps: float,
+    ) -> None:
+        super().__init__(params, lr=lr, eps=eps, fused=True)
+        self._flat, self._target, self._tau = flat, target, tau
+        self.grad_norm = torch.zeros(())
+        self._steps: list[Tensor] = []
+        self._moments: tuple[list[Tensor], list[Tensor]] = ([], [])
+        self._table = torch.empty(0)
+        place_moments(self)
+        self._prepare()
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore a state of this class or of `torch.optim.Adam`."""
+        super().load_state_dict(state_dict)
+        place_moments(self)
+        self._prepare()
+
+    @torch.no_grad()
+    def step(self, closure: None = None) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Step on the gradients in the buffers, renew the rounded copies, move the target."""
+        (group,) = self.param_groups
+        (beta1, beta2), rate, eps = group["betas"], group["lr"], group["eps"]
+        flat, target, tensors = self._flat, self._target, self._flat.tensors
+        torch._foreach_add_(self._steps, 1.0)
+        if torch.get_num_threads() <= KERNEL_THREADS and (kernels := load_kernels()):
+            steps = self._steps[0].item()
+            rate, root = rate / (1.0 - beta1**steps), (1.0 - beta2**steps) ** -0.5
+            address = self._table.data_ptr()
+            squares = kernels[torch.float32].adam(address, len(tensors), rate, beta1, beta2, root, eps, self._tau)
+            self.grad_norm = torch.tensor(squares**0.5)
+            flat.renewed()
+            if target is not None:
+                target.renewed()
+            return
+        self.grad_norm = torch.linalg.vector_norm(flat.grad)
+        options = {"lr": rate, "beta1": beta1, "beta2": beta2, "eps": eps, "weight_decay": 0.0}
+        moments = self._moments
+        torch._fused_adam_(tensors, flat.grads, *moments, [], self._steps, **options, amsgrad=False, maximize=False)
+        increment_version(tensors)  # torch's function does not
+        flat.refresh()
+        if target is not None:
+            torch._foreach_lerp_(target.tensors, tensors, self._tau)
+            target.refresh()
+
+    def _prepare(self) -> None:
+        """Sort the state as the buffers are, and write the addresses for the kernel, see `Parameter` in kernels.c."""
+        by_address = {p.data_ptr(): self.state[p] for p in self.param_groups[0]["params"]}
+        states = [by_address[tensor.data_ptr()] for tensor in self._flat.tensors]
+        self._steps = [state["step"] for state in states]
+        self._moments = [state["exp_avg"] for state in states], [state["exp_avg_sq"] for state in states]
+        flat, target, none = self._flat, self._target, [None] * len(states)
+        columns = [flat.tensors, *self._moments, flat.grads, flat.low if flat.rounds else none]
+        columns += [none, none] if target is None else [target.tensors, target.low if target.rounds else none]
+        self._table = torch.tensor(
+            [
+                [row[0].numel(), *(0 if tensor is None else tensor.data_ptr() for tensor in row)]
+                for row in zip(*columns, strict=True)
+            ]
+        )
+
+
+def place_moments(optimizer: torch.optim.Adam) -> None:
+    """Place Adam's moments on huge pages, zeros if there are none yet."""
+    arena = Arena()
+    for group in optimizer.param_groups:
+        for p in group["params"]:
+            state = optimizer.state[p]
+            state.setdefault("step", torch.zeros(()))
+            for name in ("exp_avg", "exp_avg_sq"):
+                moment = arena.zeros(*p.shape, dtype=p.dtype)
+                state[name] = moment.copy_(state[name]) if name in state else moment

@@ -1,0 +1,79 @@
+import copy
+
+import pytest
+import torch
+
+from coachable.networks.flat import FlatBuffers
+from coachable.networks.native import load_kernels
+from coachable.training import adam
+from coachable.training.adam import FlatAdam
+
+SHAPES = [(2, 70, 33), (1,), (5,), (90, 100)]
+needs_compiler = pytest.mark.skipif(not load_kernels(), reason="no C compiler")
+
+
+def parameters(seed):
+    torch.manual_seed(seed)
+    return [torch.nn.Parameter(torch.randn(shape)) for shape in SHAPES]
+
+
+def flat_adam(params, low=None, target=None, tau=0.1):
+    flat = FlatBuffers(params[::-1], low, trained=True)  # the order may differ
+    for parameter, grad in zip(params[::-1], flat.grads, strict=True):
+        parameter.grad = grad
+    return FlatAdam(params, flat, target, tau, lr=1e-2, eps=1e-7), flat
+
+
+def fill(params, seed):
+    torch.manual_seed(seed)
+    for parameter in params:
+        parameter.grad.copy_(torch.randn(parameter.shape))
+
+
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
+@pytest.mark.parametrize("low", [None, torch.bfloat16])
+def test_steps_are_those_of_adam(low, compiled, monkeypatch):
+    if not compiled:
+        monkeypatch.setattr(adam, "load_kernels", dict)
+    params, reference, target = parameters(0), parameters(0), parameters(1)[::-1]
+    follows = FlatBuffers(target, low, trained=False)
+    optimizer, flat = flat_adam(params, low, follows)
+    theirs = torch.optim.Adam(reference, lr=1e-2, eps=1e-7)
+    expected = [t.detach().clone() for t in target]
+    for step in range(5):
+        fill(params, step)
+        for ours, other in zip(params, reference, strict=True):
+            other.grad = ours.grad.clone()
+        version = params[0]._version
+        optimizer.step()
+        theirs.step()
+        assert params[0]._version > version  # autograd and other learners see the change
+        torch.testing.assert_close(optimizer.grad_norm, torch.cat([p.grad.flatten() for p in params]).norm())
+        torch._foreach_lerp_(expected, [p.detach() for p in reference[::-1]], 0.1)
+    for got, want in ((params, reference), (target, expected)):
+        torch.testing.assert_close([t.detach() for t in got], [t.detach() for t in want])
+    for buffers in (flat, follows):
+        rounded = [t.to(low) for t in buffers.tensors] if low else buffers.tensors
+        torch.testing.assert_close(buffers.low, rounded, rtol=0, atol=0)
+    for ours, other in zip(params, reference, strict=True):
+        torch.testing.assert_close(optimizer.state[ours], theirs.state[other])
+
+
+def test_state_is_that_of_adam():
+    """It moves to torch's class and back, and a restored optimiser goes on with the same bits."""
+    params = parameters(0)
+    optimizer, _ = flat_adam(params)
+    fill(params, 0)
+    optimizer.step()
+    state = copy.deepcopy(optimizer.state_dict())
+    plain = torch.optim.Adam(parameters(0), lr=1e-2, eps=1e-7, fused=True)
+    plain.load_state_dict(state)
+    again = [torch.nn.Parameter(p.detach().clone()) for p in params]
+    restored, _ = flat_adam(again)
+    restored.load_state_dict(plain.state_dict())
+    for which in (params, again):
+        fill(which, 1)
+    optimizer.step()
+    restored.step()
+    for ours, other in zip(params, again, strict=True):
+        assert torch.equal(ours, other)
