@@ -35,7 +35,7 @@ from coachable.envs.racing.task import Outcome, TaskWeights, contacts, metres_ga
 from coachable.envs.racing.track import Course
 
 WRONG_WAY_TIME = 3.0  # [s]
-STOPPED_TIME = 10.0  # [s]
+STOPPED_TIME = 3.0  # [s]
 STOPPED_SPEED = 1.0  # [m/s]
 _BEHIND_WALL = 3.0  # [m], further out than a car can be pushed back from
 TELEMETRY = (
