@@ -98,7 +98,7 @@ def _cache() -> Path:
 
 
 def _products(library: ctypes.CDLL) -> Products | None:
-    """Those of the kernels where the processor multiplies bfloat16 in vector registers; with AMX, torch's are faster."""
+    """The kernels' products where the processor has bfloat16 in vector registers; with AMX, torch's are faster."""
     capabilities = torch.cpu.get_capabilities()
     if not capabilities.get("avx512_bf16") or capabilities.get("amx_bf16") or not hasattr(library, "dense_forward"):
         return None
