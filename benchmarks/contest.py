@@ -50,7 +50,7 @@ class Worker:
 
     def close(self) -> None:
         self.process.stdin.close()
-        self.process.wait(10)
+        self.process.wait(300)  # on a busy machine leaving takes long
 
 
 def measure(workers: list[Worker], rounds: int, work: Mapping[str, int] | int) -> dict[str, list[dict[str, float]]]:
