@@ -7,7 +7,6 @@ python benchmarks/cheetah_losses.py --losses sac qr_sac --seeds 0 1
 import argparse
 import csv
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -16,34 +15,20 @@ import torch
 from matplotlib import pyplot as plt
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from trainings import RECIPES, train
 
-RECIPES = Path(__file__).resolve().parent.parent / "recipes"
 sys.path.insert(0, str(RECIPES))
 
-from cheetah_speed import cheetah_env, cheetah_space, cheetah_style_reward  # noqa: E402
+from cheetah_speed import cheetah_env, cheetah_space, cheetah_style_reward
 
-from coachable.evaluation.curves import draw_learning_curves  # noqa: E402
-from coachable.evaluation.statistics import bootstrap_interval  # noqa: E402
-from coachable.keys import STYLE, STYLE_FEATURES  # noqa: E402
-from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state  # noqa: E402
-from coachable.training.weights import load_policy  # noqa: E402
-from coachable.transforms import coachable_env  # noqa: E402
+from coachable.evaluation.curves import draw_learning_curves
+from coachable.evaluation.statistics import bootstrap_interval
+from coachable.keys import STYLE, STYLE_FEATURES
+from coachable.training.weights import load_policy
+from coachable.transforms import coachable_env
 
 SPEEDS = torch.linspace(0.0, 3.0, 13)
 STEPS, SETTLED = 200, 50  # [env-steps] of an episode, and before its speed counts
-
-
-def train(loss: str, seed: int, run_dir: Path, overrides: list[str]) -> None:
-    """Trains, or continues what was interrupted, in a process of its own."""
-    try:
-        state = read_state(find_checkpoint(run_dir))
-        if state["loop"]["frames"] >= state["config"]["train"]["total_frames"]:
-            return
-        arguments = [f"resume={run_dir}"]
-    except CheckpointError:
-        arguments = ["preset=cpu", f"loss={loss}", f"seed={seed}", f"run_dir={run_dir}", *overrides]
-    arguments += ["threads.simulator=1", "threads.learner=1"]
-    subprocess.run([sys.executable, str(RECIPES / "cheetah_speed.py"), *arguments], check=True)
 
 
 @torch.no_grad()
@@ -74,7 +59,7 @@ def main() -> None:
     runs = {loss: [args.runs / f"{loss}_{seed}" for seed in args.seeds] for loss in args.losses}
     for seed in args.seeds:  # one seed of every loss first: an interrupted comparison is a fair one
         for loss in args.losses:
-            train(loss, seed, args.runs / f"{loss}_{seed}", args.overrides)
+            train("cheetah_speed", args.runs / f"{loss}_{seed}", [f"loss={loss}", f"seed={seed}", *args.overrides])
 
     args.out.mkdir(parents=True, exist_ok=True)
     draw_learning_curves(runs, args.out / "curves.png", x="frames", y="eval/return", smooth=1)
