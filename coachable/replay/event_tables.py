@@ -124,7 +124,14 @@ class EventTableBuffer(TensorDictReplayBuffer):
 
     @classmethod
     def for_events(
-        cls, events: EventPredicate, *, capacity: int, event_capacity: int, event_horizon: int, **kwargs: Any
+        cls,
+        events: EventPredicate,
+        *,
+        capacity: int,
+        event_capacity: int,
+        event_horizon: int,
+        event_share: float = 0.5,
+        **kwargs: Any,
     ) -> "EventTableBuffer":
         """A default table and one table per event, all of one size.
 
@@ -133,10 +140,18 @@ class EventTableBuffer(TensorDictReplayBuffer):
             capacity: Records of the default table.
             event_capacity: Records of each event table.
             event_horizon: H_max.
+            event_share: Share of a batch that the event tables have together, equally.
             **kwargs: As for the class.
+
+        Raises:
+            ValueError: If the share is not between 0 and 1.
         """
+        if not 0.0 < event_share < 1.0:
+            raise ValueError(f"event_share is {event_share}: expected a share of the batch, between 0 and 1")
         capacities = {"default": capacity, **dict.fromkeys(events.names, event_capacity)}
-        return cls(capacities, events=events, event_horizon=event_horizon, **kwargs)
+        shares = {"default": 1.0 - event_share, **dict.fromkeys(events.names, event_share / len(events.names))}
+        proportions = {"table_proportions": shares, **kwargs}
+        return cls(capacities, events=events, event_horizon=event_horizon, **proportions)
 
     @classmethod
     def for_styles(

@@ -625,3 +625,16 @@ def test_rollouts_of_torchrl_are_taken_as_they_are():
     buffer.extend(TensorDict.lazy_stack(frames, 1))
     assert buffer.table("default")["id"].tolist() == [0, 1, 2, 3, 4, 5]
     assert isinstance(buffer.storage, LazyTensorStorage)
+
+
+def test_the_share_of_event_tables():
+    events = KeyEvents(["a", "b"])
+    sizes = {"capacity": 100, "event_capacity": 50, "event_horizon": 2, "num_envs": 1, "batch_size": 20}
+    rb = EventTableBuffer.for_events(events, event_share=0.2, **sizes)
+    fired = torch.zeros(60, 2, dtype=torch.bool)
+    fired[10, 0], fired[20, 1] = True, True
+    step = {"done": torch.zeros(60, 1, dtype=torch.bool), "events": fired}
+    rb.extend(TensorDict({"t": torch.arange(60), "next": step}, [60]))
+    assert torch.bincount(rb.sample()["table"]).tolist() == [16, 2, 2]
+    with pytest.raises(ValueError, match=r"event_share is 1.0: expected a share"):
+        EventTableBuffer.for_events(events, event_share=1.0, **sizes)
