@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from coachable.domain import Domain, load_domain
 from coachable.keys import STYLE
-from coachable.styles import Choice, StyleSpace
+from coachable.styles import Choice, StyleSpace, Weight
 from coachable.training.weights import load_policy
 from coachable.transforms import coachable_env
 
@@ -60,7 +60,7 @@ def render(
         _import_av()
     agent = load_policy(source)
     domain = load_domain(agent.metadata["domain"], agent.config)
-    requests = default_tour(agent.space) if styles is None else list(styles)
+    requests = default_tour(domain, agent.space) if styles is None else list(styles)
     period = max(1, round(seconds_per_style / domain.control_step))
     sheet = out.suffix == ".png"
     # A sheet shows the end of each style's time, when the agent has had the chance to comply.
@@ -75,8 +75,10 @@ def render(
     return out
 
 
-def default_tour(space: StyleSpace) -> list[dict[str, Any]]:
-    """Requests that show every option of each choice, with low, middle and high values of the other parameters."""
+def default_tour(domain: Domain, space: StyleSpace) -> list[dict[str, Any]]:
+    """Every option of each choice, with low, middle and high values of the set-points; with weights, the domain's grid."""
+    if any(isinstance(p, Weight) for p in space.parameters):
+        return domain.cells()
     choices = [p for p in space.parameters if isinstance(p, Choice)]
     others = [p for p in space.parameters if not isinstance(p, Choice)]
     tour = []
@@ -148,7 +150,9 @@ def _caption_lines(
     record = {name: torch.stack([row[name] for row in window]) for name in window[0]}
     measured = domain.measures.summarise(record, torch.ones(len(window), 1, dtype=torch.bool))
     asked = ", ".join(f"{k} {v:.2f}" if isinstance(v, float) else f"{v}" for k, v in request.items())
-    shown = ", ".join(f"{k} {v.item():.2f}" for k, v in measured.items() if not bool(v.isnan().any()))
+    wanted = [name.removeprefix("measured_") for name in domain.columns]
+    published = {name: value for name, value in measured.items() if name in wanted} or measured
+    shown = ", ".join(f"{k} {v.item():.2f}" for k, v in published.items() if not bool(v.isnan().any()))
     return f"asked: {asked}".replace("_", " "), f"last 2 s: {shown}; falls {falls}".replace("_", " ")
 
 
@@ -166,6 +170,7 @@ def caption(frame: np.ndarray, lines: tuple[str, str]) -> np.ndarray:
 
 def _write_sheet(frames: Sequence[np.ndarray], out: Path, columns: int = 3) -> None:
     height, width = frames[0].shape[:2]
+    columns = min(columns, len(frames))
     rows = -(-len(frames) // columns)
     sheet = np.zeros((rows * height, columns * width, 3), dtype=np.uint8)
     for index, frame in enumerate(frames):

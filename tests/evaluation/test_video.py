@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from coachable.domain import load_domain
 from coachable.envs.humanoid import humanoid_style_space
 from coachable.evaluation.video import default_tour, render, write_video
 
@@ -34,7 +35,7 @@ def test_gif_keeps_the_duration(tmp_path):
 
 
 def test_the_tour_shows_every_pose_with_three_lengths():
-    tour = default_tour(humanoid_style_space())
+    tour = default_tour(load_domain("humanoid"), humanoid_style_space())
     assert len(tour) == 9
     assert tour[0] == {"pose": "arms_in_front", "step_length": pytest.approx(0.30)}
     assert [round(stop["step_length"], 3) for stop in tour[:3]] == [0.3, 0.475, 0.65]
@@ -43,3 +44,8 @@ def test_the_tour_shows_every_pose_with_three_lengths():
 def test_another_suffix_is_refused_before_anything_is_drawn(tmp_path):
     with pytest.raises(ValueError, match=r"cannot write film.avi: expected a file ending in one of"):
         render("humanoid", tmp_path / "film.avi")
+
+
+def test_the_tour_of_weights_is_the_grid():
+    domain = load_domain("racing_drift")
+    assert default_tour(domain, domain.make_space()) == domain.cells()
