@@ -76,7 +76,7 @@ def render(
 
 
 def default_tour(domain: Domain, space: StyleSpace) -> list[dict[str, Any]]:
-    """Every option of each choice, with low, middle and high set-points; with weights, the cells of the domain's grid."""
+    """Each option of each choice with low, middle and high set-points; with weights, the cells of the domain's grid."""
     if any(isinstance(p, Weight) for p in space.parameters):
         return domain.cells()
     choices = [p for p in space.parameters if isinstance(p, Choice)]
