@@ -1,4 +1,4 @@
-"""How far a car drives sideways under rising weights of rear slip, and what that costs."""
+"""How far a car drives sideways under rising drift weights, and what that costs."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from coachable.envs.racing.measures import DRIFT_ANGLE_DEG, GRIP_ANGLE_DEG
 from coachable.envs.racing.scenarios import Scenario
+from coachable.envs.racing.styles import DRIFT_NAMES
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
 from coachable.evaluation.style_grid import evaluate_grid, markdown_table, training_counts, write_csv
 
@@ -22,7 +23,8 @@ if TYPE_CHECKING:
     from coachable.domain import Domain
     from coachable.training.weights import LoadedPolicy
 
-WEIGHT = "slip_angle_rear"
+ANGLE = "slip_angle_rear"
+SWEEPS = {"rear slip angle": (ANGLE,), "all four": DRIFT_NAMES}  # weights that rise together
 WEIGHTS = (-0.4, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
 _STARTS = (Scenario("solo", 1.0, "solo"),)
 _METRICS = ("slip_angle_rear", "slip_angle_front", "pace", "off", "turns", "survived")
@@ -40,7 +42,7 @@ def evaluate_drift(
     num_threads: int | None = None,
     progress: bool = True,
 ) -> str:
-    """Drive under rising weights of the rear slip angle, the other weights neutral, from ordinary starts.
+    """Drive under rising weights, of the rear slip angle alone and of all four together, from ordinary starts.
 
     Files: `drift.csv` (by weight), `drift.png`, `report.md`, `summary.json`.
 
@@ -62,7 +64,7 @@ def evaluate_drift(
         ValueError: if `episodes` is below 1.
     """
     out.mkdir(parents=True, exist_ok=True)
-    cells = [{WEIGHT: weight} for weight in WEIGHTS]
+    cells = [dict.fromkeys(names, weight) for names in SWEEPS.values() for weight in WEIGHTS]
     grid = evaluate_grid(
         domain,
         agent.actor,
@@ -74,18 +76,24 @@ def evaluate_drift(
         progress=progress,
         env_options={"scenarios": _STARTS},
     )
-    rows = _rows(grid.episodes)
-    angles, weights = grid.episodes[WEIGHT], np.repeat(np.array(WEIGHTS)[:, None], episodes, 1)
-    full, none = rows[-1], rows[WEIGHTS.index(0.0)]
-    summary = {
-        "rank_correlation": rank_correlation(weights.ravel(), angles.ravel()),
-        "angle_at_full": full["slip_angle_rear"],
-        "angle_at_none": none["slip_angle_rear"],
-        "pace_kept_at_full": full["pace_kept"],
-        "most_turns": float(np.nanmax(grid.episodes["turns"])),
-        "episodes_per_weight": episodes,
-        "seed": seed,
-    }
+    values = {name: value.reshape(len(SWEEPS), len(WEIGHTS), -1) for name, value in grid.episodes.items()}
+    rows = [
+        row
+        for index, sweep in enumerate(SWEEPS)
+        for row in _rows(sweep, {name: value[index] for name, value in values.items()})
+    ]
+    weights = np.repeat(np.array(WEIGHTS)[:, None], episodes, 1).ravel()
+    summary: dict[str, Any] = {}
+    for index, sweep in enumerate(SWEEPS):
+        own = [row for row in rows if row["sweep"] == sweep]
+        summary[sweep] = {
+            "rank_correlation": rank_correlation(weights, values[ANGLE][index].ravel()),
+            "angle_at_none": own[WEIGHTS.index(0.0)][ANGLE],
+            "angle_at_full": own[-1][ANGLE],
+            "pace_kept_at_full": own[-1]["pace_kept"],
+            "most_turns": max(row["most_turns"] for row in own),
+        }
+    summary |= {"episodes_per_weight": episodes, "seed": seed}
     write_csv(rows, out / "drift.csv")
     draw_drift(rows, out / "drift.png")
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
@@ -94,13 +102,13 @@ def evaluate_drift(
     return report
 
 
-def _rows(episodes: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
-    """Means by weight, with 95 % intervals of the angle."""
+def _rows(sweep: str, episodes: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
+    """Means by weight, with 95 % intervals of the angle, of values (weights, episodes)."""
     neutral = float(np.nanmean(episodes["pace"][WEIGHTS.index(0.0)]))
     rows = []
     for index, weight in enumerate(WEIGHTS):
-        low, high = bootstrap_interval(episodes[WEIGHT][index])
-        row: dict[str, Any] = {"weight": weight}
+        low, high = bootstrap_interval(episodes[ANGLE][index])
+        row: dict[str, Any] = {"sweep": sweep, "weight": weight}
         row |= {name: float(np.nanmean(episodes[name][index])) for name in _METRICS}
         row |= {"angle_low": low, "angle_high": high, "pace_kept": row["pace"] / max(neutral, 1e-9)}
         rows.append(row | {"most_turns": float(np.nanmax(episodes["turns"][index]))})
@@ -108,19 +116,18 @@ def _rows(episodes: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
 
 
 def draw_drift(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Slip angles, and pace and time off the track, over the weight."""
-    weights = [row["weight"] for row in rows]
+    """Rear slip angle, and pace, over the weight, a line per sweep."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.8), layout="constrained")
-    angle = np.array([row["slip_angle_rear"] for row in rows])
-    error = np.abs(np.array([[row["angle_low"], row["angle_high"]] for row in rows]) - angle[:, None]).T
-    left.errorbar(weights, angle, error, marker="o", capsize=3, label="rear, 95 % interval")
-    left.plot(weights, [row["slip_angle_front"] for row in rows], marker="s", ls="--", label="front")
-    left.axhline(DRIFT_ANGLE_DEG, color="0.6", lw=1, ls=":")
-    left.axhline(GRIP_ANGLE_DEG, color="0.6", lw=1, ls=":")
-    left.set(xlabel="requested weight of the rear slip angle", ylabel="mean slip angle [deg]")
-    right.plot(weights, [row["pace_kept"] for row in rows], marker="o", label="progress, share of that at 0")
-    right.plot(weights, [row["off"] for row in rows], marker="s", ls="--", label="share of time off the track")
-    right.set(xlabel="requested weight of the rear slip angle")
+    for sweep, marker in zip(SWEEPS, "os", strict=True):
+        own = [row for row in rows if row["sweep"] == sweep]
+        weights, angle = [row["weight"] for row in own], np.array([row[ANGLE] for row in own])
+        error = np.abs(np.array([[row["angle_low"], row["angle_high"]] for row in own]) - angle[:, None]).T
+        left.errorbar(weights, angle, error, marker=marker, capsize=3, label=f"{sweep}, 95 % interval")
+        right.plot(weights, [row["pace_kept"] for row in own], marker=marker, label=sweep)
+    for line in (DRIFT_ANGLE_DEG, GRIP_ANGLE_DEG):
+        left.axhline(line, color="0.6", lw=1, ls=":")
+    left.set(xlabel="requested weight", ylabel="mean slip angle of the rear tyres [deg]")
+    right.set(xlabel="requested weight", ylabel="progress, share of that at 0")
     for panel in (left, right):
         panel.set_ylim(0.0, None)
         panel.grid(alpha=0.3)
@@ -137,10 +144,18 @@ def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Map
     )
     text += f"{steps} steps per weight, ordinary starts, the other weights 0, seed {summary['seed']}.\n\n"
     text += "![slip angle over weight](drift.png)\n\n"
-    formats = {"weight": "g", "slip_angle_rear": ".1f", "slip_angle_front": ".1f", "pace": ".1f", "pace_kept": ".0%"}
+    formats = {
+        "sweep": "",
+        "weight": "g",
+        "slip_angle_rear": ".1f",
+        "slip_angle_front": ".1f",
+        "pace": ".1f",
+        "pace_kept": ".0%",
+    }
     text += markdown_table(rows, formats | {"off": ".1%", "turns": ".1f", "most_turns": ".0f", "survived": ".0%"})
     text += (
         "\nSlip angles in degrees (0 below 5 m/s), pace in m/s along the track, turns: largest rotation against the "
     )
     text += "track in one direction, in whole turns, mean and most over episodes.\n\n"
-    return text + f"Rank correlation of weight and rear slip angle: {summary['rank_correlation']:.2f}.\n"
+    ranks = ", ".join(f"{sweep} {summary[sweep]['rank_correlation']:.2f}" for sweep in SWEEPS)
+    return text + f"Rank correlation of weight and rear slip angle: {ranks}.\n"
