@@ -11,7 +11,7 @@ from coachable.envs.racing.driver import LineFollower
 from coachable.envs.racing.env import RacingEnv
 from coachable.envs.racing.parameters import Resources, load_car
 from coachable.envs.racing.rivals import Rivals
-from coachable.envs.racing.scenarios import Conditions, drift_scenarios, rolling_start
+from coachable.envs.racing.scenarios import Conditions, drift_scenarios, race_scenarios
 from coachable.envs.racing.styles import (
     aggressiveness_style_reward,
     aggressiveness_style_space,
@@ -55,7 +55,7 @@ def race_env(num_envs: int = 65, **options: Any) -> RacingEnv:
 
 
 def rival_env(num_envs: int = AGENTS * 21, **options: Any) -> RacingEnv:
-    """Three agents among two rivals, scripted or copies of the policy (`Rivals`), GT3 cars, rolling start.
+    """Three agents among two rivals, scripted or copies of the policy (`Rivals`), GT3 cars, all kinds of starts.
 
     One agent among four rivals where `num_envs` is no multiple of three.
     """
@@ -67,7 +67,7 @@ def rival_env(num_envs: int = AGENTS * 21, **options: Any) -> RacingEnv:
         "controlled": AGENTS if num_envs % AGENTS == 0 else 1,
         "driver": Rivals(driver, aggressiveness_style_space(), slowest=0.8 / RIVALS_GRIP),
         "car": car,
-        "scenarios": rolling_start(CARS),
+        "scenarios": race_scenarios(CARS),
     }
     return RacingEnv(num_envs, **{**defaults, **options, "track": course})
 
