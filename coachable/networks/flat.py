@@ -30,15 +30,11 @@ class FlatBuffers:
         self._versions: list[int] = []
 
     def refresh(self) -> None:
-        """Renew the rounded copies, if the tensors changed (through `.data` they change unseen, see `forget`)."""
+        """Renew the rounded copies, if the tensors changed (through `.data` they change unseen)."""
         versions = [tensor._version for tensor in self.tensors]
         if self.rounds and versions != self._versions:
             torch._foreach_copy_(self.low, self.tensors)
             self._versions = versions
-
-    def forget(self) -> None:
-        """Make the next `refresh` renew the copies in any case."""
-        self._versions = []
 
     def renewed(self) -> None:
         """Take note that a kernel changed the tensors, of which torch knows nothing, and renewed their copies."""

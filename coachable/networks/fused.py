@@ -45,6 +45,9 @@ class Plan:
         self.anchor = torch.zeros((), requires_grad=True) if members[0].grads else None
         self.written = False
         self._spaces: dict[tuple[int, ...], list[Workspace]] = {}
+        own = members[0].parameters[0]
+        suits = own.device.type == "cpu" and own.dtype == torch.float32 and all(layer.norm for layer in layers)
+        self._kernel_threads = KERNEL_THREADS if suits else 0
 
     @property
     def out_features(self) -> int:
@@ -71,7 +74,7 @@ class Plan:
             keep: Whether a backward pass will follow.
         """
         kernels = load_kernels().get(self.members[0].products[0].dtype)
-        if kernels is None or not self._suits_kernels():
+        if kernels is None or torch.get_num_threads() > self._kernel_threads:
             return TorchPasses(self.layers, self.members, keep)
         key = (rows, keep, *widths)
         if key not in self._spaces and len(self._spaces) >= _SIZES:
@@ -85,12 +88,6 @@ class Plan:
             free = self._spaces.get((passes.rows, passes.keep, *passes.widths))
             if free is not None:
                 free.append(passes)
-
-    def _suits_kernels(self) -> bool:
-        own = self.members[0].parameters[0]
-        normed = all(layer.norm for layer in self.layers)
-        threads = torch.get_num_threads()
-        return normed and threads <= KERNEL_THREADS and own.device.type == "cpu" and own.dtype == torch.float32
 
 
 def residual_network(plan: Plan, inputs: Sequence[Tensor]) -> Tensor:

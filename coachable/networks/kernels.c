@@ -41,6 +41,7 @@ typedef struct {
     uint16_t *rounded; /* or null */
     float *target; /* or null */
     uint16_t *target_rounded; /* if there is a target and a rounded copy of the parameter */
+    float *steps; /* taken so far */
 } Parameter;
 
 static inline __attribute__((always_inline)) float adam_on(
@@ -73,6 +74,7 @@ double adam(const Parameter *parameters, int64_t count, float rate, float beta1,
     double squares = 0.0;
     for (int64_t i = 0; i < count; i++) {
         const Parameter p = parameters[i];
+        *p.steps += 1.0f;
         for (int64_t from = 0; from < p.size; from += 4096) { /* short sums round little */
             const int64_t to = from + 4096 < p.size ? from + 4096 : p.size;
 #define ADAM(rounds, follows)                                                                                       \
@@ -98,9 +100,10 @@ double adam(const Parameter *parameters, int64_t count, float rate, float beta1,
 #undef STORE
 #undef NAME
 
-/* Products of bfloat16 matrices with float32 sums, on one thread. The right factor is packed first, into memory that
- * stays in the cache from product to product: blocks of BLOCK columns, each (inner / 2, BLOCK, 2). An odd inner
- * dimension is filled up with zeros. ROWS x BLOCK sums stay in registers, which leaves 8 of 32. */
+/* Products of bfloat16 matrices with float32 sums, and the float32 products of a head, on one thread. The right factor
+ * is packed first, into memory that stays in the cache from product to product: blocks of BLOCK columns, each
+ * (inner / 2, BLOCK, 2). An odd inner dimension is filled up with zeros. ROWS x BLOCK sums stay in registers, which
+ * leaves 8 of 32. */
 #ifdef __AVX512BF16__
 #include <immintrin.h>
 #include <stdlib.h>
@@ -111,20 +114,23 @@ double adam(const Parameter *parameters, int64_t count, float rate, float beta1,
 
 static inline int64_t smaller(int64_t a, int64_t b) { return a < b ? a : b; }
 
-/* sums (ROWS, BLOCK) from ROWS addresses of pairs, `step` elements apart, and one block of the right factor. */
-static inline void tile(const uint16_t *const *left, int64_t step, const uint16_t *right, int64_t pairs, float *sums) {
+/* sums (ROWS, BLOCK) from ROWS addresses of pairs, `step` elements apart, and one block of the right factor. If
+ * `single`, float32 numbers stand in the place of the pairs, here and in packed factors. */
+static inline __attribute__((always_inline)) void tile(const uint16_t *const *left, int64_t step, const uint16_t *right,
+                                                       int64_t pairs, int single, float *sums) {
     __m512bh x;
     int32_t pair;
 #define START(r)                                                                                     \
     const uint16_t *p##r = left[r];                                                                  \
     __m512 s##r##0 = _mm512_setzero_ps(), s##r##1 = s##r##0, s##r##2 = s##r##0, s##r##3 = s##r##0;
+#define ADD(s, y) s = single ? _mm512_fmadd_ps((__m512)x, (__m512)y, s) : _mm512_dpbf16_ps(s, x, y)
 #define MULTIPLY(r)                                     \
     memcpy(&pair, p##r + k * step, sizeof pair);        \
     x = (__m512bh)_mm512_set1_epi32(pair);              \
-    s##r##0 = _mm512_dpbf16_ps(s##r##0, x, y0);         \
-    s##r##1 = _mm512_dpbf16_ps(s##r##1, x, y1);         \
-    s##r##2 = _mm512_dpbf16_ps(s##r##2, x, y2);         \
-    s##r##3 = _mm512_dpbf16_ps(s##r##3, x, y3);
+    ADD(s##r##0, y0);                                   \
+    ADD(s##r##1, y1);                                   \
+    ADD(s##r##2, y2);                                   \
+    ADD(s##r##3, y3);
 #define FINISH(r)                                       \
     _mm512_storeu_ps(sums + r * BLOCK, s##r##0);        \
     _mm512_storeu_ps(sums + r * BLOCK + 16, s##r##1);   \
@@ -235,7 +241,7 @@ void dense_forward(int64_t inner, const uint16_t *weight, uint16_t *z, const flo
         rows_from(x, x_stride, i, rows, left);
         for (int64_t j = 0; j < n; j += BLOCK) {
             const int64_t columns = smaller(BLOCK, n - j);
-            tile(left, 2, packed + j * 2 * pairs, pairs, sums);
+            tile(left, 2, packed + j * 2 * pairs, pairs, 0, sums);
             for (int64_t r = 0; r < count; r++)
                 for (int64_t c = 0; c < columns; c++) z[(i + r) * n + j + c] = narrow(sums[r * BLOCK + c]);
         }
@@ -257,7 +263,7 @@ void dense_backward(const uint16_t *dz, int64_t rows, int64_t inner, const uint1
         rows_from(dz, inner, i, rows, left);
         for (int64_t j = 0; j < n; j += BLOCK) {
             const int64_t first = from > j ? from - j : 0, last = smaller(from + width, j + BLOCK) - j;
-            tile(left, 2, packed + j * 2 * pairs, pairs, sums);
+            tile(left, 2, packed + j * 2 * pairs, pairs, 0, sums);
             for (int64_t r = 0; r < smaller(ROWS, rows - i); r++) {
                 float *restrict s = sums + r * BLOCK;
                 const uint16_t *restrict g = grad + (i + r) * inner + to - from + j;
@@ -283,7 +289,7 @@ void weight_gradient(const uint16_t *dz, int64_t m, const uint16_t *x, int64_t n
             left[r] = dz_packed + row / BLOCK * pairs * 2 * BLOCK + row % BLOCK * 2;
         }
         for (int64_t j = 0; j < n; j += BLOCK) {
-            tile(left, 2 * BLOCK, x_packed + j * 2 * pairs, pairs, sums);
+            tile(left, 2 * BLOCK, x_packed + j * 2 * pairs, pairs, 0, sums);
             for (int64_t r = 0; r < smaller(ROWS, m - i); r++)
                 for (int64_t c = 0; c < smaller(BLOCK, n - j); c++) {
                     float *to = grad + (i + r) * n + j + c;
@@ -291,6 +297,60 @@ void weight_gradient(const uint16_t *dz, int64_t m, const uint16_t *x, int64_t n
                 }
         }
     }
+}
+
+/* A linear head of many outputs, in float32: the same as head_forward below. */
+void wide_head_forward(const uint16_t *restrict x, const float *weight, const float *restrict bias, int64_t rows,
+                       int64_t n, int64_t outputs, float *restrict y) {
+    uint16_t *packed = packing_memory(packed_size(2 * n, outputs) + ROWS * 2 * n);
+    float *some = (float *)(packed + packed_size(2 * n, outputs)), sums[ROWS * BLOCK];
+    const uint16_t *left[ROWS];
+    pack_transposed((const uint16_t *)weight, outputs, 2 * n, packed);
+    for (int64_t i = 0; i < rows; i += ROWS) {
+        const int64_t count = smaller(ROWS, rows - i);
+        for (int64_t k = 0; k < count * n; k++) some[k] = widen(x[i * n + k]);
+        rows_from((uint16_t *)some, 2 * n, 0, count, left);
+        for (int64_t j = 0; j < outputs; j += BLOCK) {
+            tile(left, 2, packed + j * 2 * n, n, 1, sums);
+            for (int64_t r = 0; r < count; r++)
+                for (int64_t c = 0; c < smaller(BLOCK, outputs - j); c++)
+                    y[(i + r) * outputs + j + c] = sums[r * BLOCK + c] + bias[j + c];
+        }
+    }
+}
+
+/* Its gradients: the same as head_backward below. */
+void wide_head_backward(const float *grad, const uint16_t *restrict x, const float *restrict weight, int64_t count,
+                        int64_t n, int64_t outputs, int trained, int add, uint16_t *restrict dx,
+                        float *restrict dweight, float *restrict dbias) {
+    float *packed = (float *)packing_memory(packed_size(2 * (count < outputs ? outputs : count), BLOCK));
+    float sums[ROWS * BLOCK];
+    const uint16_t *left[ROWS];
+    for (int64_t j = 0; j < n; j += BLOCK) {
+        const int64_t columns = smaller(BLOCK, n - j);
+        for (int64_t k = 0; k < outputs; k++) memcpy(packed + k * BLOCK, weight + k * n + j, columns * sizeof *packed);
+        for (int64_t i = 0; i < count; i += ROWS) {
+            rows_from((const uint16_t *)grad, 2 * outputs, i, count, left);
+            tile(left, 2, (uint16_t *)packed, outputs, 1, sums);
+            for (int64_t r = 0; r < smaller(ROWS, count - i); r++)
+                for (int64_t c = 0; c < columns; c++) dx[(i + r) * n + j + c] = narrow(sums[r * BLOCK + c]);
+        }
+        if (!trained) continue;
+        for (int64_t k = 0; k < count; k++)
+            for (int64_t c = 0; c < columns; c++) packed[k * BLOCK + c] = widen(x[k * n + j + c]);
+        for (int64_t i = 0; i < outputs; i += ROWS) {
+            rows_from((const uint16_t *)grad, 2, i, outputs, left);
+            tile(left, 2 * outputs, (uint16_t *)packed, count, 1, sums);
+            for (int64_t r = 0; r < smaller(ROWS, outputs - i); r++)
+                for (int64_t c = 0; c < columns; c++) {
+                    float *to = dweight + (i + r) * n + j + c;
+                    *to = (add ? *to : 0.0f) + sums[r * BLOCK + c];
+                }
+        }
+    }
+    if (trained && !add) memset(dbias, 0, outputs * sizeof *dbias);
+    for (int64_t r = 0; trained && r < count; r++)
+        for (int64_t o = 0; o < outputs; o++) dbias[o] += grad[r * outputs + o];
 }
 #endif
 

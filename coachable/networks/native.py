@@ -30,11 +30,13 @@ _FLAGS = (
 
 @dataclass(frozen=True)
 class Products:
-    """Products of bfloat16 matrices with what follows them, on one thread."""
+    """Products of bfloat16 matrices with what follows them, and heads of many outputs, on one thread."""
 
     dense_forward: Any
     dense_backward: Any
     weight_gradient: Any
+    wide_head_forward: Any
+    wide_head_backward: Any
 
 
 @dataclass(frozen=True)
@@ -55,13 +57,16 @@ def load_kernels() -> dict[torch.dtype, Kernels]:
 
     Returns:
         The kernels by dtype of the matrix products, or none without a working C compiler, or if `COACHABLE_NATIVE=0`
-        is set. Everything works without them, about a tenth slower.
+        is set. Everything works without them: an update takes about 1.2 times as long at float32 (measured on a Zen 5
+        for three layers of 512), and 1.5 times at bfloat16 where the kernels multiply.
     """
     if os.environ.get("COACHABLE_NATIVE", "1") == "0":
         return {}
     compiler = next((c for c in (os.environ.get("CC"), "cc", "gcc", "clang") if c and shutil.which(c)), None)
     if compiler is None:
-        _LOG.info("no C compiler (cc, gcc or clang): the learner goes without its own kernels, about a tenth slower")
+        _LOG.info(
+            "no C compiler (cc, gcc or clang): the learner goes without its own kernels, a fifth to a half slower"
+        )
         return {}
     try:
         return _bind(ctypes.CDLL(str(_build(compiler))))
@@ -107,6 +112,8 @@ def _products(library: ctypes.CDLL) -> Products | None:
         "dense_forward": [i, p, p, p, p, p, p, i, i, i, i, ctypes.c_float, i, i, p, p, p, p],
         "dense_backward": [p, i, i, p, i, i, p, i, i, i, p],
         "weight_gradient": [p, i, p, i, i, i, flag, p],
+        "wide_head_forward": [p, p, p, i, i, i, p],
+        "wide_head_backward": [p, p, p, i, i, i, flag, flag, p, p, p],
     }
     functions = {name: library[name] for name in arguments}
     for name, function in functions.items():

@@ -16,7 +16,7 @@ from coachable.networks.memory import Arena
 from coachable.networks.native import Kernels, Products
 from coachable.networks.passes import Layer, Member
 
-_FEW_OUTPUTS = 4  # of a head; beyond, torch's products are faster than the kernels
+_FEW_OUTPUTS = 4  # of a head; beyond, products of matrices are faster than the kernels of small heads
 
 
 class Workspace:
@@ -126,20 +126,25 @@ class _MemberSpace:
                 self._backward_steps.append((layer, x, here, below, dz, dz.t(), dw, weight, self._low[i], first, last))
                 factors = (dz.data_ptr(), m, x.data_ptr(), n, x.stride(0), rows)
                 target = weight.data_ptr() if weight is not None else None
-                self._product_steps.append((factors, target, weight_address, (start, to, width)))
+                addresses = dz.data_ptr(), weight_address, here.data_ptr(), None if below is None else below.data_ptr()
+                self._product_steps.append((factors, target, addresses, (start, to, width)))
             x, i = out, i + 4
         self._features = x
         self._head = (self._own[i], self._own[i].t(), self._own[i + 1]) if i < len(self._own) else None
         self._head_grads = self._grads[i:]
-        self._small_head = None
-        if self._head is not None and self._head[0].shape[0] <= _FEW_OUTPUTS:
-            weight, _, bias = self._head
-            self._small_head = kernels.head_forward, kernels.head_backward
-            self._head_sizes = x.shape[1], weight.shape[0]
-            self._head_addresses = x.data_ptr(), weight.data_ptr(), bias.data_ptr()
-            self._head_targets = [g.data_ptr() for g in self._head_grads] or [None] * 2
+        self._head_kernels: tuple[Any, Any] | None = None
+        if self._head is None:
             return
-        self._hidden = x if x.dtype == torch.float32 else space._arena.empty(*x.shape)  # what the head sees
+        weight, _, bias = self._head
+        self._head_sizes = x.shape[1], weight.shape[0]
+        self._head_addresses = x.data_ptr(), weight.data_ptr(), bias.data_ptr()
+        self._head_targets: list[int | None] = [g.data_ptr() for g in self._head_grads] or [None] * 2
+        self._small_head = weight.shape[0] <= _FEW_OUTPUTS
+        if self._small_head:
+            self._head_kernels = kernels.head_forward, kernels.head_backward
+            self._head_targets.append(scratch)
+            return
+        self._hidden = x if x.dtype == torch.float32 else space._arena.empty(*x.shape)  # what torch's head sees
         self._head_gradient = space._arena.empty(*x.shape) if space.keep else x
 
     def _products(self) -> Products | None:
@@ -156,8 +161,11 @@ class _MemberSpace:
                 self._layer_forward(*arguments)
         if self._head is None:
             out.copy_(self._features)
-        elif self._small_head is not None:
-            self._small_head[0](*self._head_addresses, self._space.rows, *self._head_sizes, out.data_ptr())
+            return
+        if not self._small_head:  # the backward pass follows this choice
+            self._head_kernels = products and (products.wide_head_forward, products.wide_head_backward)
+        if self._head_kernels is not None:
+            self._head_kernels[0](*self._head_addresses, self._space.rows, *self._head_sizes, out.data_ptr())
         else:
             if self._hidden is not self._features:
                 self._hidden.copy_(self._features)
@@ -167,10 +175,10 @@ class _MemberSpace:
         if rows is not None:
             grad = grad.index_select(0, rows)
         count, top = grad.shape[0], self._backward_steps[-1][2]
-        if self._small_head is not None:
+        if self._head_kernels is not None:
             grad = grad.contiguous()
             arguments = (grad.data_ptr(), *self._head_addresses[:2], count, *self._head_sizes, trained, add)
-            self._small_head[1](*arguments, top.data_ptr(), *self._head_targets, self._space._scratch.data_ptr())
+            self._head_kernels[1](*arguments, top.data_ptr(), *self._head_targets)
         elif self._head is not None:
             if trained:
                 weight, bias = self._head_grads
@@ -189,17 +197,18 @@ class _MemberSpace:
             layer, x, here, below, dz, dz_t, dw, into, weight, first, last = self._backward_steps[index]
             kernel(*first, address, count, trained, add, *last)
             if products is not None:
-                factors, target, address_of_weight, (start, *skip) = self._product_steps[index]
+                factors, target, (dz_at, weight_at, here_at, below_at), (start, *skip) = self._product_steps[index]
                 if trained:
                     products.weight_gradient(*factors, add, target)
-                span = columns if below is None else slice(0, layer.in_features)
-                if span is not None:
-                    if below is None:
-                        below = torch.empty(count, span.stop - span.start, dtype=dz.dtype)
-                    weight_part = address_of_weight + span.start * dz.itemsize, layer.in_features, below.shape[1]
-                    skip_part = here.data_ptr(), start - span.start, *skip, below.data_ptr()
-                    products.dense_backward(dz.data_ptr(), count, layer.out_features, *weight_part, *skip_part)
-                    grad = below
+                n, m = layer.in_features, layer.out_features
+                if index:
+                    products.dense_backward(dz_at, count, m, weight_at, n, n, here_at, start, *skip, below_at)
+                elif columns is not None:
+                    first_column, width = columns.start, columns.stop - columns.start
+                    grad = torch.empty(count, width, dtype=dz.dtype)
+                    factor = weight_at + first_column * dz.itemsize, n, width
+                    place = here_at, start - first_column, *skip, grad.data_ptr()
+                    products.dense_backward(dz_at, count, m, *factor, *place)
                 continue
             if trained:
                 if add:

@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torch.autograd.graph import increment_version
 from torchrl.objectives import LossModule
 
 from coachable.networks.ensemble import CriticEnsemble, Triple, make_plan, planned_copy, residual_networks
@@ -60,7 +61,7 @@ class Acceleration:
         self.target_critics = _critics(critic, plans(self.target, False))
         self._ensemble = CriticEnsemble(critic, self._choose, members)
         self._buffers = (self.actor, self.critic, self.target)
-        loss.register_load_state_dict_post_hook(self._forget)
+        loss.register_load_state_dict_post_hook(_tell)
 
     @staticmethod
     def supports(loss_module: LossModule) -> bool:
@@ -117,11 +118,6 @@ class Acceleration:
             for network in self._policies.values():
                 network.use_plan(None)
 
-    def _forget(self, *_: Any) -> None:
-        """Loading goes through `.data`, so that versions do not tell of it."""
-        for flat in self._buffers:
-            flat.forget()
-
     def buffers(self, name: str) -> tuple[FlatBuffers, FlatBuffers | None]:
         """Buffers of the `"actor"` or the `"critic"`, and those of its target network."""
         return (self.actor, None) if name == "actor" else (self.critic, self.target)
@@ -131,6 +127,14 @@ class Acceleration:
         for plan in (self._actor_plans if name == "actor" else self._critic_plans).values():
             plan.finish()
         return (self.actor if name == "actor" else self.critic).grad
+
+
+def _tell(loss: LossModule, _: Any) -> None:
+    """Hook after loading, which goes through `.data`, so that versions do not tell of it.
+
+    It knows nothing but its arguments, so that a copy of the loss has one of its own.
+    """
+    increment_version([*loss.parameters(), *loss.buffers()])
 
 
 def _critics(critic: TensorDictModule, plans: dict[str, Plan]) -> nn.Module:

@@ -63,17 +63,17 @@ class FlatAdam(torch.optim.Adam):
         (group,) = self.param_groups
         (beta1, beta2), rate, eps = group["betas"], group["lr"], group["eps"]
         flat, target, tensors = self._flat, self._target, self._flat.tensors
-        torch._foreach_add_(self._steps, 1.0)
         if torch.get_num_threads() <= KERNEL_THREADS and (kernels := load_kernels()):
-            steps = self._steps[0].item()
+            steps = self._steps[0].item() + 1.0
             rate, root = rate / (1.0 - beta1**steps), (1.0 - beta2**steps) ** -0.5
             address = self._table.data_ptr()
             squares = kernels[torch.float32].adam(address, len(tensors), rate, beta1, beta2, root, eps, self._tau)
-            self.grad_norm = torch.tensor(squares**0.5)
+            self.grad_norm = torch.scalar_tensor(squares**0.5)
             flat.renewed()
             if target is not None:
                 target.renewed()
             return
+        torch._foreach_add_(self._steps, 1.0)
         self.grad_norm = torch.linalg.vector_norm(flat.grad)
         options = {"lr": rate, "beta1": beta1, "beta2": beta2, "eps": eps, "weight_decay": 0.0}
         moments = self._moments
@@ -93,6 +93,7 @@ class FlatAdam(torch.optim.Adam):
         flat, target, none = self._flat, self._target, [None] * len(states)
         columns = [flat.tensors, *self._moments, flat.grads, flat.low if flat.rounds else none]
         columns += [none, none] if target is None else [target.tensors, target.low if target.rounds else none]
+        columns += [self._steps]
         self._table = torch.tensor(
             [
                 [row[0].numel(), *(0 if tensor is None else tensor.data_ptr() for tensor in row)]

@@ -65,39 +65,41 @@ class LeanSAC:
 
     def forward(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Both losses from the same parameters, as `SACLoss.forward`."""
-        loss_qvalue, critic = self.critic_loss(batch)
-        loss_actor, actor = self.actor_loss(batch)
+        alpha = self._loss._alpha
+        loss_qvalue, critic = self.critic_loss(batch, alpha)
+        loss_actor, actor = self.actor_loss(batch, alpha)
         batch.set(self._loss.tensor_keys.priority, critic["td_error"])
         losses = {
             "loss_actor": loss_actor,
             "loss_qvalue": loss_qvalue,
-            "alpha": self._loss._alpha,
+            "alpha": alpha,
             "entropy": -actor["log_prob"].mean(),
         }
         if self._loss.log_alpha.requires_grad:
             losses["loss_alpha"] = self._loss.alpha_loss(actor["log_prob"]).mean()
         return losses
 
-    def actor_loss(self, batch: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+    def actor_loss(self, batch: TensorDictBase, alpha: Tensor | None = None) -> tuple[Tensor, dict[str, Tensor]]:
         """`mean(alpha log pi - min_k Q_k)`, without gradient for the critics."""
         action, log_prob = self._act(batch)
         value = self._values(self._networks.frozen_critics, batch, action).min(0).values
-        return (self._loss._alpha * log_prob - value).mean(), {"log_prob": log_prob.detach()}
+        cost = (self._loss._alpha if alpha is None else alpha) * log_prob
+        return (cost - value).mean(), {"log_prob": log_prob.detach()}
 
-    def critic_loss(self, batch: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+    def critic_loss(self, batch: TensorDictBase, alpha: Tensor | None = None) -> tuple[Tensor, dict[str, Tensor]]:
         """Regression on the target, summed over the critics."""
-        target = self._target(batch)
+        target = self._target(batch, alpha)
         value = self._values(self._networks.trained_critics, batch, batch.get(self._loss.tensor_keys.action))
         loss = distance_loss(value, target.expand_as(value), loss_function=self._loss.loss_function)
         return loss.sum(0).mean(), {"td_error": (value.detach() - target).abs().amax(0)}
 
     @torch.no_grad()
-    def _target(self, batch: TensorDictBase) -> Tensor:
+    def _target(self, batch: TensorDictBase, alpha: Tensor | None = None) -> Tensor:
         keys, estimator = self._loss.tensor_keys, self._loss.value_estimator
         successor: Any = batch.get("next")
         action, log_prob = self._act(successor)
         value = self._values(self._networks.target_critics, successor, action).min(0).values
-        value = value - self._loss._alpha * log_prob
+        value = value - (self._loss._alpha if alpha is None else alpha) * log_prob
         discount = estimator.gamma
         steps = batch.get(estimator.tensor_keys.steps_to_next_obs, None)
         if steps is not None:

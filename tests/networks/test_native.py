@@ -139,6 +139,28 @@ def test_products_of_the_backward_pass(rows, inner, n, to):
         torch.testing.assert_close(into, add + dz.float().t() @ x.float(), rtol=1e-3, atol=1e-3)
 
 
+@needs_products
+@pytest.mark.parametrize(("rows", "n", "outputs"), [(1, 1, 5), (7, 70, 13), (33, 512, 42), (13, 128, 255)])
+def test_head_of_many_outputs(rows, n, outputs):
+    torch.manual_seed(0)
+    x, weight, bias, grad = (
+        rounded(rows, n),
+        torch.randn(outputs, n),
+        torch.randn(outputs),
+        torch.randn(rows, outputs),
+    )
+    y, dx, dweight, dbias = torch.empty(rows, outputs), torch.empty_like(x), torch.ones(outputs, n), torch.ones(outputs)
+    address, last = [t.data_ptr() for t in (x, weight, bias)], [t.data_ptr() for t in (dx, dweight, dbias)]
+    products.wide_head_forward(*address, rows, n, outputs, y.data_ptr())
+    torch.testing.assert_close(y, F.linear(x.float(), weight, bias), rtol=1e-4, atol=1e-4)
+    for trained, add in ((0, 0), (1, 1), (1, 0)):
+        products.wide_head_backward(grad.data_ptr(), *address[:2], rows, n, outputs, trained, add, *last)
+        torch.testing.assert_close(dx.float(), grad @ weight, **DTYPES[torch.bfloat16])
+        before = add if trained else 1  # the ones from before
+        torch.testing.assert_close(dweight, before + trained * grad.t() @ x.float(), rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(dbias, before + trained * grad.sum(0), rtol=1e-4, atol=1e-4)
+
+
 def test_without_a_compiler_there_are_no_kernels(fresh, monkeypatch, caplog):
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("CC", raising=False)

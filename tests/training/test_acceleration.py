@@ -1,3 +1,5 @@
+import copy
+
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
@@ -99,6 +101,22 @@ def test_the_policy_is_an_ordinary_module_between_updates():
     after.sum().backward()
     assert policy.trunk.head.weight.grad is not None
     assert policy.trunk._plan is None
+
+
+def test_a_copy_of_a_loss_goes_its_own_way():
+    """Past opponents and evaluations copy losses that a learner holds."""
+    loss = make_loss()
+    learner = Learner(loss, precision="bf16", actor_lr=1e-2)
+    learner.update(make_batch(16))
+    state = {name: value.clone() for name, value in loss.state_dict().items()}
+    twin = copy.deepcopy(loss)
+    other = Learner(twin, precision="bf16", actor_lr=1e-2)
+    other.update(make_batch(16))
+    torch.testing.assert_close(loss.state_dict(), state, rtol=0, atol=0)
+    twin.load_state_dict(state)
+    with other._networks():
+        for flat in other._acceleration._buffers:
+            torch.testing.assert_close(flat.low, [t.bfloat16() for t in flat.tensors], rtol=0, atol=0)
 
 
 def test_an_error_inside_the_update_restores_the_loss(monkeypatch):
