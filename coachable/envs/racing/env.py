@@ -16,7 +16,7 @@ from coachable.envs.racing.garage import Garage
 from coachable.envs.racing.observation import COURSE_POINTS, observation_groups
 from coachable.envs.racing.parameters import Resources, compound_table
 from coachable.envs.racing.profile import Envelope, speed_profile
-from coachable.envs.racing.referee import TELEMETRY, Referee
+from coachable.envs.racing.referee import TELEMETRY, WRONG_WAY_TIME, Referee
 from coachable.envs.racing.rivals import Rivals
 from coachable.envs.racing.run import RUN_ROWS, Run
 from coachable.envs.racing.scenarios import Conditions, Scenario, Starter, race_scenarios
@@ -56,6 +56,7 @@ class RacingEnv(EnvBase):
         weights: of the task reward.
         course_points: points of each edge of the track that a driver sees.
         episode_steps: control steps (0.1 s) after which an episode is truncated.
+        wrong_way_time: of going backwards that ends an episode [s].
         substeps: of physics in a control step; 40 for accurate runs.
         compiled: whether to compile the physics and the task: minutes at first, then several times faster. (TorchRL
             takes `compile` for itself.)
@@ -90,6 +91,7 @@ class RacingEnv(EnvBase):
         weights: TaskWeights | None = None,
         course_points: int = COURSE_POINTS,
         episode_steps: int = EPISODE_STEPS,
+        wrong_way_time: float = WRONG_WAY_TIME,
         substeps: int = SUBSTEPS,
         compiled: bool = False,
         device: torch.device | str = "cpu",
@@ -116,7 +118,13 @@ class RacingEnv(EnvBase):
             self.garage.car, resources or Resources(), cars=cars, substeps=substeps, compile=compiled, device=place
         )
         self.referee = Referee(
-            self.course, weights or TaskWeights(), cars, substeps, course_points, pool=self.garage.pooled
+            self.course,
+            weights or TaskWeights(),
+            cars,
+            substeps,
+            course_points,
+            pool=self.garage.pooled,
+            wrong_way_time=wrong_way_time,
         )
         profile = speed_profile(Envelope(self.garage.typical), self.track.table[:, 4].numpy(), self.track.spacing)
         self.starter = Starter(

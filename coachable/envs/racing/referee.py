@@ -77,6 +77,7 @@ class Referee:
         course_points: points of each edge that a driver sees.
         substeps: of a control step.
         pool: whether cars differ, so that drivers are told which they have.
+        wrong_way_time: of going backwards that ends an episode [s].
     """
 
     course: Course
@@ -85,6 +86,7 @@ class Referee:
     substeps: int
     course_points: int = COURSE_POINTS
     pool: bool = False
+    wrong_way_time: float = WRONG_WAY_TIME
 
     def command(self, packed: Tensor, packed_run: Tensor, action: Tensor, compound: Tensor) -> tuple[Tensor, Tensor]:
         """State and inputs of the next control step.
@@ -180,7 +182,7 @@ class Referee:
         reward = task_reward(self.weights, s, run, tyres, outcome)
         features = style_features(old, new, tyres, outcome, bodies, group)
         lost = beyond(arc.offset, run.left, run.right) > run.margin + _BEHIND_WALL
-        stranded = (run.wrong_time > WRONG_WAY_TIME) | (run.stopped_time > STOPPED_TIME) | lost
+        stranded = (run.wrong_time > self.wrong_way_time) | (run.stopped_time > STOPPED_TIME) | lost
         reward = reward - self.weights.stranded * stranded.to(reward.dtype)
         terminated = stranded | broken
         packed_run = torch.stack(list(run))
