@@ -23,7 +23,7 @@ from coachable.networks.workspace import Workspace
 __all__ = ["Layer", "Member", "Plan", "residual_network"]
 
 _SIZES = 4  # batch sizes for which memory is kept ready
-_ROWS = 32  # granularity of the row-sparse backward: few distinct sizes keep oneDNN's cache of kernels small
+_ROWS = 32  # granularity of the row-sparse backward with oneDNN, whose cache of kernels few distinct sizes keep small
 
 
 class Plan:
@@ -130,7 +130,7 @@ class _Residual(torch.autograd.Function):
         grad = grad.reshape(len(plan.members), count, grad.shape[-1])
         dx: Tensor | None = None
         for k in range(len(plan.members)):
-            rows = None if trained else _active_rows(grad[k])
+            rows = None if trained else _active_rows(grad[k], 1 if passes.own_products else _ROWS)
             own = passes.backward(k, grad[k], trained, plan.written, rows, columns)
             if columns is None:
                 continue
@@ -160,14 +160,15 @@ def _columns(widths: Sequence[int], needs: Sequence[bool]) -> slice | None:
     return slice(min(wanted), max(wanted)) if wanted else None
 
 
-def _active_rows(grad: Tensor) -> Tensor | None:
-    """Rows of `(rows, out)` with a gradient, filled up to a multiple of 32; `None` if most rows have one.
+def _active_rows(grad: Tensor, step: int) -> Tensor | None:
+    """Rows of `(rows, out)` with a gradient, filled up to a multiple of `step`; `None` if most rows have one.
 
     The policy's loss follows the smaller of the critics' values, so each critic receives about half of the rows.
     """
     count = grad.shape[0]
     active = (grad != 0).any(-1)
-    wanted = -(-int(active.sum()) // _ROWS) * _ROWS
+    rows = active.nonzero().squeeze(-1)
+    wanted = -(-len(rows) // step) * step
     if wanted > 0.8 * count:
         return None
-    return torch.argsort(active, descending=True)[:wanted]
+    return rows if wanted == len(rows) else torch.argsort(active, descending=True)[:wanted]

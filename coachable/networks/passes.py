@@ -79,6 +79,7 @@ class TorchPasses:
     def __init__(self, layers: Sequence[Layer], members: Sequence[Member], keep: bool) -> None:
         self._layers, self._members, self._keep = layers, members, keep
         self._kept: list[list[tuple[Tensor, ...]]] = []
+        self.own_products = False
 
     def forward(self, inputs: Sequence[Tensor], out: Sequence[Tensor]) -> None:
         """Evaluate the members on `inputs` `(rows, d_i)` into `out`, each `(rows, o)`."""

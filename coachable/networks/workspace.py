@@ -67,6 +67,11 @@ class Workspace:
         z, outs, statistic = buffer(layers[0]), (buffer(layers[0]), buffer(layers[0])), self._arena.empty(self.rows)
         return [(z, outs[i % 2], statistic, statistic) for i in range(len(layers))]
 
+    @property
+    def own_products(self) -> bool:
+        """Whether the products are those of the kernels now."""
+        return self._members[0].products() is not None
+
     def forward(self, inputs: Sequence[Tensor], out: Sequence[Tensor]) -> None:
         """Evaluate the members on `inputs` `(rows, d_i)` into `out`, each `(rows, o)`."""
         for slot, value in zip(self._slots, inputs, strict=True):
@@ -147,11 +152,11 @@ class _MemberSpace:
         self._hidden = x if x.dtype == torch.float32 else space._arena.empty(*x.shape)  # what torch's head sees
         self._head_gradient = space._arena.empty(*x.shape) if space.keep else x
 
-    def _products(self) -> Products | None:
+    def products(self) -> Products | None:
         return self._own_products if torch.get_num_threads() == 1 else None
 
     def forward(self, out: Tensor) -> None:
-        products = self._products()
+        products = self.products()
         if products is not None:
             for _, _, _, inner, address, arguments in self._forward_steps:
                 products.dense_forward(inner, address, *arguments)
@@ -191,7 +196,7 @@ class _MemberSpace:
             top[:count].copy_(torch.mm(grad, self._head[0], out=self._head_gradient[:count]))
         else:
             top[:count].copy_(grad)
-        kernel, products = self._layer_backward, self._products()
+        kernel, products = self._layer_backward, self.products()
         address = None if rows is None else rows.data_ptr()
         for index in reversed(range(len(self._layers))):
             layer, x, here, below, dz, dz_t, dw, into, weight, first, last = self._backward_steps[index]

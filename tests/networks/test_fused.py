@@ -144,12 +144,13 @@ def test_frozen_critics_pass_the_gradient_of_the_smaller_one(low):
 def test_rows_without_gradient_are_found():
     grad = torch.zeros(100, 2)
     grad[[3, 50, 51], [0, 1, 0]] = 1.0
-    rows = fused._active_rows(grad)
+    assert fused._active_rows(grad, 1).tolist() == [3, 50, 51]
+    rows = fused._active_rows(grad, 32)
     assert len(rows) == 32
     assert {3, 50, 51} <= set(rows.tolist())
     assert len(set(rows.tolist())) == 32
-    assert fused._active_rows(torch.ones(100, 2)) is None
-    assert len(fused._active_rows(torch.zeros(100, 2))) == 0
+    assert fused._active_rows(torch.ones(100, 2), 32) is None
+    assert len(fused._active_rows(torch.zeros(100, 2), 32)) == 0
 
 
 def test_nothing_is_kept_without_gradients():
