@@ -9,6 +9,7 @@ from coachable.styles.samplers import (
     PointMass,
     Product,
     Sampler,
+    Shared,
     Uniform,
     UniformChoice,
 )
@@ -40,6 +41,7 @@ __all__ = [
     "Sampler",
     "Setpoint",
     "SetpointTolerance",
+    "Shared",
     "StyleRangeWarning",
     "StyleReward",
     "StyleSpace",

@@ -20,6 +20,7 @@ __all__ = [
     "PointMass",
     "Product",
     "Sampler",
+    "Shared",
     "Uniform",
     "UniformChoice",
 ]
@@ -290,3 +291,46 @@ class OneHot(Sampler):
     def support(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Zero to the value."""
         return tuple(min(v, 0.0) for v in self.values), tuple(max(v, 0.0) for v in self.values)
+
+
+@dataclass(frozen=True)
+class Shared(Sampler):
+    """One style for several rows of a batch, such as the cars of a race.
+
+    In a batch `(copies * n,)` rows i, i + n, i + 2 n and so on share a style.
+
+    Args:
+        sampler: Distribution of the shared style.
+        copies: Rows that share one.
+
+    Raises:
+        ValueError: If `copies` is below 1.
+
+    Examples:
+        >>> style = Shared(Uniform(0.0, 1.0), 3).sample((6,))
+        >>> bool((style[:2] == style[4:]).all())
+        True
+    """
+
+    sampler: Sampler
+    copies: int
+
+    def __post_init__(self) -> None:
+        if self.copies < 1:
+            raise ValueError(f"copies is {self.copies}: expected at least 1")
+
+    @property
+    def dim(self) -> int:
+        """Number of entries."""
+        return self.sampler.dim
+
+    def _draw(self, shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
+        if not shape:
+            return self.sampler._draw(shape, generator, device)
+        count = -(-shape[-1] // self.copies)
+        drawn = self.sampler._draw((*shape[:-1], count), generator, device)
+        return drawn.repeat(*(1 for _ in shape[:-1]), self.copies, 1)[..., : shape[-1], :].clone()
+
+    def support(self) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+        """Bounds of the shared style."""
+        return self.sampler.support()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import reduce
 
 import torch
@@ -16,6 +15,7 @@ from coachable.styles import (
     Product,
     Sampler,
     Setpoint,
+    Shared,
     StyleReward,
     StyleSpace,
     Term,
@@ -84,36 +84,7 @@ def aggressiveness_style_space(cars: int = 1) -> StyleSpace:
         Setpoint("lateral", 0.0, 1.0, unit="m", help="distance to keep beside"),
     ]
     law: Sampler = Uniform((0.0, 0.0), (2.0, 1.0))
-    return StyleSpace(parameters, law if cars == 1 else SharedByRace(law, cars), name="racing_aggressiveness")
-
-
-@dataclass(frozen=True)
-class SharedByRace(Sampler):
-    """One style per race for all of its cars, of a batch `(cars * races,)` with the first cars of all races first.
-
-    Args:
-        sampler: distribution of the shared style.
-        cars: of a race.
-    """
-
-    sampler: Sampler
-    cars: int
-
-    @property
-    def dim(self) -> int:
-        """Number of entries."""
-        return self.sampler.dim
-
-    def _draw(self, shape: tuple[int, ...], generator: torch.Generator | None, device: torch.device) -> Tensor:
-        if not shape:
-            return self.sampler._draw(shape, generator, device)
-        races = -(-shape[-1] // self.cars)
-        drawn = self.sampler._draw((*shape[:-1], races), generator, device)
-        return drawn.repeat(*(1 for _ in shape[:-1]), self.cars, 1)[..., : shape[-1], :].clone()
-
-    def support(self) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-        """Bounds of the shared style."""
-        return self.sampler.support()
+    return StyleSpace(parameters, law if cars == 1 else Shared(law, cars), name="racing_aggressiveness")
 
 
 def drift_style_reward(space: StyleSpace) -> StyleReward:

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from coachable.envs.racing.styles import (
-    SharedByRace,
     aggressiveness_style_reward,
     aggressiveness_style_space,
     drift_style_reward,
@@ -12,7 +11,7 @@ from coachable.envs.racing.styles import (
     resource_style_reward,
     resource_style_space,
 )
-from coachable.styles import StyleSpace
+from coachable.styles import Shared, StyleSpace
 
 N = 40000
 
@@ -68,7 +67,7 @@ def test_the_shared_sampler_survives_serialisation():
     space = aggressiveness_style_space(cars=5)
     again = StyleSpace.from_dict(space.to_dict())
     assert again == space
-    assert isinstance(again.sampler, SharedByRace)
+    assert isinstance(again.sampler, Shared)
 
 
 def test_drift_reward_by_hand():
