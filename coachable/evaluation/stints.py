@@ -39,7 +39,7 @@ COMPARED = 6  # flying laps of each stint whose times are compared; the first la
 STINT_STEPS = 9000  # 15 minutes
 TRIAL_STEPS = 3600
 _COLD = 40.0  # [°C]
-_PRICES = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 9.0, 12.0, 16.0, 24.0)  # of the frontier, see `LapProgramme.laps`
+_PRICES = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 9.0, 12.0, 16.0, 24.0, 40.0, 70.0)  # of the frontier, see `LapProgramme.laps`
 _SOLO = (Scenario("solo", 1.0, "solo"),)
 
 
@@ -157,7 +157,7 @@ def evaluate_resources(
 
 
 def frontier(track: str, car: str, rates: Resources, resource: str) -> list[dict[str, float]]:
-    """Lap time and range gained of a point mass on a fixed line, the fastest lap first (racing.md, section 8).
+    """Lap time [s] and range [km] of a point mass on a fixed line, the fastest lap first (racing.md, section 8).
 
     Args:
         track: name of a shipped circuit.
@@ -167,14 +167,14 @@ def frontier(track: str, car: str, rates: Resources, resource: str) -> list[dict
     """
     if resource not in RESOURCES:
         raise ValueError(f"unknown resource {resource!r}: expected tyre or fuel")
-    programme = LapProgramme(load_track(track), load_car(car), rates)
+    circuit = load_track(track)
+    programme = LapProgramme(circuit, load_car(car), rates)
     [free] = programme.laps(resource, [0.0])
     use = free.wear if resource == "tyre" else free.fuel
-    points = [{"lap_time": free.time, "range_gain": 0.0}]
-    for lap in programme.laps(resource, [price / use for price in _PRICES]):
-        spent = lap.wear if resource == "tyre" else lap.fuel
-        points.append({"lap_time": lap.time, "range_gain": use / spent - 1.0})
-    return points
+    laps = [free, *programme.laps(resource, [price / use for price in _PRICES])]
+    stint = [WORN / lap.wear if resource == "tyre" else TANK / lap.fuel for lap in laps]
+    length = circuit.length / 1000.0
+    return [{"lap_time": lap.time, "range_km": length * count} for lap, count in zip(laps, stint, strict=True)]
 
 
 def _drive(
@@ -238,7 +238,7 @@ def _rows(
     pace = np.array([[stint.compared for stint in group] for group in stints])
     for index, weight in enumerate(weights):
         low, high = bootstrap_interval(reach[index])
-        lost = float(np.nanmean(pace[index]) - np.nanmean(pace[0])) if np.isfinite(pace[index]).any() else float("nan")
+        lap_time = float(np.nanmean(pace[index])) if np.isfinite(pace[index]).any() else float("nan")
         clean = np.concatenate([stint.clean for stint in stints[index]])
         rows.append(
             {
@@ -248,9 +248,9 @@ def _rows(
                 "range_km_low": low,
                 "range_km_high": high,
                 "range_gain": float(reach[index].mean() / reach[0].mean() - 1.0),
-                "lap_time": float(np.nanmean(pace[index])) if np.isfinite(pace[index]).any() else float("nan"),
-                "seconds_lost": lost,
-                "frontier_gain": gain_at(bound, lost),
+                "lap_time": lap_time,
+                "seconds_lost": lap_time - float(np.nanmean(pace[0])) if np.isfinite(pace[0]).any() else float("nan"),
+                "frontier_km": range_at(bound, lap_time),
                 "laps": len(clean),
                 "clean_laps": float(clean.mean()) if len(clean) else 0.0,
             }
@@ -258,17 +258,17 @@ def _rows(
     return rows
 
 
-def gain_at(bound: Sequence[Mapping[str, float]], lost: float) -> float:
-    """Range that the frontier gains for so many seconds per lap; NaN beyond its last point.
+def range_at(bound: Sequence[Mapping[str, float]], lap_time: float) -> float:
+    """Range of the frontier at a lap time [km]; NaN outside its points.
 
     Args:
         bound: points of `frontier`, the fastest lap first.
-        lost: [s].
+        lap_time: [s].
     """
-    times = [point["lap_time"] - bound[0]["lap_time"] for point in bound]
-    if not 0.0 <= lost <= times[-1]:
-        return 0.0 if lost < 0.0 else float("nan")
-    return float(np.interp(lost, times, [point["range_gain"] for point in bound]))
+    times = [point["lap_time"] for point in bound]
+    if not times[0] <= lap_time <= times[-1]:
+        return float("nan")
+    return float(np.interp(lap_time, times, [point["range_km"] for point in bound]))
 
 
 def _summary(
@@ -328,19 +328,18 @@ def draw_stints(laps: Sequence[Mapping[str, Any]], path: Path) -> None:
 def draw_tradeoff(
     rows: Sequence[Mapping[str, Any]], frontiers: Mapping[str, Sequence[Mapping[str, float]]], path: Path
 ) -> None:
-    """Range gained over lap time lost, the agent's beside the frontier's."""
-    figure, axes = plt.subplots(figsize=(6.6, 4.2), layout="constrained")
-    for index, (resource, bound) in enumerate(frontiers.items()):
+    """Range over lap time, the agent's beside the frontier's."""
+    figure, panels = plt.subplots(1, len(frontiers), figsize=(9.5, 4.0), squeeze=False, layout="constrained")
+    for axes, (resource, bound) in zip(panels[0], frontiers.items(), strict=True):
         own = [row for row in rows if row["resource"] == resource]
-        color = f"C{index}"
-        lost = [point["lap_time"] - bound[0]["lap_time"] for point in bound]
-        gain = [100 * point["range_gain"] for point in bound]
-        axes.plot(lost, gain, color=color, ls="--", label=f"{resource}, point mass on a fixed line")
-        agent = [row["seconds_lost"] for row in own], [100 * row["range_gain"] for row in own]
-        axes.plot(*agent, color=color, marker="o", label=f"{resource}, agent")
-    axes.set(xlabel="lap time lost against no saving [s]", ylabel="range gained [%]", xlim=(None, 8.0))
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
+        times, ranges = ([point[name] for point in bound] for name in ("lap_time", "range_km"))
+        axes.plot(times, ranges, ls="--", label="point mass on a fixed line")
+        axes.plot([row["lap_time"] for row in own], [row["range_km"] for row in own], marker="o", label="agent")
+        for row in own:
+            axes.annotate(f"{row['weight']:.0f}", (row["lap_time"], row["range_km"]), fontsize=8)
+        axes.set(xlabel="lap time [s]", ylabel="range [km]", title=f"{resource}, weight beside each point")
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8)
     figure.savefig(path, dpi=130)
     plt.close(figure)
 
@@ -354,15 +353,13 @@ def _report(
     text += "The other resource is switched off, as in the paper; tyres start at 40 °C, with a full tank.\n\n"
     text += "![stints](stints.png) ![range against pace](tradeoff.png)\n\n"
     formats = {"resource": "", "weight": ".0f", "range_km": ".1f", "range_gain": "+.0%", "lap_time": ".2f"}
-    formats |= {"seconds_lost": "+.2f", "frontier_gain": "+.0%", "laps": "", "clean_laps": ".0%"}
+    formats |= {"seconds_lost": "+.2f", "frontier_km": ".1f", "laps": "", "clean_laps": ".0%"}
     text += markdown_table(rows, formats)
+    text += f"\nRange: until the tank is empty, or until the tyres are worn by {WORN:.0%} on average, at the mean use. "
     text += (
-        f"\nRange: until the tank is empty, or until the tyres are worn by {WORN:.0%} on average, at the stint's mean "
+        f"Lap time: mean of {COMPARED} laps from the second one on. Frontier: range of a point mass on a fixed line "
     )
-    text += (
-        f"use. Lap time: mean of {COMPARED} laps from the second one on. Frontier gain: what a point mass on a fixed "
-    )
-    text += "line gains for the same seconds. Clean: never three wheels off the track.\n\n"
+    text += "at the same lap time (nan where it has none so slow). Clean: never three wheels off the track.\n\n"
     ranks = ", ".join(f"{name} {summary[name]['rank_correlation']:.2f}" for name in WEIGHTS)
     text += f"Rank correlation of weight and range: {ranks}.\n\n## Time trial, no saving asked\n\n"
     if not trial["laps"]:

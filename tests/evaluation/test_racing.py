@@ -18,7 +18,7 @@ from coachable.envs.racing.parameters import load_car
 from coachable.evaluation.drifts import evaluate_drift
 from coachable.evaluation.races import _count, _pair_results, evaluate_aggressiveness
 from coachable.evaluation.statistics import wilson_interval
-from coachable.evaluation.stints import _stint, evaluate_resources, gain_at
+from coachable.evaluation.stints import _stint, evaluate_resources, range_at
 from coachable.training.weights import LoadedPolicy
 
 
@@ -69,10 +69,9 @@ def test_an_empty_tank_ends_the_stint():
 
 
 def test_the_frontier_between_its_points():
-    bound = [{"lap_time": 80.0, "range_gain": 0.0}, {"lap_time": 84.0, "range_gain": 0.8}]
-    assert gain_at(bound, 1.0) == pytest.approx(0.2)
-    assert gain_at(bound, -0.5) == 0.0
-    assert math.isnan(gain_at(bound, 5.0))
+    bound = [{"lap_time": 80.0, "range_km": 50.0}, {"lap_time": 84.0, "range_km": 90.0}]
+    assert range_at(bound, 81.0) == pytest.approx(60.0)
+    assert math.isnan(range_at(bound, 79.0)) and math.isnan(range_at(bound, 85.0))
 
 
 def test_turns_add_up_in_one_direction_only():
