@@ -22,6 +22,7 @@ def racing_domain(
     grid: Mapping[str, Sequence[Any]] | Sequence[Mapping[str, Any]],
     columns: Mapping[str, str],
     evaluation: str,
+    **options: Any,
 ) -> Domain:
     """The domain of a family of style.
 
@@ -31,24 +32,25 @@ def racing_domain(
         grid: see `Domain`.
         columns: what is published beside survival, pace and time off course.
         evaluation: function of `coachable.evaluation` that `coachable evaluate` calls, "module.function".
+        **options: of the environment, where an agent is shown and measured otherwise than it is trained.
     """
     make_env, make_space, make_reward = racing_family(family)
 
     def as_trained(settings: Mapping[str, Any]) -> Domain:
         """With the track, the car and the observation of a training, and its length of an episode."""
-        options = {name: value for name, value in settings.items() if name not in ("_target_", "family", "num_envs")}
-        options |= {"compiled": False, "device": "cpu"}
-        pool, points = options.get("car") == "pool", options.get("course_points", COURSE_POINTS)
+        chosen = {name: value for name, value in settings.items() if name not in ("_target_", "family", "num_envs")}
+        chosen |= {"compiled": False, "device": "cpu", **options}
+        pool, points = chosen.get("car") == "pool", chosen.get("course_points", COURSE_POINTS)
         return replace(
             domain,
-            make_env=partial(make_env, **options),
-            episode_steps=options.get("episode_steps", domain.episode_steps),
-            observation_groups=observation_groups(options.get("cars", cars), pool, points),
+            make_env=partial(make_env, **chosen),
+            episode_steps=chosen.get("episode_steps", domain.episode_steps),
+            observation_groups=observation_groups(chosen.get("cars", cars), pool, points),
         )
 
     domain = Domain(
         name=f"racing_{family}",
-        make_env=make_env,
+        make_env=partial(make_env, **options),
         make_space=make_space,
         make_reward=make_reward,
         measures=RacingMeasures(family),
