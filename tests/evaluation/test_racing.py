@@ -76,7 +76,7 @@ def test_the_frontier_between_its_points():
 
 def test_turns_add_up_in_one_direction_only():
     steps = torch.arange(200) / 10.0
-    spin = torch.stack([steps, steps.sin(), -2.0 * steps], 1)  # 19.9 rad, to and fro, 39.8 rad the other way
+    spin = torch.stack([steps, steps.sin(), -2.0 * steps], 1)  # 19.9 rad, back and forth, 39.8 rad the other way
     wrapped = torch.remainder(spin + math.pi, 2 * math.pi) - math.pi
     alive = torch.ones(200, 3, dtype=torch.bool)
     assert whole_turns(wrapped, alive).tolist() == [3.0, 0.0, 6.0]
