@@ -14,7 +14,7 @@ from coachable.envs.racing.measures import DRIFT_ANGLE_DEG, GRIP_ANGLE_DEG
 from coachable.envs.racing.scenarios import Scenario
 from coachable.envs.racing.styles import DRIFT_NAMES
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
-from coachable.evaluation.style_grid import evaluate_grid, markdown_table, training_counts, write_csv
+from coachable.evaluation.style_grid import evaluate_grid, markdown_table, policy_sentence, write_csv
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -137,11 +137,8 @@ def draw_drift(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Mapping[str, Any], steps: int) -> str:
-    trained = training_counts(agent)
     text = "# racing, drift: requested and measured style\n\n"
-    text += (
-        f"Deterministic policy{' after ' + trained if trained else ''}; {summary['episodes_per_weight']} episodes of "
-    )
+    text += f"{policy_sentence(agent)}; {summary['episodes_per_weight']} episodes of "
     text += f"{steps} steps per weight, ordinary starts, the other weights 0, seed {summary['seed']}.\n\n"
     text += "![slip angle over weight](drift.png)\n\n"
     formats = {

@@ -14,7 +14,7 @@ from coachable.evaluation.style_grid import (
     evaluate_grid,
     markdown_table,
     mean_of,
-    training_counts,
+    policy_sentence,
     write_csv,
 )
 from coachable.evaluation.switching import SwitchReport, evaluate_switching
@@ -95,8 +95,7 @@ def _report(
 ) -> str:
     columns = {name: "" for name in grid.cells[0]} | dict(domain.columns)
     text = f"# {domain.name}: requested and measured style\n\n"
-    trained = training_counts(agent)
-    text += f"Deterministic policy{' after ' + trained if trained else ''}; {rows[0]['episodes']} episodes of "
+    text += f"{policy_sentence(agent)}; {rows[0]['episodes']} episodes of "
     text += f"{grid.steps} steps per style, seed {grid.seed}.\n\n![style grid](grid.png)\n\n"
     text += markdown_table(rows, columns)
     if response:

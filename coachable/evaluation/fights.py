@@ -17,7 +17,7 @@ from coachable.evaluation.coached_fight import SOURCES, STATES, CoachedFights, d
 from coachable.evaluation.figures import readable
 from coachable.evaluation.rollouts import record_episodes
 from coachable.evaluation.statistics import rank_correlation
-from coachable.evaluation.style_grid import markdown_table, training_counts, write_csv
+from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_csv
 from coachable.evaluation.sweep import WeightSweep, sweep_weights
 from coachable.styles import StyleSpace
 from coachable.transforms import coachable_env
@@ -271,9 +271,8 @@ def _report(
     steps: int,
     seed: int,
 ) -> str:
-    trained = training_counts(agent)
     text = "# combat: requested and measured style\n\n"
-    text += f"Deterministic policy{' after ' + trained if trained else ''}; {episodes} fights of at most {steps} "
+    text += f"{policy_sentence(agent)}; {episodes} fights of at most {steps} "
     text += f"steps per style and machine, seed {seed}.\n\n![damage by style](damage.png)\n\n"
     scores = ["" if row["style_score"] is None else f"{row['style_score']:.2f}" for row in tables["damage"]]
     table = [{**row, "score": score} for row, score in zip(tables["damage"], scores, strict=True)]

@@ -16,21 +16,18 @@ import matplotlib
 import numpy as np
 import torch
 
-from coachable.envs.racing.referee import TELEMETRY
+from coachable.envs.racing.measures import TelemetryMeasures
 from coachable.envs.racing.scenarios import rolling_start
 from coachable.envs.racing.simulation import CONTROL_STEP
 from coachable.evaluation.rollouts import record_episodes
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation, wilson_interval
-from coachable.evaluation.style_grid import markdown_table, training_counts, write_csv
+from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_csv
 from coachable.transforms import coachable_env
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
 if TYPE_CHECKING:
-    from tensordict import TensorDictBase
-    from torch import Tensor
-
     from coachable.domain import Domain
     from coachable.training.weights import LoadedPolicy
 
@@ -43,20 +40,6 @@ LAPS = 4
 RACE_STEPS = 10_000
 _AGAIN = 1.0  # [s], after which touching counts as another contact
 _METRICS = {"win_rate": "wins", "places_gained": "places gained", "contacts": "contacts per race"}
-
-
-class _Positions:
-    """What decides a race, step by step."""
-
-    def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
-        told = transition.get(("next", "telemetry"))
-        return {name: told[:, TELEMETRY.index(name)] for name in ("distance", "contact", "off")}
-
-    def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
-        return {}
-
-    def complies(self, record: Mapping[str, Tensor]) -> Tensor:
-        return record["contact"] == 0.0
 
 
 def evaluate_aggressiveness(
@@ -157,7 +140,7 @@ def _race(
         env,
         agent.actor,
         theta.reshape(CARS * count, -1),
-        _Positions(),
+        TelemetryMeasures("distance", "contact", "off"),
         steps=steps,
         seed=seed,
         progress=f"{count} races of {CARS} cars" if progress else None,
@@ -244,11 +227,8 @@ def draw_radar(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Mapping[str, Any]) -> str:
-    trained = training_counts(agent)
     text = "# racing, aggressiveness: requested margin and what came of it\n\n"
-    text += (
-        f"Deterministic policy{' after ' + trained if trained else ''} in all five cars; {summary['races_per_row']} "
-    )
+    text += f"{policy_sentence(agent)} in all five cars; {summary['races_per_row']} "
     text += (
         f"races per row, {LAPS} laps, rolling start, seed {summary['seed']}. Two cars, which start last (pursuer) or "
     )

@@ -13,23 +13,20 @@ import numpy as np
 import torch
 
 from coachable.envs.racing.circuits import load_track
-from coachable.envs.racing.frontier import RESOURCES, TANK, WORN, LapProgramme
-from coachable.envs.racing.parameters import Resources, load_car
-from coachable.envs.racing.referee import TELEMETRY
+from coachable.envs.racing.frontier import TANK, WORN, sweep
+from coachable.envs.racing.measures import TelemetryMeasures
+from coachable.envs.racing.parameters import Resources
 from coachable.envs.racing.scenarios import Conditions, Scenario
 from coachable.envs.racing.simulation import CONTROL_STEP
 from coachable.evaluation.rollouts import record_episodes
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
-from coachable.evaluation.style_grid import markdown_table, training_counts, write_csv
+from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_csv
 from coachable.transforms import coachable_env
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
 if TYPE_CHECKING:
-    from tensordict import TensorDictBase
-    from torch import Tensor
-
     from coachable.domain import Domain
     from coachable.training.weights import LoadedPolicy
 
@@ -64,20 +61,6 @@ class Stint:
         """Mean time of the laps that are compared; NaN without any [s]."""
         flying = self.laps[1 : 1 + COMPARED]
         return float(flying.mean()) if len(flying) else float("nan")
-
-
-class _Telemetry:
-    """Columns of the telemetry as measures."""
-
-    def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
-        told = transition.get(("next", "telemetry"))
-        return {name: told[:, TELEMETRY.index(name)] for name in ("distance", "fuel", "wear", "off")}
-
-    def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
-        return {}
-
-    def complies(self, record: Mapping[str, Tensor]) -> Tensor:
-        return record["off"] == 0.0
 
 
 def evaluate_resources(
@@ -127,7 +110,7 @@ def evaluate_resources(
     frontiers: dict[str, list[dict[str, float]]] = {}
     for resource, name in WEIGHTS.items():
         only = replace(rates, **{"wear" if resource == "fuel" else "fuel": 0.0})
-        frontiers[resource] = frontier(track, car, only, resource)
+        frontiers[resource] = frontier(track, car, resource)
         high = dict(zip(agent.space.names, agent.space.high.tolist(), strict=True))[name]
         cells = [{name: share * high} for share in SHARES]
         conditions = Conditions(fuel=TANK, heat=_COLD)
@@ -156,25 +139,18 @@ def evaluate_resources(
     return report
 
 
-def frontier(track: str, car: str, rates: Resources, resource: str) -> list[dict[str, float]]:
+def frontier(track: str, car: str, resource: str) -> list[dict[str, float]]:
     """Lap time [s] and range [km] of a point mass on a fixed line, the fastest lap first (racing.md, section 8).
 
     Args:
         track: name of a shipped circuit.
         car: name of a shipped car.
-        rates: wear and fuel.
         resource: "tyre" or "fuel".
     """
-    if resource not in RESOURCES:
-        raise ValueError(f"unknown resource {resource!r}: expected tyre or fuel")
-    circuit = load_track(track)
-    programme = LapProgramme(circuit, load_car(car), rates)
-    [free] = programme.laps(resource, [0.0])
-    use = free.wear if resource == "tyre" else free.fuel
-    laps = [free, *programme.laps(resource, [price / use for price in _PRICES])]
-    stint = [WORN / lap.wear if resource == "tyre" else TANK / lap.fuel for lap in laps]
-    length = circuit.length / 1000.0
-    return [{"lap_time": lap.time, "range_km": length * count} for lap, count in zip(laps, stint, strict=True)]
+    length = load_track(track).length / 1000.0
+    stock, spent = (WORN, "wear_per_lap") if resource == "tyre" else (TANK, "fuel_per_lap")
+    laps = sweep(car, resource, _PRICES, track=track)
+    return [{"lap_time": lap["lap_time"], "range_km": length * stock / lap[spent]} for lap in laps]
 
 
 def _drive(
@@ -199,7 +175,15 @@ def _drive(
     )
     env = coachable_env(simulation, space, domain.make_reward(space), seed=seed)
     bar = f"{label}: {count} stints" if progress else None
-    record = record_episodes(env, agent.actor, theta, _Telemetry(), steps=steps, seed=seed, progress=bar)
+    record = record_episodes(
+        env,
+        agent.actor,
+        theta,
+        TelemetryMeasures("distance", "fuel", "wear", "off"),
+        steps=steps,
+        seed=seed,
+        progress=bar,
+    )
     env.close()
     measured = {name: values.double().numpy() for name, values in record.measures.items()}
     alive = record.alive.numpy()
@@ -347,9 +331,9 @@ def draw_tradeoff(
 def _report(
     agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Mapping[str, Any], seed: int, episodes: int
 ) -> str:
-    trained, trial = training_counts(agent), summary["trial"]
+    trial = summary["trial"]
     text = "# racing, resources: requested and measured style\n\n"
-    text += f"Deterministic policy{' after ' + trained if trained else ''}; {episodes} stints per weight, seed {seed}. "
+    text += f"{policy_sentence(agent)}; {episodes} stints per weight, seed {seed}. "
     text += "The other resource is switched off, as in the paper; tyres start at 40 °C, with a full tank.\n\n"
     text += "![stints](stints.png) ![range against pace](tradeoff.png)\n\n"
     formats = {"resource": "", "weight": ".0f", "range_km": ".1f", "range_gain": "+.0%", "lap_time": ".2f"}

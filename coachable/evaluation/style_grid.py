@@ -159,5 +159,11 @@ def training_counts(agent: LoadedPolicy) -> str:
     return ", ".join(f"{count:,} {name}" for name, count in counts.items() if count)
 
 
+def policy_sentence(agent: LoadedPolicy) -> str:
+    """Who acts, such as "Deterministic policy after 800,000 frames, 36,798 updates", for the start of a report."""
+    trained = training_counts(agent)
+    return "Deterministic policy" + (f" after {trained}" if trained else "")
+
+
 def _distinct(items: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return [item for i, item in enumerate(items) if item not in items[:i]]

@@ -89,6 +89,30 @@ class RacingMeasures:
         return record["complied"] > 0
 
 
+class TelemetryMeasures:
+    """Columns of the telemetry, step by step, for evaluations that judge whole races and stints themselves.
+
+    Args:
+        columns: names of `TELEMETRY`.
+    """
+
+    def __init__(self, *columns: str) -> None:
+        self._columns = {name: _COLUMN[name] for name in columns}
+
+    def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
+        """See `StyleMeasures.step`."""
+        told = transition.get(("next", "telemetry"))
+        return {name: told[:, column] for name, column in self._columns.items()}
+
+    def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
+        """Nothing: that is the evaluation's business."""
+        return {}
+
+    def complies(self, record: Mapping[str, Tensor]) -> Tensor:
+        """See `StyleMeasures.complies`: on the track."""
+        return record["off"] == 0.0
+
+
 def whole_turns(heading: Tensor, alive: Tensor) -> Tensor:
     """Largest rotation in one direction, in whole turns, (N,), of a heading (T, N) [rad] in the steps that count."""
     steps = torch.diff(heading, dim=0)
