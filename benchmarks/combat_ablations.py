@@ -94,7 +94,7 @@ def train(variant: str, seed: int, run_dir: Path, args: argparse.Namespace) -> N
 
 
 def evaluation(training: Train, config: dict[str, Any], episodes: int) -> Callable[[], Mapping[str, float]]:
-    """Style scores and wins of the deterministic policy, by style, as `coachable evaluate` measures them."""
+    """Style scores and wins, by style, as `coachable evaluate` measures them."""
     domain = load_domain("combat", config)
     space = domain.make_space()
     agent = LoadedPolicy(training.collector.policy, space, config, {})

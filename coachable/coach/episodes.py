@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import threading
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from torchrl.envs.utils import step_mdp
 
 from coachable.domain import Domain
 from coachable.keys import STYLE
 from coachable.styles import StyleSpace
+from coachable.training.rng import RandomStream
 from coachable.transforms import coachable_env
 
 TIME_IS_UP = "time is up"
-_EXPLORATION = threading.Lock()  # the exploration type is global to the process, sessions may run in several threads
 
 
 class LiveEpisodes:
-    """Steps one environment with the deterministic policy and counts how episodes end.
+    """Steps one environment with a policy and counts how episodes end.
 
     Args:
         domain: gives the environment.
@@ -44,6 +41,7 @@ class LiveEpisodes:
         self.endless, self._terminated = endless, terminated
         self.ended: str | None = None
         self.number = self.steps = 0
+        self._chance = RandomStream(0)
         self.endings: Counter[str] = Counter()
 
     @property
@@ -62,6 +60,7 @@ class LiveEpisodes:
     def seed(self, seed: int) -> None:
         """Starts over; `begin` must follow."""
         self.env.set_seed(seed)
+        self._chance = RandomStream(seed)
         self.number = 0
         self.endings.clear()
 
@@ -74,7 +73,7 @@ class LiveEpisodes:
 
     def step(self, policy: TensorDictModuleBase, theta: Tensor) -> TensorDictBase:
         """One step under a style (d,); returns the transition, batch shape (1,)."""
-        with _deterministic():
+        with self._chance.drawn():
             action = policy(self._current.set(STYLE, theta[None]))
         transition = self.env.step(action)
         self.steps += 1
@@ -92,9 +91,3 @@ class LiveEpisodes:
         """Releases the environment."""
         if not self.env.is_closed:
             self.env.close()
-
-
-@contextmanager
-def _deterministic() -> Iterator[None]:
-    with _EXPLORATION, set_exploration_type(ExplorationType.DETERMINISTIC):
-        yield

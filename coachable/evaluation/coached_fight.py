@@ -11,7 +11,7 @@ import matplotlib
 import numpy as np
 import torch
 from tensordict import TensorDict
-from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
 from coachable.envs.combat.constants import PLAYER_HP
@@ -21,6 +21,7 @@ from coachable.evaluation.figures import readable
 from coachable.evaluation.runs import SWITCH_PERIOD
 from coachable.keys import STYLE
 from coachable.styles import StyleSpace
+from coachable.training.rng import RandomStream
 from coachable.transforms import coachable_env
 
 matplotlib.use("Agg")
@@ -134,14 +135,14 @@ def requests_of(space: StyleSpace) -> tuple[str, ...]:
 def fight_coached(
     domain: Domain, agent: LoadedPolicy, *, sequences: int, steps: int, seed: int, progress: bool
 ) -> CoachedFights:
-    """Run the fights with the deterministic policy.
+    """Run the fights.
 
     Args:
         domain: combat, as the agent was trained in; its machines and sites are drawn at random.
         agent: with at least two styles that `requests_of` names.
         sequences: N.
         steps: T.
-        seed: of scenarios, fights and requests.
+        seed: of scenarios, fights, actions and requests.
         progress: show a bar.
 
     Raises:
@@ -161,7 +162,7 @@ def fight_coached(
     current = env.reset(TensorDict({STYLE: theta[requests[0]]}, env.batch_size))
     rows: list[dict[str, torch.Tensor]] = []
     label = f"{sequences} sequences of fights, style switched every {period} steps" if progress else None
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
+    with RandomStream(seed).drawn():
         for request in tqdm(requests, desc=label, disable=True if label is None else None, leave=False):
             transition = env.step(agent.actor(current.set(STYLE, theta[request])))
             row = domain.measures.step(transition)

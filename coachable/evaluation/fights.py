@@ -73,7 +73,7 @@ def evaluate_fights(
 
     Args:
         domain: combat, as the agent was trained in.
-        agent: the policy; acts deterministically.
+        agent: the policy; samples its actions, as in training.
         out: folder, created if missing.
         episodes: fights per style and machine, at sites drawn at random.
         switch_episodes: sequences of fights with a style that switches, each `steps` long; 0 for none. There are none

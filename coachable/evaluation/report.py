@@ -24,7 +24,7 @@ from coachable.evaluation.runs import (
     flat_row,
     response_rows,
 )
-from coachable.evaluation.style_grid import mean_of, training_counts, write_csv
+from coachable.evaluation.style_grid import acting, mean_of, training_counts, write_csv
 from coachable.styles import Setpoint
 from coachable.training.weights import LoadedPolicy, load_policy
 
@@ -142,7 +142,7 @@ def _lead(agents: Mapping[str, LoadedPolicy], runs: Sequence[Run], episodes: int
     (name, agent), *others = agents.items()
     counts = training_counts(agent)
     trained = f", trained for {counts}" if counts else ""
-    subject = "Several agents" if others else f"The deterministic policy of {name}{trained}"
+    subject = "Several agents" if others else f"{acting(agent)} of {name}{trained}"
     grid = runs[0].grid
     return (
         f"{subject}. {len(runs)} runs ({', '.join(run.label for run in runs)}) of {episodes} episodes in each of "

@@ -10,11 +10,12 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
 from coachable.domain import StyleMeasures
 from coachable.keys import STYLE, TASK_REWARD
+from coachable.training.rng import RandomStream
 
 StyleSchedule = Callable[[int], Tensor]
 
@@ -50,7 +51,7 @@ def record_episodes(
     on_step: Callable[[int], None] | None = None,
     progress: str | None = None,
 ) -> EpisodeRecord:
-    """Run one episode in each env with the deterministic policy.
+    """Run one episode in each env; the policy acts as it does by default (`default_interaction_type`).
 
     Args:
         env: N envs with style transforms.
@@ -58,7 +59,7 @@ def record_episodes(
         style: theta (N, d) for whole episodes, or a function from the step to theta, for styles that change.
         measures: the domain's measured style.
         steps: length of the episodes; an env that ended earlier is stepped on but no longer recorded.
-        seed: of the initial states.
+        seed: of the initial states, and of the actions where they are sampled.
         on_step: called with the step after each, to draw frames for example.
         progress: label of a progress bar; None shows none.
     """
@@ -69,7 +70,7 @@ def record_episodes(
     survived, task_return = alive.clone(), torch.zeros(env.batch_size)
     rows: list[dict[str, Tensor]] = []
     styles, lives = [], []
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
+    with RandomStream(seed).drawn():
         for step in tqdm(range(steps), desc=progress, disable=True if progress is None else None, leave=False):
             theta = schedule(step)
             transition = env.step(policy(current.set(STYLE, theta)))

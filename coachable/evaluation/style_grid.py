@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import InteractionType, TensorDictModuleBase
 
 from coachable.domain import Domain
 from coachable.evaluation.rollouts import record_episodes
@@ -162,7 +162,13 @@ def training_counts(agent: LoadedPolicy) -> str:
 def policy_sentence(agent: LoadedPolicy) -> str:
     """Who acts, such as "Deterministic policy after 800,000 frames, 36,798 updates", for the start of a report."""
     trained = training_counts(agent)
-    return "Deterministic policy" + (f" after {trained}" if trained else "")
+    return acting(agent) + (f" after {trained}" if trained else "")
+
+
+def acting(agent: LoadedPolicy) -> str:
+    """How the policy acts, unless told otherwise."""
+    samples = getattr(agent.actor, "default_interaction_type", None) is InteractionType.RANDOM
+    return "Policy that samples its actions" if samples else "Deterministic policy"
 
 
 def _distinct(items: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -12,12 +12,13 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 from tensordict import TensorDict
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
 from coachable.domain import Domain, load_domain
 from coachable.keys import STYLE
 from coachable.styles import Choice, StyleSpace, Weight
+from coachable.training.rng import RandomStream
 from coachable.training.weights import load_policy
 from coachable.transforms import coachable_env
 
@@ -44,7 +45,7 @@ def render(
             upper value of the other parameters.
         seconds_per_style: time between switches [s].
         size: width and height [px].
-        seed: of the initial state.
+        seed: of the initial state, and of the actions where they are sampled.
         progress: show a bar.
 
     Returns:
@@ -121,6 +122,7 @@ def _film(
     """Frames of each request's `period` steps, of every `every`-th step."""
     env = coachable_env(domain.make_env(num_envs=1, num_threads=1), space, domain.make_reward(space), seed=seed)
     renderer = domain.make_renderer(*size)
+    chance = RandomStream(seed)
     env.set_seed(seed)
     thetas = [space.make(**request) for request in requests]
     current = env.reset(TensorDict({STYLE: thetas[0][None]}, [1]))
@@ -129,8 +131,9 @@ def _film(
         for request, theta in zip(requests, thetas, strict=True):
             recent: list[dict[str, Tensor]] = []
             for step in range(1, period + 1):
-                with set_exploration_type(ExplorationType.DETERMINISTIC):
-                    transition = env.step(policy(current.set(STYLE, theta[None])))
+                with chance.drawn():
+                    action = policy(current.set(STYLE, theta[None]))
+                transition = env.step(action)
                 recent.append(domain.measures.step(transition))
                 if step % every == 0:
                     yield caption(renderer.draw(env), _caption_lines(domain, request, recent, falls))

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal, get_args
 
 import torch
-from tensordict.nn import TensorDictModule
+from tensordict.nn import InteractionType, TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
 from torchrl.modules import ProbabilisticActor
@@ -108,7 +108,9 @@ def make_mixed_actor(
 
     Returns:
         A `ProbabilisticActor` reading `observation` and `style`, writing `probs`, `loc`, `scale` (those that exist)
-        and `action`, with hard one-hots.
+        and `action`, with hard one-hots. Unless told otherwise (`set_exploration_type`) it samples its actions where
+        it has categorical heads, as in training: at their modes it would never do what is right now and then, such as
+        dodging. With axes alone it takes the deterministic action.
 
     Example:
         >>> actor = make_mixed_actor(3, ActionHeads((4, 2), axes=1), None, widths=(8,))
@@ -125,4 +127,5 @@ def make_mixed_actor(
         spec=heads.spec() if action_spec is None else action_spec,
         distribution_class=MixedAction,
         distribution_kwargs={"heads": heads},
+        default_interaction_type=InteractionType.RANDOM if heads.categorical else InteractionType.DETERMINISTIC,
     )

@@ -13,7 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import nn
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase, TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs.utils import ExplorationType
 
 from coachable.training.rng import preserved_rng
 
@@ -199,7 +199,7 @@ def evaluate_policy(
     keys: Iterable[str] = (),
     device: torch.device | str = "cpu",
 ) -> dict[str, float]:
-    """Runs one episode per environment with the deterministic policy.
+    """Runs one episode per environment; the policy acts as it does by default (`default_interaction_type`).
 
     Args:
         env: batched env `[N]`; it is reset first, with styles drawn by its sampler.
@@ -213,7 +213,7 @@ def evaluate_policy(
         all averaged over episodes.
     """
     wanted = dict.fromkeys(["reward", "task_reward", *keys])
-    with preserved_rng(), torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+    with preserved_rng(), torch.no_grad():
         td = env.reset()
         running = torch.ones(env.batch_size, dtype=torch.bool, device=td["done"].device)
         fell = torch.zeros_like(running)

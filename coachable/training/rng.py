@@ -1,6 +1,7 @@
 """The global random number generators as one plain, pickle-free state."""
 
 import random
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -8,7 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 
-__all__ = ["preserved_rng", "rng_state", "seed_everything", "set_rng_state"]
+__all__ = ["RandomStream", "preserved_rng", "rng_state", "seed_everything", "set_rng_state"]
+
+_BORROWED = threading.RLock()  # the global generator, by one stream at a time
 
 
 def seed_everything(seed: int) -> None:
@@ -84,3 +87,35 @@ def preserved_rng() -> Iterator[None]:
         yield
     finally:
         set_rng_state(state)
+
+
+class RandomStream:
+    """Random numbers for policies that sample, from torch's global CPU generator but independent of its other users.
+
+    Args:
+        seed: of the stream.
+
+    Example:
+        >>> first, second = RandomStream(0), RandomStream(0)
+        >>> with first.drawn():
+        ...     a = torch.rand(1)
+        >>> b = torch.rand(1)
+        >>> with second.drawn():
+        ...     print(bool(torch.rand(1) == a))
+        True
+    """
+
+    def __init__(self, seed: int) -> None:
+        self._state = torch.Generator().manual_seed(seed).get_state()
+
+    @contextmanager
+    def drawn(self) -> Iterator[None]:
+        """Random numbers drawn meanwhile are the stream's; other streams wait."""
+        with _BORROWED:
+            outside = torch.get_rng_state()
+            torch.set_rng_state(self._state)
+            try:
+                yield
+            finally:
+                self._state = torch.get_rng_state()
+                torch.set_rng_state(outside)

@@ -268,3 +268,10 @@ def test_policy_keeps_float32_under_autocast() -> None:
         outputs = policy(torch.randn(8, 5))
     assert [o.dtype for o in outputs] == [torch.float32] * 3
     assert outputs[0].min() > 0
+
+
+@pytest.mark.parametrize(("categorical", "sampled"), [((3,), True), ((), False)])
+def test_actors_with_categorical_heads_act_by_sampling(categorical: tuple[int, ...], sampled: bool) -> None:
+    actor = make_mixed_actor(2, ActionHeads(categorical, axes=2), None, widths=(8,))
+    observation = TensorDict({"observation": torch.zeros(64, 2)}, [64])
+    assert (actor(observation)["action"].unique(dim=0).shape[0] > 1) == sampled
