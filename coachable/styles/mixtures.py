@@ -1,4 +1,4 @@
-"""The combat domain's distribution of training styles and its ablations, for any space of weights."""
+"""Distributions of training styles for any space of weights: the combat domain's, its ablations, and one for sliders."""
 
 from typing import Literal, get_args
 
@@ -6,7 +6,7 @@ from coachable.styles.parameters import Weight
 from coachable.styles.samplers import ContinuousOneHot, Mixture, OneHot, PointMass, Sampler, Uniform
 from coachable.styles.space import StyleSpace
 
-__all__ = ["Single", "own", "style_mixture"]
+__all__ = ["Single", "own", "style_mixture", "with_requests"]
 
 Single = Literal["continuous_one_hot", "one_hot", "independent"]
 
@@ -49,3 +49,32 @@ def style_mixture(
     every = Uniform(low, high)
     one = {"continuous_one_hot": ContinuousOneHot(low, high), "one_hot": OneHot(high), "independent": every}[single]
     return Mixture([PointMass([0.0] * space.dim), every, one], [neutral, independent, 1.0 - neutral - independent])
+
+
+def with_requests(space: StyleSpace, *, positive: float = 0.25, full: float = 0.15, neutral: float = 0.1) -> Sampler:
+    """The space's own sampler, mixed with what people ask for and it may hardly ever draw.
+
+    Where each weight is positive on its own one time in four, all four are so once in 256 episodes, and a network that
+    has to extrapolate to such a request fails it.
+
+    Args:
+        space: Its parameters, all of them weights.
+        positive: Probability that every weight is drawn uniformly from 0 to its upper bound.
+        full: Probability that every weight is at its upper bound.
+        neutral: Probability that every weight is 0.
+
+    Returns:
+        A sampler of the space's dimension.
+
+    Raises:
+        ValueError: If a parameter is no weight, or the probabilities exceed 1 together.
+    """
+    others = [p.name for p in space.parameters if not isinstance(p, Weight)]
+    if others:
+        raise ValueError(
+            f"sampler with_requests asks for weights of 0, which {', '.join(others)} of the style space "
+            f"{space.name!r} cannot be (not a weight): expected sampler=default or sampler=independent"
+        )
+    high, zero = space.high.tolist(), [0.0] * space.dim
+    parts = [PointMass(zero), PointMass(high), Uniform(zero, high), space.sampler]
+    return Mixture(parts, [neutral, full, positive, 1.0 - neutral - full - positive])

@@ -117,6 +117,8 @@ class Learner:
         }
         self._rates = rates
         loss: Any = loss_module
+        fixed = hasattr(loss, "log_alpha") and not params["alpha"]
+        self._log_alpha = float(loss.log_alpha) if fixed else None
         self._losses = _Losses(loss.forward, loss.actor_loss, _critic_loss_of(loss))
         if compile and self._acceleration is None and _can_compile(device):
             self._losses = _Losses(*map(torch.compile, self._losses))
@@ -162,6 +164,17 @@ class Learner:
             for group in optimizer.param_groups:
                 group["lr"] = factor * self._rates[name]
 
+    def scale_entropy_weight(self, factor: float) -> None:
+        """Set a fixed entropy weight to `factor` times what it was at construction.
+
+        Raises:
+            ValueError: if there is no fixed entropy weight and the factor is not 1.
+        """
+        if self._log_alpha is not None:
+            cast(Tensor, self.loss_module.log_alpha).fill_(self._log_alpha + math.log(factor))
+        elif factor != 1.0:
+            raise ValueError("this loss has no fixed entropy weight to scale: leave train.anneal_entropy at 1")
+
     def check_finite(self) -> None:
         """Raise if a loss or gradient since the last check was not finite (this reads one number from the device)."""
         if not math.isfinite(float(self._watch)):
@@ -180,13 +193,14 @@ class Learner:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned; the learning rates stay those of the constructor."""
+        """Restore what :meth:`state_dict` returned; the learning rates and a fixed entropy weight stay the constructor's."""
         self.loss_module.load_state_dict(state["loss_module"])
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
             if self._device_type == "cpu" and not isinstance(optimizer, FlatAdam):
                 place_moments(optimizer)
         self.scale_learning_rates(1.0)
+        self.scale_entropy_weight(1.0)
         self.updates = int(state["updates"])
         self._watch.zero_()
 

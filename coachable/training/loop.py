@@ -165,6 +165,7 @@ class Train:
             return
         with self._timed("update"):
             self.learner.scale_learning_rates(self.settings.learning_rate_factor(self.frames))
+            self.learner.scale_entropy_weight(self.settings.entropy_factor(self.frames))
             if self.settings.utd_ratio is None:  # the learner fills the time that the throttle leaves
                 while self._throttle.remaining() > 0 and not stop.is_set():
                     self._update_once()

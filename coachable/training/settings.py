@@ -17,6 +17,7 @@ class TrainSettings:
             leaves.
         throttle: [env-steps/s] upper bound on collection, or None.
         anneal: share of total_frames, at its end, over which the learning rates fall linearly to a tenth.
+        anneal_entropy: what the entropy weight falls to meanwhile, as a share of its value before.
         eval_interval: [env-steps] between evaluations, 0 for none but the last.
         log_interval: [s] between rows of metrics.
         checkpoint_interval: [s] between checkpoints.
@@ -28,6 +29,7 @@ class TrainSettings:
     utd_ratio: float | None = 1.0
     throttle: float | None = None
     anneal: float = 0.0
+    anneal_entropy: float = 1.0
     eval_interval: int = 0
     log_interval: float = 20.0
     checkpoint_interval: float = 300.0
@@ -43,8 +45,18 @@ class TrainSettings:
             raise ValueError(f"utd_ratio must not be negative, got {self.utd_ratio}")
         if not 0.0 <= self.anneal <= 1.0:
             raise ValueError(f"anneal must be between 0 and 1, got {self.anneal}")
+        if not 0.0 < self.anneal_entropy <= 1.0:
+            raise ValueError(f"anneal_entropy must be above 0 and at most 1, got {self.anneal_entropy}")
 
     def learning_rate_factor(self, frames: int) -> float:
         """What the learning rates are multiplied with after so many env-steps (see `anneal`)."""
+        return 1.0 - 0.9 * self._annealed(frames)
+
+    def entropy_factor(self, frames: int) -> float:
+        """What the entropy weight is multiplied with after so many env-steps (see `anneal_entropy`)."""
+        return 1.0 - (1.0 - self.anneal_entropy) * self._annealed(frames)
+
+    def _annealed(self, frames: int) -> float:
+        """From 0 before the last part of the training to 1 at its end."""
         left = max(0.0, 1.0 - frames / self.total_frames)
-        return 1.0 if left >= self.anneal else 0.1 + 0.9 * left / self.anneal
+        return 0.0 if left >= self.anneal else 1.0 - left / self.anneal

@@ -92,6 +92,18 @@ def test_learning_rates_fall_to_a_tenth_over_the_last_share(make_train, tmp_path
     assert again.learner.optimizers["actor"].param_groups[0]["lr"] == pytest.approx(1e-3)
 
 
+def test_the_entropy_weight_falls_with_the_learning_rates(make_train, tmp_path):
+    settings = TrainSettings(total_frames=400, anneal=0.25, anneal_entropy=0.2)
+    assert [settings.entropy_factor(frames) for frames in (0, 300, 350, 400)] == pytest.approx([1.0, 1.0, 0.6, 0.2])
+    before = make_train(total_frames=400).learner.loss_module.log_alpha.exp()
+    train = make_train(total_frames=400, anneal=0.25, anneal_entropy=0.2)
+    train.run()
+    assert train.learner.loss_module.log_alpha.exp() == pytest.approx(0.2 * before)
+    again = make_train(total_frames=800, anneal=0.25, anneal_entropy=0.2)
+    again.resume(tmp_path / "run")
+    assert again.learner.loss_module.log_alpha.exp() == pytest.approx(before)
+
+
 @pytest.mark.parametrize("utd_ratio, updates", [(0.0, 0), (0.125, 45), (0.3, 108), (1.0, 360)])
 def test_updates_per_step(make_train, utd_ratio, updates):
     train = make_train(total_frames=400, utd_ratio=utd_ratio)
@@ -110,6 +122,8 @@ def test_without_a_ratio_the_learner_fills_the_throttled_time(make_train):
 def test_the_share_of_annealing_is_a_share():
     with pytest.raises(ValueError, match="anneal must be between 0 and 1"):
         TrainSettings(total_frames=10, anneal=1.5)
+    with pytest.raises(ValueError, match="anneal_entropy must be above 0"):
+        TrainSettings(total_frames=10, anneal_entropy=0.0)
 
 
 def test_a_ratio_of_none_needs_a_throttle():

@@ -20,7 +20,7 @@ ROLLING_GAP = 14.0  # [m] between cars of a rolling start
 _LAUNCH_SPEED = 60.0  # [m/s]
 _WEAR_MAX, _WEAR_SPREAD = 0.75, 0.05
 _FUEL = (10.0, 100.0)  # [l]
-_HEAT = (30.0, 100.0)  # [°C]
+_HEAT = (30.0, 130.0)  # [°C], as hot as a stint makes them
 _MEDIUM = COMPOUNDS.index("race_medium")
 _DRAWS = 16  # random numbers per car and episode
 
@@ -79,7 +79,7 @@ class Conditions:
     Attributes:
         wear: whether tyres start worn: X ~ U(0, 0.75), each tyre N(X, 0.05) clipped (paper).
         fuel: litres, or None for U(10, 100) (paper).
-        heat: °C of the tyres, or None for U(30, 100).
+        heat: °C of the tyres, or None for U(30, 130).
         compounds: indices into `COMPOUNDS`, drawn uniformly.
     """
 
