@@ -1,4 +1,4 @@
-"""Distributions of training styles for any space of weights: the combat domain's, its ablations, and one for sliders."""
+"""Distributions of training styles for any space of weights: combat's, its ablations, and one for sliders."""
 
 from typing import Literal, get_args
 

@@ -193,7 +193,7 @@ class Learner:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned; the learning rates and a fixed entropy weight stay the constructor's."""
+        """Restore what :meth:`state_dict` returned; rates and a fixed entropy weight stay those of the constructor."""
         self.loss_module.load_state_dict(state["loss_module"])
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])

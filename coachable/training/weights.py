@@ -132,14 +132,14 @@ def initialise_from(
         path_or_domain: as for `load_policy`.
         actor: overwritten.
         loss_module: built from `actor`; its critics and their targets are overwritten.
-        space: of the new training.
+        space: of the new training; it may draw its styles otherwise.
 
     Raises:
-        CheckpointError: if style space or network shapes differ.
+        CheckpointError: if style parameters or network shapes differ.
     """
     file = _locate(path_or_domain)
     state = read_state(file)
-    _check_space(state["space"], space, file)
+    _check_space({**state["space"], "sampler": space.to_dict()["sampler"]}, space, file)
     present = loss_module.state_dict()
     check_fits(state["actor"], _tensors(actor.state_dict()), "actor", file)
     check_fits(state["critics"], _with_prefix(present, _CRITICS), "critics", file)

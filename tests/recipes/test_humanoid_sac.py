@@ -151,7 +151,7 @@ def test_a_resumed_run_keeps_its_configuration(tmp_path):
 
 def test_a_new_run_starts_from_another_ones_weights(tmp_path):
     _run(tmp_path / "first", "train.total_frames=24")
-    second = _run(tmp_path / "second", "train.total_frames=4", f"init_from={tmp_path / 'first'}")
+    second = _run(tmp_path / "second", "train.total_frames=4", "sampler=independent", f"init_from={tmp_path / 'first'}")
     assert second.learner.updates == 0
     first = read_state(find_checkpoint(tmp_path / "first"))
     for name, value in read_state(find_checkpoint(tmp_path / "second"))["actor"].items():

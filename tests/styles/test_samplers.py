@@ -12,9 +12,13 @@ from coachable.styles import (
     PointMass,
     Product,
     Sampler,
+    Setpoint,
+    StyleSpace,
     Uniform,
     UniformChoice,
+    Weight,
 )
+from coachable.styles.mixtures import with_requests
 
 N = 200_000
 
@@ -236,9 +240,20 @@ def test_names_of_samplers_are_unique():
         (lambda: Mixture([], []), "at least one"),
         (lambda: Product([]), "at least one"),
         (lambda: UniformChoice(0), "at least one"),
+        (lambda: with_requests(StyleSpace([Weight("drift", 0.0, 5.0)]), full=0.9), "probabilities that sum to 1"),
+        (lambda: with_requests(StyleSpace([Setpoint("pace", 0.0, 1.0)])), "with_requests asks for weights of 0.*pace"),
         (lambda: Sampler.from_dict({"type": "Levy"}), "unknown sampler type 'Levy'"),
     ],
 )
 def test_construction_is_checked(build, message):
     with pytest.raises(ValueError, match=message):
         build()
+
+
+def test_requests_are_drawn_beside_the_spaces_own_styles():
+    space = StyleSpace([Weight(name, -0.4, 5.0) for name in "abcd"], DRIFT)
+    theta = with_requests(space, positive=0.25, full=0.15, neutral=0.1).sample((N,), torch.Generator().manual_seed(0))
+    assert (theta == 5.0).all(-1).float().mean() == pytest.approx(0.15, abs=0.005)
+    assert (theta == 0.0).all(-1).float().mean() == pytest.approx(0.1 + 0.5 * 0.5**4, abs=0.005)
+    every = ((theta > 0.0) & (theta < 5.0)).all(-1).float().mean()
+    assert every == pytest.approx(0.25 + 0.5 * 0.25**4, abs=0.005)
