@@ -88,8 +88,8 @@ class Domain:
             every entry is a group of its own.
         as_trained: this domain as the settings of a training made it (`env` of its configuration: which machines,
             which cars); None where trainings do not differ.
-        evaluation: what `coachable evaluate` does instead of running the grid and switched styles, with the arguments
-            of `coachable.evaluation.evaluate.evaluate` but `source`, preceded by the domain and the loaded policy.
+        evaluation: what `coachable evaluate` does instead of running the grid and switched styles: `(domain, policy,
+            folder, settings) -> report`, with the loaded policy and `coachable.evaluation.settings`.
         evaluation_reads_sweeps: whether it also takes `sweeps`, which a report has made already (`sweep_weights`).
     """
 

@@ -13,6 +13,7 @@ import numpy as np
 from coachable.envs.racing.measures import DRIFT_ANGLE_DEG, GRIP_ANGLE_DEG
 from coachable.envs.racing.scenarios import Scenario
 from coachable.envs.racing.styles import DRIFT_NAMES
+from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
 from coachable.evaluation.style_grid import evaluate_grid, markdown_table, policy_sentence, write_csv
 
@@ -34,13 +35,7 @@ def evaluate_drift(
     domain: Domain,
     agent: LoadedPolicy,
     out: Path,
-    *,
-    episodes: int = 20,
-    switch_episodes: int = 0,
-    steps: int | None = None,
-    seed: int = 0,
-    num_threads: int | None = None,
-    progress: bool = True,
+    settings: EvaluationSettings,
 ) -> str:
     """Drive under rising weights, of the rear slip angle alone and of all four together, from ordinary starts.
 
@@ -50,18 +45,10 @@ def evaluate_drift(
         domain: racing_drift, as the agent was trained in.
         agent: the policy; acts deterministically.
         out: folder, created if missing.
-        episodes: per weight, each from its own place on the track.
-        switch_episodes: not used.
-        steps: length of an episode in control steps; default: the domain's.
-        seed: of the starts. The same seed gives the same files.
-        num_threads: not used: threads are torch's own.
-        progress: show a progress bar.
+        settings: `episodes` per weight, each from its own place on the track.
 
     Returns:
         The report, Markdown.
-
-    Raises:
-        ValueError: if `episodes` is below 1.
     """
     out.mkdir(parents=True, exist_ok=True)
     cells = [dict.fromkeys(names, weight) for names in SWEEPS.values() for weight in WEIGHTS]
@@ -69,11 +56,11 @@ def evaluate_drift(
         domain,
         agent.actor,
         agent.space,
-        episodes=episodes,
-        steps=steps,
-        seed=seed,
+        episodes=settings.episodes,
+        steps=settings.steps,
+        seed=settings.seed,
         cells=cells,
-        progress=progress,
+        progress=settings.progress,
         env_options={"scenarios": _STARTS},
     )
     values = {name: value.reshape(len(SWEEPS), len(WEIGHTS), -1) for name, value in grid.episodes.items()}
@@ -82,7 +69,7 @@ def evaluate_drift(
         for index, sweep in enumerate(SWEEPS)
         for row in _rows(sweep, {name: value[index] for name, value in values.items()})
     ]
-    weights = np.repeat(np.array(WEIGHTS)[:, None], episodes, 1).ravel()
+    weights = np.repeat(np.array(WEIGHTS)[:, None], settings.episodes, 1).ravel()
     summary: dict[str, Any] = {}
     for index, sweep in enumerate(SWEEPS):
         own = [row for row in rows if row["sweep"] == sweep]
@@ -93,7 +80,7 @@ def evaluate_drift(
             "pace_kept_at_full": own[-1]["pace_kept"],
             "most_turns": max(row["most_turns"] for row in own),
         }
-    summary |= {"episodes_per_weight": episodes, "seed": seed}
+    summary |= {"episodes_per_weight": settings.episodes, "seed": settings.seed}
     write_csv(rows, out / "drift.csv")
     draw_drift(rows, out / "drift.png")
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")

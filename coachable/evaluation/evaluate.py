@@ -9,6 +9,7 @@ from typing import Any
 
 from coachable.domain import Domain, load_domain
 from coachable.evaluation.figures import draw_style_grid
+from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.style_grid import (
     StyleGrid,
     evaluate_grid,
@@ -46,13 +47,17 @@ def evaluate(
 
     Returns:
         The report, Markdown.
+
+    Raises:
+        ValueError: if `episodes` is below 1.
     """
     out.mkdir(parents=True, exist_ok=True)
     agent = load_policy(source)
     domain = load_domain(agent.metadata["domain"], agent.config)
     options: dict[str, Any] = {"steps": steps, "seed": seed, "num_threads": num_threads, "progress": progress}
+    settings = EvaluationSettings(episodes=episodes, switch_episodes=switch_episodes, **options)
     if domain.evaluation is not None:
-        return domain.evaluation(domain, agent, out, episodes=episodes, switch_episodes=switch_episodes, **options)
+        return domain.evaluation(domain, agent, out, settings)
     grid = evaluate_grid(domain, agent.actor, agent.space, episodes=episodes, **options)
     switching = evaluate_switching(domain, agent.actor, agent.space, episodes=switch_episodes, **options)
     rows, response = grid.rows(), grid.response(agent.space)

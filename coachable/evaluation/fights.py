@@ -16,6 +16,7 @@ from coachable.envs.combat.tables import MACHINES, SITES, STYLES, UNSEEN_MACHINE
 from coachable.evaluation.coached_fight import SOURCES, STATES, CoachedFights, draw_timeline, fight_coached, requests_of
 from coachable.evaluation.figures import readable
 from coachable.evaluation.rollouts import record_episodes
+from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.statistics import rank_correlation
 from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_csv
 from coachable.evaluation.sweep import WeightSweep, sweep_weights
@@ -55,13 +56,8 @@ def evaluate_fights(
     domain: Domain,
     agent: LoadedPolicy,
     out: Path,
+    settings: EvaluationSettings,
     *,
-    episodes: int = 20,
-    switch_episodes: int = 60,
-    steps: int | None = None,
-    seed: int = 0,
-    num_threads: int | None = None,
-    progress: bool = True,
     sweeps: Sequence[WeightSweep] | None = None,
 ) -> str:
     """Fight every machine in every style and write tables, figures and a report.
@@ -75,25 +71,17 @@ def evaluate_fights(
         domain: combat, as the agent was trained in.
         agent: the policy; samples its actions, as in training.
         out: folder, created if missing.
-        episodes: fights per style and machine, at sites drawn at random.
-        switch_episodes: sequences of fights with a style that switches, each `steps` long; 0 for none. There are none
-            for an agent with fewer than two styles of damage.
-        steps: length of a fight; default: the domain's.
-        seed: of scenarios and fights. The same seed gives the same files.
-        num_threads: not used: threads are torch's own.
-        progress: show progress bars.
+        settings: `episodes` fights per style and machine, at sites drawn at random, of at most `steps`, and
+            `switch_episodes` sequences of fights with a style that switches, each as long; none for an agent with fewer
+            than two styles of damage.
         sweeps: of `sweep_weights`, where they exist already.
 
     Returns:
         The report, Markdown.
-
-    Raises:
-        ValueError: if `episodes` is below 1.
     """
-    if episodes < 1:
-        raise ValueError(f"episodes per style and machine must be at least 1, got {episodes}")
+    episodes, seed, progress = settings.episodes, settings.seed, settings.progress
     out.mkdir(parents=True, exist_ok=True)
-    space, steps = agent.space, steps or domain.episode_steps
+    space, steps = agent.space, settings.steps or domain.episode_steps
     cells = single_styles(space) + composed_styles(space)
     labels = [style_label(cell) for cell in cells]
     machines = list(agent.config["env"].get("machines") or MACHINES)
@@ -116,8 +104,9 @@ def evaluate_fights(
     sweep = _sweep_rows(sweeps)
     tables = {"damage": damage, "wins": wins, "unseen": unseen, "outcomes": outcomes, "sweep": sweep}
     coached = None
-    if switch_episodes and len(requests_of(space)) > 1:
-        coached = fight_coached(domain, agent, sequences=switch_episodes, steps=steps, seed=seed, progress=progress)
+    if settings.switch_episodes and len(requests_of(space)) > 1:
+        sequences = settings.switch_episodes
+        coached = fight_coached(domain, agent, sequences=sequences, steps=steps, seed=seed, progress=progress)
         timeline = coached.timeline()
         tables |= {"switches": coached.switches(), "timeline": timeline}
         draw_timeline(timeline, out / "timeline.png")

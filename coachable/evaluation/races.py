@@ -20,6 +20,7 @@ from coachable.envs.racing.measures import TelemetryMeasures
 from coachable.envs.racing.scenarios import rolling_start
 from coachable.envs.racing.simulation import CONTROL_STEP
 from coachable.evaluation.rollouts import record_episodes
+from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation, wilson_interval
 from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_csv
 from coachable.transforms import coachable_env
@@ -46,13 +47,7 @@ def evaluate_aggressiveness(
     domain: Domain,
     agent: LoadedPolicy,
     out: Path,
-    *,
-    episodes: int = 3,
-    switch_episodes: int = 0,
-    steps: int | None = None,
-    seed: int = 0,
-    num_threads: int | None = None,
-    progress: bool = True,
+    settings: EvaluationSettings,
 ) -> str:
     """Race pairs with rising lateral margins against three other copies of the agent.
 
@@ -62,26 +57,17 @@ def evaluate_aggressiveness(
         domain: racing_aggressiveness, as the agent was trained in.
         agent: the policy of all five cars; acts deterministically.
         out: folder, created if missing.
-        episodes: races per setting, margin and combination of the others' margins, of which there are eight.
-        switch_episodes: not used.
-        steps: control steps after which a race is over at the latest; default 10000. Otherwise it ends when the first
-            car has driven four laps.
-        seed: of the starts. The same seed gives the same files.
-        num_threads: not used: threads are torch's own.
-        progress: show a progress bar.
+        settings: `episodes` races per setting, margin and combination of the others' margins, of which there are eight.
+            A race ends when the first car has driven four laps, or after `steps`, by default 10000.
 
     Returns:
         The report, Markdown.
-
-    Raises:
-        ValueError: if `episodes` is below 1.
     """
-    if episodes < 1:
-        raise ValueError(f"episodes per combination must be at least 1, got {episodes}")
+    episodes, seed = settings.episodes, settings.seed
     out.mkdir(parents=True, exist_ok=True)
     cells = [(setting, lateral) for setting in SETTINGS for lateral in LATERAL]
     races = [(setting, lateral, others) for setting, lateral in cells for others in OTHERS for _ in range(episodes)]
-    found = _race(domain, agent, races, steps or RACE_STEPS, seed, progress)
+    found = _race(domain, agent, races, settings.steps or RACE_STEPS, seed, settings.progress)
     rows = _rows(cells, {name: values.reshape(len(cells), -1, 2) for name, values in found.items()})
     summary: dict[str, Any] = {
         setting: {

@@ -24,6 +24,7 @@ from coachable.evaluation.runs import (
     flat_row,
     response_rows,
 )
+from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.style_grid import acting, mean_of, training_counts, write_csv
 from coachable.styles import Setpoint
 from coachable.training.weights import LoadedPolicy, load_policy
@@ -115,9 +116,9 @@ def write_report(
     _switches(page, domain, runs, switch_episodes, formats, out)
     _tradeoffs(page, styles, runs, formats, out)
     if domain.evaluation is not None:
-        own: dict[str, Any] = {"episodes": episodes, "switch_episodes": switch_episodes, "steps": steps, "seed": seed}
-        own |= {"sweeps": runs[0].sweeps} if domain.evaluation_reads_sweeps else {}
-        _own(page, domain, agent, out, num_threads=num_threads, progress=progress, **own)
+        settings = EvaluationSettings(episodes, switch_episodes, steps, seed, num_threads, progress)
+        sweeps = {"sweeps": runs[0].sweeps} if domain.evaluation_reads_sweeps else {}
+        _own(page, domain, agent, out, settings, **sweeps)
     command = [f"coachable report {' '.join(agents)} --seed {seed} --episodes {episodes}"]
     command += [f"--switch-episodes {switch_episodes} --sweep-points {sweep_points}"]
     command += [f"--seeds {seeds}"] if len(agents) == 1 else []
@@ -241,11 +242,13 @@ def _tradeoffs(page: Page, styles: StyleTable, runs: Sequence[Run], formats: Map
     )
 
 
-def _own(page: Page, domain: Domain, agent: LoadedPolicy, out: Path, **settings: Any) -> None:
+def _own(
+    page: Page, domain: Domain, agent: LoadedPolicy, out: Path, settings: EvaluationSettings, **sweeps: Any
+) -> None:
     """What a domain measures in its own way, of the first agent: each table that it writes, with its figure."""
     assert domain.evaluation is not None
     folder = out / domain.name
-    domain.evaluation(domain, agent, folder, **settings)
+    domain.evaluation(domain, agent, folder, settings, **sweeps)
     for file in sorted(folder.glob("*.csv")):
         with file.open(newline="", encoding="utf-8") as lines:
             rows = [{name: _number(value) for name, value in row.items()} for row in csv.DictReader(lines)]

@@ -19,6 +19,7 @@ from coachable.envs.racing.parameters import Resources
 from coachable.envs.racing.scenarios import Conditions, Scenario
 from coachable.envs.racing.simulation import CONTROL_STEP
 from coachable.evaluation.rollouts import record_episodes
+from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
 from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_csv
 from coachable.transforms import coachable_env
@@ -67,13 +68,7 @@ def evaluate_resources(
     domain: Domain,
     agent: LoadedPolicy,
     out: Path,
-    *,
-    episodes: int = 5,
-    switch_episodes: int = 0,
-    steps: int | None = None,
-    seed: int = 0,
-    num_threads: int | None = None,
-    progress: bool = True,
+    settings: EvaluationSettings,
 ) -> str:
     """Drive stints under rising weights of one resource at a time, and a time trial without any.
 
@@ -85,26 +80,17 @@ def evaluate_resources(
         domain: racing_resources, as the agent was trained in.
         agent: the policy; acts deterministically.
         out: folder, created if missing.
-        episodes: stints per weight, each from its own place on the track.
-        switch_episodes: not used.
-        steps: length of a stint in control steps; default 9000, 15 minutes.
-        seed: of the places. The same seed gives the same files.
-        num_threads: not used: threads are torch's own.
-        progress: show progress bars.
+        settings: `episodes` stints per weight, each from its own place on the track, of `steps`, by default 9000,
+            15 minutes.
 
     Returns:
         The report, Markdown.
-
-    Raises:
-        ValueError: if `episodes` is below 1.
     """
-    if episodes < 1:
-        raise ValueError(f"episodes per weight must be at least 1, got {episodes}")
     out.mkdir(parents=True, exist_ok=True)
-    settings = agent.config.get("env", {})
-    car, track = settings.get("car", "x2019"), settings.get("track", "lakeside")
+    trained, episodes, seed = agent.config.get("env", {}), settings.episodes, settings.seed
+    car, track = trained.get("car", "x2019"), trained.get("track", "lakeside")
     rates = Resources.calibrated(car)
-    options: dict[str, Any] = {"steps": steps or STINT_STEPS, "seed": seed, "progress": progress}
+    options: dict[str, Any] = {"steps": settings.steps or STINT_STEPS, "seed": seed, "progress": settings.progress}
     rows: list[dict[str, Any]] = []
     every: list[dict[str, Any]] = []
     frontiers: dict[str, list[dict[str, float]]] = {}
@@ -134,7 +120,7 @@ def evaluate_resources(
     draw_stints(every, out / "stints.png")
     draw_tradeoff(rows, frontiers, out / "tradeoff.png")
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
-    report = _report(agent, rows, summary, options["seed"], episodes)
+    report = _report(agent, rows, summary, seed, episodes)
     (out / "report.md").write_text(report)
     return report
 

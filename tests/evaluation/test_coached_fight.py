@@ -19,6 +19,7 @@ from coachable.evaluation.coached_fight import (
     requests_of,
 )
 from coachable.evaluation.fights import evaluate_fights
+from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.sweep import WeightSweep
 from coachable.training.weights import LoadedPolicy
 
@@ -127,16 +128,16 @@ def test_the_evaluation_has_the_switches(domain, tmp_path):
         WeightSweep(name, np.array([0.0, 1.0]), {key: np.ones((2, 1)) for key in (name, "damage", "won")})
         for name in STYLES
     ]
-    report = evaluate_fights(
-        domain, agent, tmp_path, episodes=1, switch_episodes=2, steps=20, progress=False, sweeps=sweeps
-    )
+    settings = EvaluationSettings(episodes=1, switch_episodes=2, steps=20, progress=False)
+    report = evaluate_fights(domain, agent, tmp_path, settings, sweeps=sweeps)
     assert "## Style switched every 2 s" in report and "| skykiller |" in report
     rows = {name: (tmp_path / f"{name}.csv").read_text().splitlines() for name in ("sweep", "timeline")}
     assert len(rows["sweep"]) == 1 + 6  # those given, not its own
     timeline = list(csv.DictReader(rows["timeline"]))
     assert [row["requested"] for row in timeline] == ["melee"] * 10 + ["skykiller"] * 10
     assert (tmp_path / "timeline.png").stat().st_size > 5_000
-    without = evaluate_fights(domain, agent, tmp_path / "b", episodes=1, switch_episodes=0, steps=5, progress=False)
+    settings = EvaluationSettings(episodes=1, switch_episodes=0, steps=5, progress=False)
+    without = evaluate_fights(domain, agent, tmp_path / "b", settings)
     assert "switched" not in without and not (tmp_path / "b" / "timeline.csv").exists()
 
 

@@ -17,6 +17,7 @@ from coachable.domain import Domain
 from coachable.evaluation.report import report, write_report
 from coachable.evaluation.report_page import shown, table
 from coachable.evaluation.runs import Estimate, Run, StyleTable, describe, estimate
+from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.style_grid import StyleGrid
 from coachable.evaluation.sweep import sweep_weights
 from coachable.evaluation.switching import SwitchReport
@@ -183,9 +184,9 @@ def test_the_page_is_one_file(folder):
 
 
 def test_what_a_domain_measures_itself_is_on_the_page(tmp_path):
-    def evaluation(domain, agent, out, *, episodes, sweeps, **settings):
-        assert settings == {"switch_episodes": 4, "steps": None, "seed": 0, "num_threads": None, "progress": False}
-        assert [sweep.weight for sweep in sweeps] == ["bold"] and episodes == 2
+    def evaluation(domain, agent, out, settings, *, sweeps):
+        assert settings == EvaluationSettings(episodes=2, switch_episodes=4, progress=False)
+        assert [sweep.weight for sweep in sweeps] == ["bold"]
         out.mkdir()
         (out / "every_step.csv").write_text("step\n" + "1\n" * 101)
         (out / "wins.csv").write_text("style,easy_machine\nred,0.5\n")

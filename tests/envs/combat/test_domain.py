@@ -10,6 +10,7 @@ from coachable.domain import load_domain
 from coachable.envs.combat.domain import DOMAIN
 from coachable.envs.combat.tables import STYLES
 from coachable.evaluation.fights import evaluate_fights, style_label
+from coachable.evaluation.settings import EvaluationSettings
 from coachable.transforms import coachable_env
 
 
@@ -79,8 +80,9 @@ def test_fights_are_counted_by_style_and_machine(tmp_path):
         "combat", {"env": {"styles": ["melee", "corrosive_blastsling", "acid"], "observation": "small", "traps": 0}}
     )
     agent = _Idle(domain.make_space())
-    report = evaluate_fights(domain, agent, tmp_path, episodes=2, steps=30, progress=False)
-    again = evaluate_fights(domain, agent, tmp_path / "again", episodes=2, steps=30, progress=False)
+    settings = EvaluationSettings(episodes=2, steps=30, progress=False)
+    report = evaluate_fights(domain, agent, tmp_path, settings)
+    again = evaluate_fights(domain, agent, tmp_path / "again", settings)
     assert report == again and (tmp_path / "report.md").read_text() == report
     styles = ["default", "melee", "corrosive_blastsling", "acid", "corrosive_blastsling + acid"]
     for name in ("damage", "wins", "unseen", "outcomes", "sweep"):
@@ -90,5 +92,5 @@ def test_fights_are_counted_by_style_and_machine(tmp_path):
         if name == "outcomes":
             assert [sum(int(row[key]) for key in row if key != "machine") for row in rows] == [10, 10]
     assert (tmp_path / "damage.png").stat().st_size > 5_000 and (tmp_path / "sweep.png").stat().st_size > 5_000
-    with pytest.raises(ValueError, match="episodes per style and machine must be at least 1, got 0"):
-        evaluate_fights(domain, agent, tmp_path, episodes=0)
+    with pytest.raises(ValueError, match="episodes per style must be at least 1, got 0"):
+        EvaluationSettings(episodes=0)
