@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from coachable.training.weights import LoadedPolicy, load_policy
 
 __all__ = ["SCHEMA_VERSION", "TOLERANCE", "export", "largest_difference", "metadata_of"]
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 """Version of the file's inputs, outputs and metadata."""
 
 TOLERANCE = 1e-5
@@ -31,8 +32,9 @@ def export(source: str | Path, out: Path) -> float:
     """Write the deterministic policy as ONNX and compare it with torch.
 
     Inputs are `observation` (batch, obs_dim) and `style` (batch, d), raw theta in natural units: the encoding is part
-    of the graph. The output is `action` (batch, A) in [-1, 1]; for mixed actions `axes` (batch, axes) in [-1, 1] and
-    `choices` (batch, heads), the index of the chosen value of each head. The batch is dynamic.
+    of the graph. The output is `action` (batch, A) in [-1, 1]; for mixed actions `axes` (batch, axes) in [-1, 1],
+    `choices` (batch, heads), the index of the likeliest value of each head, and `probabilities` (batch, all values),
+    to draw the choices from. The batch is dynamic.
 
     Args:
         source: checkpoint, run folder, weights file, or the name of a domain that ships with weights.
@@ -98,7 +100,8 @@ def largest_difference(file: Path, plain: DeterministicAction, space: StyleSpace
         samples: number of inputs.
 
     Returns:
-        Largest absolute difference of the axes; for choices, how much less likely than the best one the file's is.
+        Largest absolute difference of actions, axes and probabilities; for choices, how much less likely than the best
+        one the file's is.
     """
     import onnxruntime
 
@@ -114,16 +117,15 @@ def largest_difference(file: Path, plain: DeterministicAction, space: StyleSpace
             expected = dict(zip(plain.output_names, plain(observation[rows], style[rows]), strict=True))
             for name, value in results.items():
                 if name == "choices":
-                    worst = _shortfall(plain, observation[rows], style[rows], value)
+                    worst = _shortfall(expected["probabilities"].split(plain.choice_sizes, -1), value)
                 else:
                     worst = (value - expected[name]).abs().max().item()
                 largest = max(largest, worst)
     return largest
 
 
-def _shortfall(plain: DeterministicAction, observation: Tensor, style: Tensor, choices: Tensor) -> float:
+def _shortfall(probabilities: Sequence[Tensor], choices: Tensor) -> float:
     """Probability by which the given choices fall short of the likeliest ones: rounding may break exact ties."""
-    probabilities = plain.head_probabilities(observation, style)
     chosen = [p.gather(-1, choices[:, i : i + 1]).squeeze(-1) for i, p in enumerate(probabilities)]
     return max((p.amax(-1) - c).max().item() for p, c in zip(probabilities, chosen, strict=True))
 

@@ -60,13 +60,15 @@ class _PlainPolicy(nn.Module):
 
 
 class DeterministicAction(_PlainPolicy):
-    """What evaluation executes: `(observation, style)` to the action, style raw and encoded inside.
+    """`(observation, style)` to the deterministic action, style raw and encoded inside.
+
+    Categorical heads also give their probabilities: policies of mixed actions act by sampling them.
 
     Args:
         actor: From `make_gaussian_actor` or `make_mixed_actor`; its weights are shared.
 
     Attributes:
-        output_names: `("action",)`; for mixed actions `axes` and `choices`, those that exist.
+        output_names: `("action",)`; for mixed actions `axes`, and `choices` and `probabilities`, those that exist.
         choice_sizes: Number of values of each head of `choices`.
 
     Example:
@@ -83,7 +85,8 @@ class DeterministicAction(_PlainPolicy):
         self.choice_sizes: tuple[int, ...] = ()
         if isinstance(self.policy, MixedPolicy):
             heads = self.policy.heads
-            self.output_names = (("axes",) if heads.axes else ()) + (("choices",) if heads.categorical else ())
+            self.output_names = ("axes",) if heads.axes else ()
+            self.output_names += ("choices", "probabilities") if heads.categorical else ()
             self.choice_sizes = heads.categorical
 
     def forward(self, observation: Tensor, style: Tensor) -> tuple[Tensor, ...]:
@@ -95,15 +98,13 @@ class DeterministicAction(_PlainPolicy):
 
         Returns:
             `action` `(..., A)` in [-1, 1]; or `axes` `(..., axes)` in [-1, 1] and `choices` `(..., heads)` int64, the
-            index of each head's most likely value.
+            index of each head's most likely value, and `probabilities` `(..., sum(choice_sizes))`, head after head.
         """
         axes, probabilities = self._parts(self.policy.trunk(observation, self.space.encode(style)))
         outputs = () if axes is None else (axes,)
-        return (*outputs, torch.stack([head.argmax(-1) for head in probabilities], -1)) if probabilities else outputs
-
-    def head_probabilities(self, observation: Tensor, style: Tensor) -> tuple[Tensor, ...]:
-        """Probabilities `(..., size)` of each categorical head."""
-        return self._parts(self.policy.trunk(observation, self.space.encode(style)))[1]
+        if not probabilities:
+            return outputs
+        return (*outputs, torch.stack([head.argmax(-1) for head in probabilities], -1), torch.cat(probabilities, -1))
 
 
 class ActionOutputs(_PlainPolicy):

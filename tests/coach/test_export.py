@@ -88,9 +88,12 @@ def test_mixed_actions_leave_as_axes_and_choices(tmp_path):
     out = write(plain, tmp_path / "mixed.onnx")
     observation, style = torch.randn(40, 5), SPACE.sample((40,))
     results = run(out, observation=observation, style=style)
-    assert {name: value.shape for name, value in results.items()} == {"axes": (40, 2), "choices": (40, 3)}
+    shapes = {name: value.shape for name, value in results.items()}
+    assert shapes == {"axes": (40, 2), "choices": (40, 3), "probabilities": (40, 9)}
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        action = actor(TensorDict(observation=observation, style=style, batch_size=[40]))["action"]
+        acted = actor(TensorDict(observation=observation, style=style, batch_size=[40]))
+    action = acted["action"]
+    np.testing.assert_allclose(results["probabilities"], acted["probs"].numpy(), rtol=0, atol=1e-5)
     np.testing.assert_allclose(results["axes"], heads.split(action)[1].numpy(), rtol=0, atol=1e-5)
     np.testing.assert_array_equal(results["choices"], heads.choices(action).numpy())
     assert len(np.unique(results["choices"][:, 0])) > 1
@@ -105,7 +108,8 @@ def test_only_the_components_that_exist(tmp_path, heads, mean_bound):
     observation, style = torch.randn(9, 4), SPACE.sample((9,))
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         action = actor(TensorDict(observation=observation, style=style, batch_size=[9]))["action"]
-        (only,) = plain(observation, style)
+        only, *probabilities = plain(observation, style)
+    assert len(probabilities) == (1 if heads.categorical else 0)
     expected = heads.choices(action) if heads.categorical else action
     torch.testing.assert_close(only, expected)
 
