@@ -14,6 +14,8 @@ from coachable.networks.mixed import MixedPolicy
 
 __all__ = ["ActionOutputs", "DeterministicAction", "policy_network"]
 
+_SCALE = 2.0**20  # cancels out; without it the exporter takes EPSILON for zero, and no positive preference becomes NaN
+
 
 def policy_network(actor: TensorDictModuleBase) -> GaussianPolicy | MixedPolicy:
     """The network inside an actor.
@@ -53,7 +55,8 @@ class _PlainPolicy(nn.Module):
         probabilities = ()
         if heads.categorical:
             positive = [
-                head.clamp(min=0.0) + EPSILON / head.shape[-1] for head in preferences.split(heads.categorical, -1)
+                _SCALE * head.clamp(min=0.0) + _SCALE * EPSILON / head.shape[-1]
+                for head in preferences.split(heads.categorical, -1)
             ]
             probabilities = tuple(head / head.sum(-1, keepdim=True) for head in positive)
         return (torch.tanh(loc) if heads.axes else None), probabilities
