@@ -25,7 +25,11 @@ if TYPE_CHECKING:
     from coachable.training.weights import LoadedPolicy
 
 ANGLE = "slip_angle_rear"
-SWEEPS = {"rear slip angle": (ANGLE,), "all four": DRIFT_NAMES}  # weights that rise together
+SWEEPS = {  # weights that rise together
+    "rear slip angle": (ANGLE,),
+    "rear slip angle and ratio": (ANGLE, "slip_ratio_rear"),
+    "all four": DRIFT_NAMES,
+}
 WEIGHTS = (-0.4, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
 _STARTS = (Scenario("solo", 1.0, "solo"),)
 _METRICS = ("slip_angle_rear", "slip_angle_front", "pace", "off", "turns", "survived")
@@ -37,7 +41,7 @@ def evaluate_drift(
     out: Path,
     settings: EvaluationSettings,
 ) -> str:
-    """Drive under rising weights, of the rear slip angle alone and of all four together, from ordinary starts.
+    """Drive under rising weights, of the rear slip angle alone, with the ratio, and of all four, from ordinary starts.
 
     Files: `drift.csv` (by weight), `drift.png`, `report.md`, `summary.json`.
 
@@ -105,7 +109,7 @@ def _rows(sweep: str, episodes: Mapping[str, np.ndarray]) -> list[dict[str, Any]
 def draw_drift(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Rear slip angle, and pace, over the weight, a line per sweep."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.8), layout="constrained")
-    for sweep, marker in zip(SWEEPS, "os", strict=True):
+    for sweep, marker in zip(SWEEPS, "ovs", strict=True):
         own = [row for row in rows if row["sweep"] == sweep]
         weights, angle = [row["weight"] for row in own], np.array([row[ANGLE] for row in own])
         error = np.abs(np.array([[row["angle_low"], row["angle_high"]] for row in own]) - angle[:, None]).T

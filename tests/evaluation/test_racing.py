@@ -128,8 +128,8 @@ def test_a_driver_who_never_drifts(tmp_path):
     domain, agent = scripted("drift", "street")
     evaluate_drift(domain, agent, tmp_path, EvaluationSettings(episodes=2, steps=60, progress=False))
     rows = read(tmp_path / "drift.csv")
-    assert [float(row["weight"]) for row in rows] == 2 * [-0.4, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
-    assert sum(float(row["slip_angle_rear"]) < 8.0 for row in rows) >= 9  # it loses the car now and then
+    assert [float(row["weight"]) for row in rows] == 3 * [-0.4, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
+    assert sum(float(row["slip_angle_rear"]) < 8.0 for row in rows) >= 14  # it loses the car now and then
     assert all(float(row["turns"]) == 0.0 for row in rows)
     assert (tmp_path / "drift.png").stat().st_size > 10_000
 
