@@ -1,8 +1,8 @@
-"""Train a racing driver whose style is chosen at run time (QR-SAC, n-step returns, event tables).
+"""Train a racing driver whose style is chosen at run time (QR-SAC).
 
 python recipes/racing_qr_sac.py                                        tyre and fuel saving, cpu or gpu
 python recipes/racing_qr_sac.py family=drift sampler=with_requests     drifting on request
-python recipes/racing_qr_sac.py family=aggressiveness                  margins to four scripted rivals
+python recipes/racing_qr_sac.py family=aggressiveness                  margins to two agents and two rivals
 python recipes/racing_qr_sac.py preset=smoke                           every part once, within a minute
 """
 

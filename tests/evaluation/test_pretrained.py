@@ -18,7 +18,8 @@ def test_shipped_weights_act_in_their_domain(name):
     agent = load_policy(name)
     domain = load_domain(name, agent.config)
     assert agent.metadata["domain"] == name
-    assert agent.space == domain.make_space()
+    space = domain.make_space()
+    assert agent.space.with_sampler(space.sampler) == space  # it may have been trained on styles drawn otherwise
     env = domain.make_env(num_envs=2, num_threads=1)
     start = env.reset().set("style", agent.space.sample((2,)))
     action = agent.actor(start)["action"]
