@@ -14,7 +14,7 @@ from coachable.networks.mixed import MixedPolicy
 
 __all__ = ["ActionOutputs", "DeterministicAction", "policy_network"]
 
-_SCALE = 2.0**20  # cancels out; without it the exporter takes EPSILON for zero, and no positive preference becomes NaN
+_SCALE = 2.0**20  # cancels out; without it the exporter takes EPSILON for 0, and a head without preferences for 0 / 0
 
 
 def policy_network(actor: TensorDictModuleBase) -> GaussianPolicy | MixedPolicy:
