@@ -139,7 +139,7 @@ def _draw_points(table: StyleTable, metrics: Sequence[str], formats: Mapping[str
 
 
 def _lines(cells: Sequence[dict[str, Any]], space: StyleSpace) -> tuple[str | None, dict[str, list[int]]]:
-    """The numeric parameter with most values, and the cells of each combination of the others."""
+    """The numeric parameter with most values, and the cells of each combination of the others, two or more."""
     counts = {name: len({c[name] for c in cells}) for name in cells[0] if not isinstance(space[name], Choice)}
     axis = max(counts, key=lambda name: counts[name], default=None)
     if axis is None or counts[axis] < 3:
@@ -148,7 +148,8 @@ def _lines(cells: Sequence[dict[str, Any]], space: StyleSpace) -> tuple[str | No
     for i, cell in sorted(enumerate(cells), key=lambda pair: pair[1][axis]):
         others = {k: v for k, v in cell.items() if k != axis}
         lines.setdefault(describe(others) if others else "", []).append(i)
-    return (axis, lines) if len(lines) <= _MOST_LINES else (None, {})
+    drawable = len(lines) <= _MOST_LINES and all(len(line) > 1 for line in lines.values())
+    return (axis, lines) if drawable else (None, {})
 
 
 def _line(panel: Axes, x: Sequence[float], estimates: Sequence[Estimate], index: int, label: str, lines: int) -> None:
