@@ -144,7 +144,13 @@ _COACHING = {
             "slip_ratio_front": ("lock wheel", "lock the front wheel"),
         },
         presets={
-            "drift": {"slip_angle_rear": 5.0},
+            "drift": {"slip_angle_rear": 5.0, "slip_ratio_rear": 5.0},
+            "donuts": {
+                "slip_angle_front": 5.0,
+                "slip_angle_rear": 5.0,
+                "slip_ratio_front": 5.0,
+                "slip_ratio_rear": 5.0,
+            },
             "grip": {"slip_angle_front": -0.4, "slip_angle_rear": -0.4},
         },
         terminated="retired",

@@ -1,16 +1,16 @@
 """Declaration of the domain racing_drift."""
 
 from coachable.envs.racing.domains import racing_domain
+from coachable.envs.racing.styles import DRIFT_NAMES
+
+_NONE: dict[str, float] = dict.fromkeys(DRIFT_NAMES, 0.0)
+_ALL: dict[str, float] = dict.fromkeys(DRIFT_NAMES, 5.0)
+_REAR = ("slip_angle_rear", "slip_ratio_rear")  # together they make the car slide
 
 DOMAIN = racing_domain(
     "drift",
     cars=1,
-    grid={
-        "slip_angle_front": (0.0,),
-        "slip_angle_rear": (-0.4, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0),
-        "slip_ratio_front": (0.0,),
-        "slip_ratio_rear": (0.0,),
-    },
+    grid=[*({**_NONE, **dict.fromkeys(_REAR, weight)} for weight in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)), _ALL],
     columns={"slip_angle_front": ".1f", "slip_angle_rear": ".1f"},
     evaluation="drifts.evaluate_drift",
 )
