@@ -37,14 +37,9 @@ def style_mixture(
     """
     if single not in get_args(Single):
         raise ValueError(f"single is {single!r}: expected one of {', '.join(get_args(Single))}")
-    others = [p.name for p in space.parameters if not isinstance(p, Weight)]
-    if others and single == "independent":
+    if single == "independent" and _no_weights(space):
         return StyleSpace(space.parameters).sampler
-    if others:
-        raise ValueError(
-            f"sampler {single} leaves all weights but one at 0, which {', '.join(others)} of the style space "
-            f"{space.name!r} cannot be (not a weight): expected sampler=default or sampler=independent"
-        )
+    _require_weights(space, f"sampler {single} leaves all weights but one at 0")
     low, high = space.low.tolist(), space.high.tolist()
     every = Uniform(low, high)
     one = {"continuous_one_hot": ContinuousOneHot(low, high), "one_hot": OneHot(high), "independent": every}[single]
@@ -69,12 +64,21 @@ def with_requests(space: StyleSpace, *, positive: float = 0.25, full: float = 0.
     Raises:
         ValueError: If a parameter is no weight, or the probabilities exceed 1 together.
     """
-    others = [p.name for p in space.parameters if not isinstance(p, Weight)]
-    if others:
-        raise ValueError(
-            f"sampler with_requests asks for weights of 0, which {', '.join(others)} of the style space "
-            f"{space.name!r} cannot be (not a weight): expected sampler=default or sampler=independent"
-        )
+    _require_weights(space, "sampler with_requests asks for weights of 0")
     high, zero = space.high.tolist(), [0.0] * space.dim
     parts = [PointMass(zero), PointMass(high), Uniform(zero, high), space.sampler]
     return Mixture(parts, [neutral, full, positive, 1.0 - neutral - full - positive])
+
+
+def _no_weights(space: StyleSpace) -> list[str]:
+    """Names of the parameters that are not weights."""
+    return [p.name for p in space.parameters if not isinstance(p, Weight)]
+
+
+def _require_weights(space: StyleSpace, why: str) -> None:
+    others = _no_weights(space)
+    if others:
+        raise ValueError(
+            f"{why}, which {', '.join(others)} of the style space {space.name!r} cannot be (not a weight): expected "
+            "sampler=default or sampler=independent"
+        )
