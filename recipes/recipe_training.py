@@ -11,6 +11,7 @@ from hydra.utils import instantiate
 from recipe_config import save_config
 from tensordict import NestedKey
 
+from coachable.keys import STYLE_FEATURES
 from coachable.replay import EventTableBuffer
 from coachable.styles import StyleReward, StyleSpace
 from coachable.training.checkpoint import CheckpointStore, check_writable
@@ -80,8 +81,9 @@ def build_training(
     learner = make(config["learner"])(loss_module)
 
     # Replay and collector
-    check_relabelling(config)
-    replay = make(config["replay"])()
+    check_relabelling(config, style_reward)
+    relabelled_sums = config["impersonation"]["n"] and config["n_steps"] > 1
+    replay = make(config["replay"])(**({"discounted_keys": [("next", STYLE_FEATURES)]} if relabelled_sums else {}))
     tables = len(replay.names) if isinstance(replay, EventTableBuffer) else 0
     if config["train"]["batch_size"] < tables:
         raise ValueError(
@@ -140,7 +142,7 @@ def build_training(
     return train
 
 
-def check_relabelling(config: dict[str, Any]) -> None:
+def check_relabelling(config: dict[str, Any], style_reward: StyleReward) -> None:
     """Refuses replay settings that contradict each other.
 
     Raises:
@@ -149,8 +151,8 @@ def check_relabelling(config: dict[str, Any]) -> None:
     replay, n = config["replay"], config["impersonation"]["n"]
     if "events" in replay and replay["events"] is None:
         raise ValueError(f"replay=event_tables: {config['domain']} names no events; expected replay=uniform")
-    if n and config["n_steps"] > 1:
+    if n and config["n_steps"] > 1 and not style_reward.is_linear:
         raise ValueError(
-            f"impersonation.n={n} with n_steps={config['n_steps']}: the reward of another style needs the features of "
-            "every step summed; expected n_steps=1 or impersonation.n=0"
+            f"impersonation.n={n} with n_steps={config['n_steps']}: the style reward of {config['domain']} is not "
+            "linear in its features, so those of several steps cannot be summed; expected n_steps=1 or impersonation.n=0"
         )

@@ -76,6 +76,11 @@ class StyleReward(nn.Module):
         """Names of the terms, in the order in which they are added."""
         return tuple(self.scales)
 
+    @property
+    def is_linear(self) -> bool:
+        """Whether the reward is known to be linear in the features, so that those of several steps may be summed."""
+        return all(isinstance(term, WeightedFeature | WeightedSum) for _, term, _ in self._terms)
+
     def forward(self, features: Features, theta: Tensor) -> Tensor:
         """Style part of the reward.
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 from recipe_config import compose_config, config_groups
 
+from coachable.envs.racing.families import racing_family
 from coachable.training.checkpoint import find_checkpoint, read_state
 from coachable.training.loop import REPLAY_KEYS
 
@@ -52,6 +53,16 @@ def test_every_replay_buffer_trains(recipe, replay, tmp_path):
     sample = train.replay.sample(8)
     assert set(REPLAY_KEYS) - {("next", "style_features")} <= set(sample.keys(True))
     assert train.replay.names[:1] == ("default",) and (len(train.replay.names) > 1) == (replay == "event_tables")
+
+
+def test_returns_over_several_steps_are_relabelled_by_the_sum_of_their_features(tmp_path):
+    train = _train("racing_qr_sac", tmp_path, "n_steps=3", "impersonation.n=2", "family=resources")
+    sample = train.replay.sample(16)
+    assert sample.shape == (16, 3) and (sample["steps_to_next_obs"] == 3).any()
+    following = sample["next"]
+    style_reward = racing_family("resources").make_reward(racing_family("resources").make_space())
+    expected = following["task_reward"] + style_reward(following["style_features"], sample["style"])
+    torch.testing.assert_close(following["reward"], expected, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("group", ["sampler", "collector", "network", "preset"])

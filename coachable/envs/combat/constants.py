@@ -44,7 +44,7 @@ HEAVY_HIT = 60.0  # [HP], a harder hit staggers
 STAGGER_TIME, CHARGE_STAGGER_TIME, HEAVY_SAFE, LIGHT_SAFE = 0.45, 0.9, 0.7, 0.25  # [s]
 
 # -- traps and hazards ---------------------------------------------------------------------------------------------
-TRAP_SLOTS, TRAP_AHEAD, TRAP_ROOT, TRAP_ARM = 4, 1.2, 0.8, 1.0  # [1], [m], [s], [s]
+TRAP_SLOTS, TRAP_AHEAD, TRAP_ROOT, TRAP_ARM = 4, 1.2, 2.0, 1.0  # [1], [m], [s], [s]
 TRAP_TRIGGER, TRAP_BLAST, TRAP_SELF_DAMAGE = 1.6, 2.5, 60.0  # [m] beyond the body, [m], [HP] to the player
 CLOSENESS_SCALE = 8.0  # [m]
 HAZARD_SLOTS, HAZARD_RADIUS, HAZARD_TIME, HAZARD_DPS = 2, 3.0, 4.0, 10.0  # [1], [m], [s], [HP/s]
