@@ -154,5 +154,5 @@ def check_relabelling(config: dict[str, Any], style_reward: StyleReward) -> None
     if n and config["n_steps"] > 1 and not style_reward.is_linear:
         raise ValueError(
             f"impersonation.n={n} with n_steps={config['n_steps']}: the style reward of {config['domain']} is not "
-            "linear in its features, so those of several steps cannot be summed; expected n_steps=1 or impersonation.n=0"
+            "linear in its features, which cannot be summed over steps; expected n_steps=1 or impersonation.n=0"
         )
