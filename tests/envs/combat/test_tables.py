@@ -114,7 +114,7 @@ def test_style_ranges_are_the_papers():
     torch.testing.assert_close(space.high, torch.tensor(high))
     torch.testing.assert_close(space.low, torch.tensor(low))
     sim = combat_style_space()
-    sim_high = [1.1, 0.15, 0.6, 0.7, 1.0, 1.6, 2.1, 0.3, 1, 1, 1, 3, 3, 3, 3, 3, 4.5, 4.5]
+    sim_high = [1.1, 0.15, 0.6, 0.7, 1.0, 1.6, 2.1, 0.3, 1, 1, 1, 0.6, 0.6, 0.6, 0.6, 0.6, 0.9, 0.9]
     torch.testing.assert_close(sim.high, torch.tensor(sim_high))
     ratio = torch.tensor([-1.0 if name == "skykiller" else -0.05 for name in STYLES])
     torch.testing.assert_close(sim.low, ratio * sim.high)
