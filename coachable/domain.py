@@ -90,7 +90,6 @@ class Domain:
             which cars); None where trainings do not differ.
         evaluation: what `coachable evaluate` does instead of running the grid and switched styles: `(domain, policy,
             folder, settings) -> report`, with the loaded policy and `coachable.evaluation.settings`.
-        evaluation_reads_sweeps: whether it also takes `sweeps`, which a report has made already (`sweep_weights`).
     """
 
     name: str
@@ -106,7 +105,6 @@ class Domain:
     observation_groups: Sequence[tuple[str, int]] = ()
     as_trained: Callable[[Mapping[str, Any]], Domain] | None = None
     evaluation: Callable[..., str] | None = None
-    evaluation_reads_sweeps: bool = False
 
     def cells(self) -> list[dict[str, Any]]:
         """The styles of the evaluation grid, by parameter name."""

@@ -57,8 +57,6 @@ def evaluate_fights(
     agent: LoadedPolicy,
     out: Path,
     settings: EvaluationSettings,
-    *,
-    sweeps: Sequence[WeightSweep] | None = None,
 ) -> str:
     """Fight every machine in every style and write tables, figures and a report.
 
@@ -74,7 +72,6 @@ def evaluate_fights(
         settings: `episodes` fights per style and machine, at sites drawn at random, of at most `steps`, and
             `switch_episodes` sequences of fights with a style that switches, each as long; none for an agent with fewer
             than two styles of damage.
-        sweeps: of `sweep_weights`, where they exist already.
 
     Returns:
         The report, Markdown.
@@ -99,6 +96,8 @@ def evaluate_fights(
             strict=True,
         )
     ]
+    sweeps = settings.sweeps
+    sweeps = settings.sweeps
     if sweeps is None:
         sweeps = sweep_weights(domain, agent.actor, agent.space, points=7, **options)
     sweep = _sweep_rows(sweeps)

@@ -116,9 +116,8 @@ def write_report(
     _switches(page, domain, runs, switch_episodes, formats, out)
     _tradeoffs(page, styles, runs, formats, out)
     if domain.evaluation is not None:
-        settings = EvaluationSettings(episodes, switch_episodes, steps, seed, num_threads, progress)
-        sweeps = {"sweeps": runs[0].sweeps} if domain.evaluation_reads_sweeps else {}
-        _own(page, domain, agent, out, settings, **sweeps)
+        settings = EvaluationSettings(episodes, switch_episodes, steps, seed, num_threads, progress, runs[0].sweeps)
+        _own(page, domain, agent, out, settings)
     command = [f"coachable report {' '.join(agents)} --seed {seed} --episodes {episodes}"]
     command += [f"--switch-episodes {switch_episodes} --sweep-points {sweep_points}"]
     command += [f"--seeds {seeds}"] if len(agents) == 1 else []
@@ -242,13 +241,11 @@ def _tradeoffs(page: Page, styles: StyleTable, runs: Sequence[Run], formats: Map
     )
 
 
-def _own(
-    page: Page, domain: Domain, agent: LoadedPolicy, out: Path, settings: EvaluationSettings, **sweeps: Any
-) -> None:
+def _own(page: Page, domain: Domain, agent: LoadedPolicy, out: Path, settings: EvaluationSettings) -> None:
     """What a domain measures in its own way, of the first agent: each table that it writes, with its figure."""
     assert domain.evaluation is not None
     folder = out / domain.name
-    domain.evaluation(domain, agent, folder, settings, **sweeps)
+    domain.evaluation(domain, agent, folder, settings)
     for file in sorted(folder.glob("*.csv")):
         with file.open(newline="", encoding="utf-8") as lines:
             rows = [{name: _number(value) for name, value in row.items()} for row in csv.DictReader(lines)]

@@ -1,6 +1,13 @@
 """What an evaluation was asked for."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from coachable.evaluation.sweep import WeightSweep
 
 
 @dataclass(frozen=True)
@@ -14,6 +21,7 @@ class EvaluationSettings:
         seed: of initial states, styles and sampled actions. The same seed gives the same files.
         num_threads: physics threads, where the simulator has its own.
         progress: show progress bars.
+        sweeps: episodes along each weight, where a report has made them already (`sweep_weights`); else None.
 
     Raises:
         ValueError: if `episodes` is below 1.
@@ -25,6 +33,7 @@ class EvaluationSettings:
     seed: int = 0
     num_threads: int | None = None
     progress: bool = True
+    sweeps: Sequence[WeightSweep] | None = None
 
     def __post_init__(self) -> None:
         """Refuses what cannot be evaluated."""

@@ -128,8 +128,8 @@ def test_the_evaluation_has_the_switches(domain, tmp_path):
         WeightSweep(name, np.array([0.0, 1.0]), {key: np.ones((2, 1)) for key in (name, "damage", "won")})
         for name in STYLES
     ]
-    settings = EvaluationSettings(episodes=1, switch_episodes=2, steps=20, progress=False)
-    report = evaluate_fights(domain, agent, tmp_path, settings, sweeps=sweeps)
+    settings = EvaluationSettings(episodes=1, switch_episodes=2, steps=20, progress=False, sweeps=sweeps)
+    report = evaluate_fights(domain, agent, tmp_path, settings)
     assert "## Style switched every 2 s" in report and "| skykiller |" in report
     rows = {name: (tmp_path / f"{name}.csv").read_text().splitlines() for name in ("sweep", "timeline")}
     assert len(rows["sweep"]) == 1 + 6  # those given, not its own

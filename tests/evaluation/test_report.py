@@ -184,16 +184,16 @@ def test_the_page_is_one_file(folder):
 
 
 def test_what_a_domain_measures_itself_is_on_the_page(tmp_path):
-    def evaluation(domain, agent, out, settings, *, sweeps):
-        assert settings == EvaluationSettings(episodes=2, switch_episodes=4, progress=False)
-        assert [sweep.weight for sweep in sweeps] == ["bold"]
+    def evaluation(domain, agent, out, settings):
+        assert replace(settings, sweeps=None) == EvaluationSettings(episodes=2, switch_episodes=4, progress=False)
+        assert [sweep.weight for sweep in settings.sweeps] == ["bold"]
         out.mkdir()
         (out / "every_step.csv").write_text("step\n" + "1\n" * 101)
         (out / "wins.csv").write_text("style,easy_machine\nred,0.5\n")
         (out / "wins.png").write_bytes((tmp_path / "styles.png").read_bytes())
         return "not used"
 
-    domain = replace(DOMAIN, evaluation=evaluation, evaluation_reads_sweeps=True)
+    domain = replace(DOMAIN, evaluation=evaluation)
     write_report(domain, {"toy.pt": AGENT}, tmp_path, **SMALL)
     page = (tmp_path / "report.html").read_text()
     assert "101 rows: toy/every_step.csv" in page

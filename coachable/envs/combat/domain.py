@@ -52,6 +52,5 @@ DOMAIN = Domain(
     columns={"won": ".0%", "damage": ".0f", "style_score": ".2f"},
     observation_groups=observation_groups("full"),
     as_trained=_as_trained,
-    evaluation_reads_sweeps=True,
     evaluation=deferred("coachable.evaluation.fights.evaluate_fights"),
 )
