@@ -130,7 +130,7 @@ _COACHING = {
             "spear fighter": {"melee": 1.1},
             "archer": {"sunscourge": 1.6, "carjas_bane": 1.0},
             "trapper": {"traps": 0.15},
-            "arsonist": {"fire": 4.5},
+            "arsonist": {"fire": 0.9},
             "scavenger": {"part_weapon": 1.0, "part_canister": 1.0, "part_shield": 1.0},
         },
         terminated="ended the fight",

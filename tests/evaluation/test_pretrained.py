@@ -1,4 +1,4 @@
-"""Shipped weights fit the domains that they are named after."""
+"""Shipped weights fit the domains that they are named after, with the preset where there are several."""
 
 from pathlib import Path
 
@@ -16,8 +16,8 @@ SHIPPED = sorted(file.parent.name for file in Path(coachable.pretrained.__path__
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_weights_act_in_their_domain(name):
     agent = load_policy(name)
-    domain = load_domain(name, agent.config)
-    assert agent.metadata["domain"] == name
+    assert name in (agent.metadata["domain"], f"{agent.metadata['domain']}_{agent.config['preset']}")
+    domain = load_domain(agent.metadata["domain"], agent.config)
     space = domain.make_space()
     assert agent.space.with_sampler(space.sampler) == space  # it may have been trained on styles drawn otherwise
     env = domain.make_env(num_envs=2, num_threads=1)
