@@ -28,8 +28,8 @@ def test_words_and_presets_fit_the_styles(domain):
 @pytest.mark.parametrize(
     ("domain", "phrase", "changes"),
     [
-        ("combat", "freeze it", {"frost": 3.0}),
-        ("combat", "burn it, but no plasma", {"fire": 4.5, "plasma": -0.15}),
+        ("combat", "freeze it", {"frost": 0.6}),
+        ("combat", "burn it, but no plasma", {"fire": 0.9, "plasma": -0.03}),
         ("combat", "break its weapon", {"part_weapon": 1.0}),
         ("racing_drift", "go sideways", {"slip_angle_rear": 5.0}),
         ("racing_drift", "no drifting", {"slip_angle_rear": -0.4}),
