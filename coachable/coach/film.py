@@ -9,7 +9,7 @@ import numpy as np
 
 from coachable.coach.recording import Recording
 from coachable.coach.session import CoachSession
-from coachable.evaluation.video import caption, write_video
+from coachable.evaluation.video import CAPTION, caption, write_video
 
 
 def film(
@@ -59,7 +59,7 @@ def _frames(
     on_progress: Callable[[float], None],
 ) -> Iterator[np.ndarray]:
     first = 0 if last is None else recording.steps - round(last / session.domain.control_step)
-    renderer = session.domain.make_renderer(*size)
+    renderer = session.domain.make_renderer(size[0], size[1] - CAPTION)
     session.replay(recording)
     try:
         for step in range(recording.steps):

@@ -24,6 +24,7 @@ from coachable.transforms import coachable_env
 
 VIDEO_SUFFIXES = (".mp4", ".gif", ".png")
 _GIF_FPS = 20
+CAPTION = 44  # [px]
 
 
 def render(
@@ -121,7 +122,7 @@ def _film(
 ) -> Iterator[np.ndarray]:
     """Frames of each request's `period` steps, of every `every`-th step."""
     env = coachable_env(domain.make_env(num_envs=1, num_threads=1), space, domain.make_reward(space), seed=seed)
-    renderer = domain.make_renderer(*size)
+    renderer = domain.make_renderer(size[0], size[1] - CAPTION)
     chance = RandomStream(seed)
     env.set_seed(seed)
     thetas = [space.make(**request) for request in requests]
@@ -160,15 +161,13 @@ def _caption_lines(
 
 
 def caption(frame: np.ndarray, lines: tuple[str, str]) -> np.ndarray:
-    """Writes two lines, the first one larger, over the bottom of a frame (height, width, 3) uint8."""
-    image = Image.fromarray(frame)
+    """Writes two lines, the first one larger, below a frame (height, width, 3) uint8; it is `CAPTION` higher then."""
+    image = Image.new("RGB", (frame.shape[1], CAPTION), (20, 20, 30))
     draw = ImageDraw.Draw(image)
-    width, height = image.size
-    draw.rectangle((0, height - 44, width, height), fill=(20, 20, 30))
     large, small = ImageFont.load_default(16), ImageFont.load_default(12)
-    draw.text((8, height - 42), lines[0], font=large, fill=(255, 220, 120))
-    draw.text((8, height - 20), lines[1], font=small, fill=(220, 220, 220))
-    return np.asarray(image)
+    draw.text((8, 2), lines[0], font=large, fill=(255, 220, 120))
+    draw.text((8, 24), lines[1], font=small, fill=(220, 220, 220))
+    return np.concatenate([frame, np.asarray(image)])
 
 
 def _write_sheet(frames: Sequence[np.ndarray], out: Path, columns: int = 3) -> None:
