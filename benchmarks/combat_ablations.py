@@ -141,6 +141,13 @@ def last(run: Path, metric: str) -> float:
     return float(read_metric(run, "frames", metric)[1][-1])
 
 
+def pace(run: Path) -> float:
+    """Median time of an update [ms]: the machine may have been busy with something else, or suspended, in between."""
+    updates, seconds = read_metric(run, "updates", "seconds/update")
+    done = np.diff(updates)
+    return 1e3 * float(np.median(np.diff(seconds)[done > 0] / done[done > 0]))
+
+
 def final_rows(runs: Mapping[str, Sequence[Path]]) -> list[dict[str, Any]]:
     """Per variant: means and 95 % bootstrap intervals over seeds of the last evaluation, and what updates took."""
     rows = []
@@ -153,7 +160,7 @@ def final_rows(runs: Mapping[str, Sequence[Path]]) -> list[dict[str, Any]]:
             row[f"{name}_by_seed"] = " ".join(f"{value:.3f}" for value in values)
         row["frames"] = int(np.mean([last(folder, "frames") for folder in folders]))
         row["updates"] = int(np.mean([last(folder, "updates") for folder in folders]))
-        row["update_minutes"] = float(np.mean([last(folder, "seconds/update") for folder in folders])) / 60
+        row["update_ms"] = float(np.mean([pace(folder) for folder in folders]))
         rows.append(row)
     return rows
 
