@@ -97,7 +97,6 @@ def evaluate_fights(
         )
     ]
     sweeps = settings.sweeps
-    sweeps = settings.sweeps
     if sweeps is None:
         sweeps = sweep_weights(domain, agent.actor, agent.space, points=7, **options)
     sweep = _sweep_rows(sweeps)
