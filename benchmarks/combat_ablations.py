@@ -43,7 +43,7 @@ VARIANTS: dict[str, list[str]] = {
     "samples_1": ["entropy_samples=1"],
     "samples_1000": ["entropy_samples=1000"],
     "impersonation_0": ["impersonation.n=0"],
-    "impersonation_4": ["impersonation.n=4"],
+    "impersonation_2": ["impersonation.n=2"],
     "uniform": ["replay=uniform"],
     "one_hot": ["sampler=one_hot"],
     "independent": ["sampler=independent"],
@@ -53,14 +53,14 @@ LABELS = {
     "samples_1": "1 entropy sample",
     "samples_1000": "1000 entropy samples",
     "impersonation_0": "no impersonation",
-    "impersonation_4": "4 further styles",
+    "impersonation_2": "2 further styles",
     "uniform": "uniform replay",
     "one_hot": "styles one-hot",
     "independent": "styles independent",
 }
 PANELS = {
     "loss and its entropy samples": ("sac", "samples_1", "samples_1000"),
-    "impersonation and replay": ("impersonation_0", "impersonation_4", "uniform"),
+    "impersonation and replay": ("impersonation_0", "impersonation_2", "uniform"),
     "training styles": ("one_hot", "independent"),
 }
 METRICS = {"eval/style_score": "style score", "eval/won": "fights won"}
