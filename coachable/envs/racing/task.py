@@ -31,6 +31,8 @@ class TaskWeights:
         rear_end: of contact with a car ahead, times the squared relative speed.
         stranded: once, when a car that stands, goes backwards or is outside the walls ends its episode (our choice:
             without it drivers learn to park beside the track for good, as that costs nothing).
+        tyre_wear: per mean wear (our choice: 0 but in the tyre and fuel family). Heat takes a minute to go, so what a
+            slide costs later is beyond the discount; wear grows with the same slip power, at once.
     """
 
     progress: float = 1.0
@@ -41,6 +43,7 @@ class TaskWeights:
     contact: float = 4.0
     rear_end: float = 0.1
     stranded: float = 100.0
+    tyre_wear: float = 0.0
 
 
 class Outcome(NamedTuple):

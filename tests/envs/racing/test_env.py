@@ -23,7 +23,8 @@ from coachable.envs.racing.referee import TELEMETRY
 from coachable.envs.racing.run import Others
 from coachable.envs.racing.scenarios import Conditions, Scenario, drift_scenarios, rolling_start
 from coachable.envs.racing.state import ROW, WEARS
-from coachable.envs.racing.task import metres_gained
+from coachable.envs.racing.styles import TIRE
+from coachable.envs.racing.task import TaskWeights, metres_gained
 from coachable.transforms import coachable_env
 
 T = {name: column for column, name in enumerate(TELEMETRY)}
@@ -151,6 +152,15 @@ def test_off_course_costs_the_squared_speed():
     slip = -after["task_reward"].item() - 0.01 * 0.1 * kmh.item() ** 2
     assert after["telemetry"][0, T["off"]] == 1
     assert -1e-3 < slip < 0.05
+
+
+def test_a_price_of_wear_is_taken_off_the_task_reward():
+    settings = {"track": "ring", "resources": Resources(9.0, 3.0), "seed": 0}
+    free, priced = (RacingEnv(8, **settings, weights=TaskWeights(tyre_wear=w)) for w in (0.0, 1500.0))
+    for without, charged in zip(roll(free, actions(8, 5)), roll(priced, actions(8, 5)), strict=True):
+        worn = -without["style_features"][:, TIRE]
+        assert (worn > 0).all()
+        torch.testing.assert_close(without["task_reward"][:, 0] - charged["task_reward"][:, 0], 1500.0 * worn)
 
 
 def test_metres_gained_count_within_the_window():
