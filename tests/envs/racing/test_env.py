@@ -163,6 +163,20 @@ def test_a_price_of_wear_is_taken_off_the_task_reward():
         torch.testing.assert_close(without["task_reward"][:, 0] - charged["task_reward"][:, 0], 1500.0 * worn)
 
 
+def test_half_a_metre_between_cars_side_by_side_is_seen():
+    """Margins of at most a metre are asked for: in a plain scale to 150 m nobody would learn them."""
+    env = RacingEnv(2, cars=2, track="oval", scenarios=(Scenario("f", 1.0, "field", 2),), seed=0)
+    env.reset()
+    sides = []
+    for offset in (-1.5, -1.0):
+        place = torch.tensor([200.0, 200.0]), torch.tensor([1.0, offset])
+        for name, value in zip(("x", "y", "yaw"), env.course.place(*place), strict=True):
+            env.state[ROW[name]] = value
+        seen = env.referee.observe(env.state, env.run, env.compound, env.garage.car, env.simulation.wheels, env.group)
+        sides.append(seen[0, -32])  # of the first opponent, sideways
+    assert 0.03 < (sides[0] - sides[1]).abs() < 0.1
+
+
 def test_metres_gained_count_within_the_window():
     """Ahead 40 m, behind 20 m, before or after; who is ahead is decided before."""
     before = torch.tensor([41.0, 39.0, -5.0, -19.0, -30.0, 2.0, 100.0])
