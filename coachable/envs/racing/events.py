@@ -9,7 +9,7 @@ from torch import Tensor
 
 from coachable.envs.racing.families import check_family
 from coachable.envs.racing.observation import observation_groups
-from coachable.envs.racing.styles import DRIFT_NAMES, GAPS, RESOURCE_NAMES, RESOURCES
+from coachable.envs.racing.styles import DRIFT_NAMES, GAPS, OVERTAKE
 from coachable.keys import STYLE_FEATURES
 from coachable.replay import PredicateEvents
 
@@ -61,7 +61,7 @@ def _slide(steps: TensorDictBase) -> Tensor:
 
 
 def _overtake(steps: TensorDictBase) -> Tensor:
-    gained = steps["next", STYLE_FEATURES][..., RESOURCES.start + RESOURCE_NAMES.index("overtake")]
+    gained = steps["next", STYLE_FEATURES][..., OVERTAKE]
     near = steps["next", STYLE_FEATURES][..., GAPS + 2 :: 3].any(-1)
     return (gained > 0.0) & near
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from coachable.envs.racing.families import check_family
 from coachable.envs.racing.referee import TELEMETRY
 from coachable.envs.racing.simulation import CONTROL_STEP
-from coachable.envs.racing.styles import GAP_COLUMNS, GAPS, RESOURCES
+from coachable.envs.racing.styles import FUEL, GAP_COLUMNS, GAPS, TIRE
 from coachable.keys import STYLE, STYLE_FEATURES
 
 DRIFT_ANGLE_DEG = 20.0  # that counts as a drift
@@ -51,8 +51,8 @@ class RacingMeasures:
             "wall": told("wall"),
             "slip_angle_front": features[:, 0] * degrees,
             "slip_angle_rear": features[:, 1] * degrees,
-            "wear": -features[:, RESOURCES][:, 2],
-            "fuel": -features[:, RESOURCES][:, 3],
+            "wear": -features[:, TIRE],
+            "fuel": -features[:, FUEL],
             "place": told("place"),
         }
         if self.family == "drift":

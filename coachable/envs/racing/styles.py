@@ -29,7 +29,7 @@ DRIFT_NAMES = ("slip_angle_front", "slip_angle_rear", "slip_ratio_front", "slip_
 RESOURCE_NAMES = ("overtake", "defend", "tire", "fuel")
 DRIFT = slice(0, 4)
 RESOURCES = slice(4, 8)
-TIRE = RESOURCES.start + RESOURCE_NAMES.index("tire")  # minus the mean wear
+OVERTAKE, DEFEND, TIRE, FUEL = range(RESOURCES.start, RESOURCES.stop)
 GAPS = 8
 GAP_COLUMNS = ("longitudinal", "lateral", "near")
 

@@ -164,7 +164,7 @@ def test_a_price_of_wear_is_taken_off_the_task_reward():
 
 
 def test_half_a_metre_between_cars_side_by_side_is_seen():
-    """Margins of at most a metre are asked for: in a plain scale to 150 m nobody would learn them."""
+    """Margins of at most a metre are asked for: on a plain scale to 50 m nobody would learn them."""
     env = RacingEnv(2, cars=2, track="oval", scenarios=(Scenario("f", 1.0, "field", 2),), seed=0)
     env.reset()
     sides = []
