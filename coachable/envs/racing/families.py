@@ -24,7 +24,7 @@ from coachable.envs.racing.task import TaskWeights
 from coachable.styles import StyleReward, StyleSpace
 
 RIVALS_GRIP = 0.97  # of the fastest scripted opponents; the slowest use 0.8
-TYRE_WEAR = 1500.0  # what a set of tyres is worth [m] to drivers that are not asked to save any
+TYRE_HEAT = 900.0  # [m] that all grip is worth for the minute that heat takes to go
 AGENTS, CARS = 3, 5  # in a race of the aggressiveness family
 
 
@@ -46,7 +46,7 @@ def resource_env(num_envs: int = 64, **options: Any) -> RacingEnv:
         "car": "x2019",
         "conditions": Conditions.resources(),
         "resources": Resources.calibrated("gt3" if options.get("car") == "gt3" else "x2019"),
-        "weights": TaskWeights(tyre_wear=TYRE_WEAR),
+        "weights": TaskWeights(tyre_heat=TYRE_HEAT),
     }
     return RacingEnv(num_envs, **(defaults | options))
 

@@ -29,11 +29,11 @@ from coachable.envs.racing.run import (
     wrap,
 )
 from coachable.envs.racing.simulation import CONTROL_STEP, bodies_of
-from coachable.envs.racing.state import ROW, WEARS, CarInputs, CarState
-from coachable.envs.racing.styles import TIRE
+from coachable.envs.racing.state import HEATS, ROW, WEARS, CarInputs, CarState
 from coachable.envs.racing.surface import beyond
 from coachable.envs.racing.task import Outcome, TaskWeights, contacts, metres_gained, style_features, task_reward
 from coachable.envs.racing.track import Course
+from coachable.envs.racing.tyres import heat_loss
 
 WRONG_WAY_TIME = 3.0  # [s]
 STOPPED_TIME = 3.0  # [s]
@@ -182,7 +182,7 @@ class Referee:
         tyres = tyre_view(car, wheels, new, compound[0])
         reward = task_reward(self.weights, s, run, tyres, outcome)
         features = style_features(old, new, tyres, outcome, bodies, group)
-        reward = reward + self.weights.tyre_wear * features[:, TIRE]
+        reward = reward - self.weights.tyre_heat * (heat_loss(new[HEATS]) - heat_loss(old[HEATS])).mean(0)
         lost = beyond(arc.offset, run.left, run.right) > run.margin + _BEHIND_WALL
         stranded = (run.wrong_time > self.wrong_way_time) | (run.stopped_time > STOPPED_TIME) | lost
         reward = reward - self.weights.stranded * stranded.to(reward.dtype)

@@ -31,8 +31,9 @@ class TaskWeights:
         rear_end: of contact with a car ahead, times the squared relative speed.
         stranded: once, when a car that stands, goes backwards or is outside the walls ends its episode (our choice:
             without it drivers learn to park beside the track for good, as that costs nothing).
-        tyre_wear: per mean wear (our choice: 0 but in the tyre and fuel family). Heat takes a minute to go, so what a
-            slide costs later is beyond the discount; wear grows with the same slip power, at once.
+        tyre_heat: per mean share of grip that tyres lose by being too hot, charged as they heat up and paid back as they
+            cool down (our choice: 0 but in the tyre and fuel family). Undiscounted it would change nothing; but heat
+            takes a minute to go, and what a slide costs by then is beyond the discount.
     """
 
     progress: float = 1.0
@@ -43,7 +44,7 @@ class TaskWeights:
     contact: float = 4.0
     rear_end: float = 0.1
     stranded: float = 100.0
-    tyre_wear: float = 0.0
+    tyre_heat: float = 0.0
 
 
 class Outcome(NamedTuple):

@@ -112,6 +112,12 @@ def heat_factor(heat: Tensor) -> Tensor:
     return torch.clamp(1.0 - 0.2 * off * off, min=0.8)
 
 
+def heat_loss(heat: Tensor) -> Tensor:
+    """Share of its grip that a tyre loses by being hotter than 90 °C, without the bound of `heat_factor`."""
+    over = torch.clamp(heat - BEST_HEAT, min=0.0) / 60.0
+    return 0.2 * over * over
+
+
 def wear_factor(wear: Tensor) -> Tensor:
     """Grip of a worn tyre, relative to a new one; falls faster beyond 75 %."""
     return 1.0 - 0.10 * wear - 0.5 * torch.clamp(wear - 0.75, min=0.0)

@@ -22,8 +22,7 @@ from coachable.envs.racing.parameters import Resources
 from coachable.envs.racing.referee import TELEMETRY
 from coachable.envs.racing.run import Others
 from coachable.envs.racing.scenarios import Conditions, Scenario, drift_scenarios, rolling_start
-from coachable.envs.racing.state import ROW, WEARS
-from coachable.envs.racing.styles import TIRE
+from coachable.envs.racing.state import HEATS, ROW, WEARS
 from coachable.envs.racing.task import TaskWeights, metres_gained
 from coachable.transforms import coachable_env
 
@@ -154,13 +153,29 @@ def test_off_course_costs_the_squared_speed():
     assert -1e-3 < slip < 0.05
 
 
-def test_a_price_of_wear_is_taken_off_the_task_reward():
-    settings = {"track": "ring", "resources": Resources(9.0, 3.0), "seed": 0}
-    free, priced = (RacingEnv(8, **settings, weights=TaskWeights(tyre_wear=w)) for w in (0.0, 1500.0))
-    for without, charged in zip(roll(free, actions(8, 5)), roll(priced, actions(8, 5)), strict=True):
-        worn = -without["style_features"][:, TIRE]
-        assert (worn > 0).all()
-        torch.testing.assert_close(without["task_reward"][:, 0] - charged["task_reward"][:, 0], 1500.0 * worn)
+def test_overheating_is_charged_and_cooling_paid_back():
+    conditions = Conditions(heat=130.0)
+    free, priced = (
+        RacingEnv(8, track="ring", conditions=conditions, seed=0, weights=TaskWeights(tyre_heat=w))
+        for w in (0.0, 900.0)
+    )
+
+    def lost(env: RacingEnv) -> torch.Tensor:
+        """Mean over tyres of 0.2 ((T - 90) / 60)²."""
+        return 0.2 * ((env.state[HEATS].clamp(min=90.0) - 90.0) / 60.0).square().mean(0)
+
+    for env in (free, priced):
+        env.reset()
+    signs = set()
+    for action in (torch.tensor([[0.0, 0.0]]), torch.tensor([[1.0, 1.0]])):  # coasts, spins
+        for _ in range(10):
+            before = lost(priced)
+            without, charged = (env.step(TensorDict({"action": action.expand(8, 2)}, [8])) for env in (free, priced))
+            due = 900.0 * (lost(priced) - before)
+            signs.update(due.sign().tolist())
+            difference = (without["next", "task_reward"] - charged["next", "task_reward"])[:, 0]
+            torch.testing.assert_close(difference, due, atol=1e-3, rtol=1e-3)
+    assert signs == {-1.0, 1.0}
 
 
 def test_half_a_metre_between_cars_side_by_side_is_seen():
