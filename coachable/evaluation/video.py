@@ -127,7 +127,7 @@ def _film(
     env.set_seed(seed)
     thetas = [space.make(**request) for request in requests]
     current = env.reset(TensorDict({STYLE: thetas[0][None]}, [1]))
-    falls = 0
+    failures = 0
     try:
         for request, theta in zip(requests, thetas, strict=True):
             recent: list[dict[str, Tensor]] = []
@@ -137,10 +137,10 @@ def _film(
                 transition = env.step(action)
                 recent.append(domain.measures.step(transition))
                 if step % every == 0:
-                    yield caption(renderer.draw(env), _caption_lines(domain, request, recent, falls))
+                    yield caption(renderer.draw(env), _caption_lines(domain, request, recent, failures))
                 current = step_mdp(transition)
                 if transition["next", "done"].any():
-                    falls += int(transition["next", "terminated"].sum())
+                    failures += int(transition["next", "terminated"].sum())
                     current = env.reset(TensorDict({STYLE: theta[None]}, [1]))
     finally:
         renderer.close()
@@ -148,7 +148,7 @@ def _film(
 
 
 def _caption_lines(
-    domain: Domain, request: dict[str, Any], recent: list[dict[str, Tensor]], falls: int
+    domain: Domain, request: dict[str, Any], recent: list[dict[str, Tensor]], failures: int
 ) -> tuple[str, str]:
     window = recent[-round(2.0 / domain.control_step) :]
     record = {name: torch.stack([row[name] for row in window]) for name in window[0]}
@@ -157,7 +157,7 @@ def _caption_lines(
     wanted = [name.removeprefix("measured_") for name in domain.columns]
     published = {name: value for name, value in measured.items() if name in wanted} or measured
     shown = ", ".join(f"{k} {v.item():.2f}" for k, v in published.items() if not bool(v.isnan().any()))
-    return f"asked: {asked}".replace("_", " "), f"last 2 s: {shown}; falls {falls}".replace("_", " ")
+    return f"asked: {asked}".replace("_", " "), f"last 2 s: {shown}; failures {failures}".replace("_", " ")
 
 
 def caption(frame: np.ndarray, lines: tuple[str, str]) -> np.ndarray:
