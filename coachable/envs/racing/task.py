@@ -31,6 +31,9 @@ class TaskWeights:
         rear_end: of contact with a car ahead, times the squared relative speed.
         stranded: once, when a car that stands, goes backwards or is outside the walls ends its episode (our choice:
             without it drivers learn to park beside the track for good, as that costs nothing).
+        steering_change: of the squared change of the steering command (our choice, after Lee et al. 2025). Wheels turn at a
+            limited rate, so that commands from lock to lock and back steer as well as steady ones: drivers that pay
+            nothing get stuck in that habit, which scrubs the tyres.
         tyre_heat: per mean share of grip that tyres lose by being too hot, charged as they heat up and paid back as they
             cool down (our choice: 0 but in the tyre and fuel family). Undiscounted it would change nothing; but heat
             takes a minute to go, and what a slide costs by then is beyond the discount.
@@ -44,6 +47,7 @@ class TaskWeights:
     contact: float = 4.0
     rear_end: float = 0.1
     stranded: float = 100.0
+    steering_change: float = 0.5
     tyre_heat: float = 0.0
 
 
@@ -97,6 +101,7 @@ def task_reward(weights: TaskWeights, state: CarState, run: Run, tyres: TyreView
     reward = reward - weights.off_course * state.off_time * squared
     reward = reward - weights.wall * state.wall_time * squared
     reward = reward - weights.tyre_slip * (slip[0] + slip[1] + slip[2] + slip[3])
+    reward = reward - weights.steering_change * (run.steer - run.steer_before) ** 2
     reward = reward + weights.passing * (outcome.overtake + outcome.defend)
     return reward - weights.contact * outcome.contact - weights.rear_end * outcome.rear_end
 
