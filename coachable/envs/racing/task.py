@@ -31,12 +31,12 @@ class TaskWeights:
         rear_end: of contact with a car ahead, times the squared relative speed.
         stranded: once, when a car that stands, goes backwards or is outside the walls ends its episode (our choice:
             without it drivers learn to park beside the track for good, as that costs nothing).
-        steering_change: of the squared change of the steering command (our choice, after Lee et al. 2025). Wheels turn at a
-            limited rate, so that commands from lock to lock and back steer as well as steady ones: drivers that pay
-            nothing get stuck in that habit, which scrubs the tyres.
-        tyre_heat: per mean share of grip that tyres lose by being too hot, charged as they heat up and paid back as they
-            cool down (our choice: 0 but in the tyre and fuel family). Undiscounted it would change nothing; but heat
-            takes a minute to go, and what a slide costs by then is beyond the discount.
+        steering_change: of the squared change of the steering command (our choice, after Lee et al. 2025). Wheels turn
+            at a limited rate, so that commands from lock to lock and back steer as well as steady ones: drivers that
+            pay nothing get stuck in that habit, which scrubs the tyres.
+        tyre_heat: per mean share of grip that tyres lose by being too hot, charged as they heat up and paid back as
+            they cool down (our choice: 0 but in the tyre and fuel family). Undiscounted it would change nothing; but
+            heat takes a minute to go, and what a slide costs by then is beyond the discount.
     """
 
     progress: float = 1.0
