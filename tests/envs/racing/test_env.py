@@ -178,6 +178,16 @@ def test_overheating_is_charged_and_cooling_paid_back():
     assert signs == {-1.0, 1.0}
 
 
+def test_changes_of_the_steering_command_cost():
+    free, priced = (RacingEnv(8, track="ring", seed=0, weights=TaskWeights(steering_change=w)) for w in (0.0, 0.5))
+    steered = actions(8, 5)
+    before = torch.zeros(8)  # of an episode that begins
+    for action, without, charged in zip(steered, roll(free, steered), roll(priced, steered), strict=True):
+        due = 0.5 * (action[:, 0] - before).square()
+        torch.testing.assert_close((without["task_reward"] - charged["task_reward"])[:, 0], due, atol=1e-4, rtol=1e-3)
+        before = action[:, 0]
+
+
 def test_half_a_metre_between_cars_side_by_side_is_seen():
     """Margins of at most a metre are asked for: on a plain scale to 50 m nobody would learn them."""
     env = RacingEnv(2, cars=2, track="oval", scenarios=(Scenario("f", 1.0, "field", 2),), seed=0)
