@@ -47,7 +47,7 @@ class TaskWeights:
     contact: float = 4.0
     rear_end: float = 0.1
     stranded: float = 100.0
-    steering_change: float = 0.5
+    steering_change: float = 2.0
     tyre_heat: float = 0.0
 
 
