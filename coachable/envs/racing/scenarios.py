@@ -58,11 +58,11 @@ def race_scenarios(cars: int) -> tuple[Scenario, ...]:
     if cars == 1:
         return (Scenario("solo", 0.8, "solo"), Scenario("recovery", 0.2, "recovery"))
     return (
-        Scenario("solo", 0.15, "solo"),
-        Scenario("one_to_one", 0.20, "field", 2),
-        Scenario("field", 0.20, "field", cars),
-        Scenario("rolling", 0.20, "rolling", cars),
-        Scenario("slipstream", 0.15, "slipstream", cars),
+        Scenario("solo", 0.30, "solo"),
+        Scenario("one_to_one", 0.15, "field", 2),
+        Scenario("field", 0.25, "field", cars),
+        Scenario("rolling", 0.10, "rolling", cars),
+        Scenario("slipstream", 0.10, "slipstream", cars),
         Scenario("recovery", 0.10, "recovery"),
     )
 

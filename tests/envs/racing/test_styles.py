@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from coachable.envs.racing.styles import (
-    MARGIN_WEIGHT,
     aggressiveness_style_reward,
     aggressiveness_style_space,
     drift_style_reward,
@@ -89,10 +88,9 @@ def test_margin_reward_by_hand():
     space = aggressiveness_style_space()
     features = torch.tensor([[0.0] * 8 + [3.0, 2.0, 1.0, 0.5, 0.25, 1.0, 0.0, 0.0, 0.0]])
     theta = torch.tensor([[2.0, 1.0]])
-    assert aggressiveness_style_reward(space, weight=1.0)(features, theta).item() == pytest.approx(-2.25)
+    assert aggressiveness_style_reward(space)(features, theta).item() == pytest.approx(-2.25)
     ahead = torch.tensor([[0.0] * 8 + [1.0, 0.0, 1.0]])
-    assert aggressiveness_style_reward(space)(features, theta).item() == pytest.approx(-2.25 * MARGIN_WEIGHT)
-    assert aggressiveness_style_reward(space, weight=1.0)(ahead, theta).item() == pytest.approx(-2.0)
-    assert aggressiveness_style_reward(space, weight=1.0, gate="overlap")(ahead, theta).item() == pytest.approx(-1.0)
+    assert aggressiveness_style_reward(space)(ahead, theta).item() == pytest.approx(-2.0)
+    assert aggressiveness_style_reward(space, gate="overlap")(ahead, theta).item() == pytest.approx(-1.0)
     with pytest.raises(ValueError, match="expected 'radius' or 'overlap'"):
         aggressiveness_style_reward(space, gate="distance")
