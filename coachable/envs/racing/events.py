@@ -8,7 +8,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from coachable.envs.racing.families import check_family
-from coachable.envs.racing.observation import observation_groups
+from coachable.envs.racing.observation import own_columns
 from coachable.envs.racing.styles import DRIFT_NAMES, GAPS, OVERTAKE
 from coachable.keys import STYLE_FEATURES
 from coachable.replay import PredicateEvents
@@ -40,12 +40,7 @@ def racing_events(family: str = "resources") -> PredicateEvents:
 
 def _flags(steps: TensorDictBase) -> Tensor:
     """Off course, wall, contact, (N, 3)."""
-    before = 0
-    for name, width in observation_groups(1, pool=False):
-        if name == "flags":
-            return steps["next", "observation"][..., before : before + width]
-        before += width
-    raise RuntimeError("the observation has no flags")
+    return steps["next", "observation"][..., own_columns("flags")]
 
 
 def _off_course(steps: TensorDictBase) -> Tensor:

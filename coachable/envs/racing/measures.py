@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from coachable.envs.racing.families import check_family
+from coachable.envs.racing.observation import own_columns
 from coachable.envs.racing.referee import TELEMETRY
 from coachable.envs.racing.simulation import CONTROL_STEP
 from coachable.envs.racing.styles import FUEL, GAP_COLUMNS, GAPS, TIRE
@@ -35,7 +36,11 @@ class RacingMeasures:
         self.family = family
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
-        """See `StyleMeasures.step`. Angles in degrees, wear and fuel per kilometre, gaps in metres."""
+        """See `StyleMeasures.step`. Angles in degrees, wear and fuel per kilometre, gaps in metres.
+
+        "steering_change" is that of the steering command in a control step, at most 2: agents that steer from lock to
+        lock in every step may drive well otherwise.
+        """
         theta, features = transition.get(STYLE), transition.get(("next", STYLE_FEATURES))
         telemetry = transition.get(("next", "telemetry"))
 
@@ -43,9 +48,11 @@ class RacingMeasures:
             return telemetry[:, _COLUMN[name]]
 
         degrees = 180.0 / math.pi
+        *_, steer, _, steer_before, _ = transition.get(("next", "observation"))[:, own_columns("controls")].unbind(-1)
         found = {
             "pace": told("progress") / CONTROL_STEP,
             "speed": told("speed"),
+            "steering_change": (steer - steer_before).abs(),
             "off": told("off"),
             "contact": told("contact"),
             "wall": told("wall"),

@@ -47,6 +47,20 @@ def observation_groups(cars: int, pool: bool, course_points: int = COURSE_POINTS
     return tuple(groups)
 
 
+def own_columns(name: str) -> slice:
+    """Where a block up to the compound is, which is the same in every race.
+
+    Raises:
+        KeyError: if there is no such block.
+    """
+    first = 0
+    for block, width in observation_groups(1, pool=False):
+        if block == name:
+            return slice(first, first + width)
+        first += width
+    raise KeyError(f"no block {name!r} in the observation")
+
+
 def own_car(car: Car, wheels: WheelSet, packed: Tensor, run: Run, tyres: TyreView, length: float) -> list[Tensor]:
     """Columns of the car itself, up to the fuel."""
     s = CarState(*packed.unbind(0))

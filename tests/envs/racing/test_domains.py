@@ -26,6 +26,8 @@ def test_a_domain_makes_measures_and_draws(family):
     assert sum(width for _, width in domain.observation_groups) == data["observation"].shape[-1]
     records = [domain.measures.step(data[:, t]) for t in range(3)]
     record = {name: torch.stack([r[name] for r in records]) for name in records[0]}
+    steered = data["action"][..., 0].T
+    torch.testing.assert_close(record["steering_change"][1:], steered.diff(dim=0).abs())
     alive = torch.ones(3, 4, dtype=torch.bool)
     summary = domain.measures.summarise(record, alive)
     assert set(domain.columns) - {"survived"} <= set(summary)

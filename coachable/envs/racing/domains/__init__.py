@@ -30,7 +30,7 @@ def racing_domain(
         family: drift, resources or aggressiveness.
         cars: of a race.
         grid: see `Domain`.
-        columns: what is published beside survival, pace and time off course.
+        columns: what is published beside survival, pace, time off course and changes of the steering command.
         evaluation: function of `coachable.evaluation` that `coachable evaluate` calls, "module.function".
         **options: of the environment, where an agent is shown and measured otherwise than it is trained.
     """
@@ -58,7 +58,7 @@ def racing_domain(
         grid=grid,
         control_step=CONTROL_STEP,
         episode_steps=EPISODE_STEPS,
-        columns={"survived": ".0%", "pace": ".1f", "off": ".1%"} | dict(columns),
+        columns={"survived": ".0%", "pace": ".1f", "off": ".1%", "steering_change": ".2f"} | dict(columns),
         observation_groups=observation_groups(cars, pool=False),
         as_trained=as_trained,
         evaluation=deferred(f"coachable.evaluation.{evaluation}"),
