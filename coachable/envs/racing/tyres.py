@@ -108,14 +108,18 @@ def heat_rate(slip_power: Tensor, load: Tensor, speed: Tensor, heat: Tensor) -> 
 
 def heat_factor(heat: Tensor) -> Tensor:
     """Grip at a temperature, relative to that at 90 °C."""
-    off = (heat - BEST_HEAT) / 60.0
-    return torch.clamp(1.0 - 0.2 * off * off, min=0.8)
+    return torch.clamp(1.0 - _off_best(heat), min=0.8)
 
 
 def heat_loss(heat: Tensor) -> Tensor:
     """Share of its grip that a tyre loses by being hotter than 90 °C, without the bound of `heat_factor`."""
-    over = torch.clamp(heat - BEST_HEAT, min=0.0) / 60.0
-    return 0.2 * over * over
+    return _off_best(torch.clamp(heat, min=BEST_HEAT))
+
+
+def _off_best(heat: Tensor) -> Tensor:
+    """Share of the grip that is lost at a temperature, hot or cold."""
+    off = (heat - BEST_HEAT) / 60.0
+    return 0.2 * off * off
 
 
 def wear_factor(wear: Tensor) -> Tensor:
