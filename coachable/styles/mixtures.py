@@ -2,11 +2,11 @@
 
 from typing import Literal, get_args
 
-from coachable.styles.parameters import Weight
-from coachable.styles.samplers import ContinuousOneHot, Mixture, OneHot, PointMass, Sampler, Uniform
+from coachable.styles.parameters import Choice, Weight
+from coachable.styles.samplers import ContinuousOneHot, Mixture, OneHot, PointMass, Product, Sampler, Shared, Uniform
 from coachable.styles.space import StyleSpace
 
-__all__ = ["Single", "own", "style_mixture", "with_requests"]
+__all__ = ["Single", "own", "style_mixture", "with_extremes", "with_requests"]
 
 Single = Literal["continuous_one_hot", "one_hot", "independent"]
 
@@ -68,6 +68,34 @@ def with_requests(space: StyleSpace, *, positive: float = 0.25, full: float = 0.
     high, zero = space.high.tolist(), [0.0] * space.dim
     parts = [PointMass(zero), PointMass(high), Uniform(zero, high), space.sampler]
     return Mixture(parts, [neutral, full, positive, 1.0 - neutral - full - positive])
+
+
+def with_extremes(space: StyleSpace, *, share: float = 0.5) -> Sampler:
+    """The space's own sampler, mixed with styles whose every parameter is at one of its bounds.
+
+    What tells two styles apart is largest between bounds, so that networks hear of it sooner.
+
+    Args:
+        space: Its parameters, weights or set-points. Rows that share a style (`Shared`) go on to share it.
+        share: Probability that every parameter is at its lower or its upper bound, each equally likely.
+
+    Returns:
+        A sampler of the space's dimension.
+
+    Raises:
+        ValueError: If a parameter is a choice, or the share is not in [0, 1].
+    """
+    choices = [p.name for p in space.parameters if isinstance(p, Choice)]
+    if choices:
+        raise ValueError(
+            f"sampler with_extremes asks for bounds, which {', '.join(choices)} of the style space {space.name!r} does "
+            "not have (a choice): expected sampler=default or sampler=independent"
+        )
+    bounds = zip(space.low.tolist(), space.high.tolist(), strict=True)
+    extremes = Product([Mixture([PointMass(low), PointMass(high)], [0.5, 0.5]) for low, high in bounds])
+    if isinstance(space.sampler, Shared):
+        return Shared(Mixture([extremes, space.sampler.sampler], [share, 1.0 - share]), space.sampler.copies)
+    return Mixture([extremes, space.sampler], [share, 1.0 - share])
 
 
 def _no_weights(space: StyleSpace) -> list[str]:

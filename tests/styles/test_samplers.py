@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from coachable.styles import (
+    Choice,
     ContinuousOneHot,
     Mixture,
     OneHot,
@@ -13,12 +14,13 @@ from coachable.styles import (
     Product,
     Sampler,
     Setpoint,
+    Shared,
     StyleSpace,
     Uniform,
     UniformChoice,
     Weight,
 )
-from coachable.styles.mixtures import with_requests
+from coachable.styles.mixtures import with_extremes, with_requests
 
 N = 200_000
 
@@ -242,6 +244,8 @@ def test_names_of_samplers_are_unique():
         (lambda: UniformChoice(0), "at least one"),
         (lambda: with_requests(StyleSpace([Weight("drift", 0.0, 5.0)]), full=0.9), "probabilities that sum to 1"),
         (lambda: with_requests(StyleSpace([Setpoint("pace", 0.0, 1.0)])), "with_requests asks for weights of 0.*pace"),
+        (lambda: with_extremes(StyleSpace([Setpoint("pace", 0.0, 1.0)]), share=2.0), "probabilities that sum to 1"),
+        (lambda: with_extremes(StyleSpace([Choice("gait", ("run", "hop"))])), "with_extremes asks for bounds.*gait"),
         (lambda: Sampler.from_dict({"type": "Levy"}), "unknown sampler type 'Levy'"),
     ],
 )
@@ -257,3 +261,18 @@ def test_requests_are_drawn_beside_the_spaces_own_styles():
     assert (theta == 0.0).all(-1).float().mean() == pytest.approx(0.1 + 0.5 * 0.5**4, abs=0.005)
     every = ((theta > 0.0) & (theta < 5.0)).all(-1).float().mean()
     assert every == pytest.approx(0.25 + 0.5 * 0.25**4, abs=0.005)
+
+
+@pytest.mark.parametrize("copies", [1, 3])
+def test_extremes_are_drawn_beside_the_spaces_own_styles(copies):
+    own = Uniform([0.0, 0.0], [2.0, 1.0])
+    space = StyleSpace([Setpoint("a", 0.0, 2.0), Setpoint("b", 0.0, 1.0)], Shared(own, copies) if copies > 1 else own)
+    theta = with_extremes(space, share=0.4).sample((3 * N,), torch.Generator().manual_seed(0))
+    first, second = theta.unbind(-1)
+    for a in (0.0, 2.0):
+        for b in (0.0, 1.0):
+            assert ((first == a) & (second == b)).float().mean() == pytest.approx(0.1, abs=0.005)
+    assert ((first > 0.0) & (first < 2.0) & (second > 0.0) & (second < 1.0)).float().mean() == pytest.approx(
+        0.6, abs=5e-3
+    )
+    assert (theta[:N] == theta[N : 2 * N]).all() == (copies == 3)

@@ -98,11 +98,12 @@ def resource_style_reward(space: StyleSpace) -> StyleReward:
     return StyleReward(space, {"resources": WeightedSum(RESOURCE_NAMES, RESOURCES)})
 
 
-def aggressiveness_style_reward(space: StyleSpace, *, gate: str = "radius") -> StyleReward:
-    """Σ over near opponents of min(0, d_lon - ξ_lon) + min(0, d_lat - ξ_lat).
+def aggressiveness_style_reward(space: StyleSpace, *, weight: float = 1.0, gate: str = "radius") -> StyleReward:
+    """Σ over near opponents of weight · (min(0, d_lon - ξ_lon) + min(0, d_lat - ξ_lat)).
 
     Args:
         space: `aggressiveness_style_space`.
+        weight: per metre that a margin is short, in each control step; the paper has none.
         gate: "radius" charges both gaps of every near car, literally; "overlap" charges a gap only where the cars
             overlap along the other axis, so that a car straight ahead costs no lateral margin.
 
@@ -120,7 +121,7 @@ def aggressiveness_style_reward(space: StyleSpace, *, gate: str = "radius") -> S
             too_lat = torch.clamp(lat - style["lateral"], max=0.0)
             if gate == "overlap":
                 too_long, too_lat = torch.where(lat == 0.0, too_long, 0.0), torch.where(long == 0.0, too_lat, 0.0)
-            parts.append(near * (too_long + too_lat))
+            parts.append(weight * near * (too_long + too_lat))
         return reduce(operator.add, parts) if parts else torch.zeros_like(style["lateral"])
 
     return StyleReward(space, {"margins": Term(margins, parameters=("longitudinal", "lateral"))})

@@ -89,6 +89,7 @@ def test_margin_reward_by_hand():
     features = torch.tensor([[0.0] * 8 + [3.0, 2.0, 1.0, 0.5, 0.25, 1.0, 0.0, 0.0, 0.0]])
     theta = torch.tensor([[2.0, 1.0]])
     assert aggressiveness_style_reward(space)(features, theta).item() == pytest.approx(-2.25)
+    assert aggressiveness_style_reward(space, weight=4.0)(features, theta).item() == pytest.approx(-9.0)
     ahead = torch.tensor([[0.0] * 8 + [1.0, 0.0, 1.0]])
     assert aggressiveness_style_reward(space)(ahead, theta).item() == pytest.approx(-2.0)
     assert aggressiveness_style_reward(space, gate="overlap")(ahead, theta).item() == pytest.approx(-1.0)
