@@ -51,6 +51,10 @@ def build_training(
 
     # Styles and environment
     space = space.with_sampler(make(config["sampler"])(space))
+    settings = set(signature(make_style_reward).parameters) - {"space"}
+    if unknown := set(config["style_reward"]) - settings:
+        expected = ", ".join(sorted(settings)) or "none"
+        raise ValueError(f"style_reward has {', '.join(sorted(unknown))}: {config['domain']} takes {expected}")
     style_reward = make_style_reward(space, **config["style_reward"])
     workers = config["collector"]["num_collectors"]
 

@@ -73,6 +73,15 @@ def test_every_choice_composes(recipe, group):
         assert config["preset"] != "auto", "auto was replaced by what it chose"
 
 
+def test_the_presets_of_races_are_of_their_family(tmp_path):
+    config = compose_config("racing_qr_sac", ["preset=cpu_races"])
+    assert config["domain"] == "racing_aggressiveness" and config["style_reward"] == {"weight": 2.0}
+    assert sum(scenario["share"] for scenario in config["env"]["scenarios"]) == pytest.approx(1.0)
+    config = compose_config("racing_qr_sac", ["preset=cpu_races", "family=drift", f"run_dir={tmp_path}"])
+    with pytest.raises(ValueError, match="style_reward has weight: racing_drift takes none"):
+        import_module("racing_qr_sac").build(config)
+
+
 @pytest.mark.parametrize("loss, replay", [("sac", "uniform"), ("cat_rac", "event_tables")])
 def test_runs_with_tables_resume_bit_for_bit(loss, replay, tmp_path):
     choice = [f"loss={loss}", f"replay={replay}", "n_steps=3", "replay.prioritized=true"]
