@@ -15,14 +15,18 @@ from typing import TYPE_CHECKING, Any
 import matplotlib
 import numpy as np
 import torch
+from tensordict import TensorDictBase
+from torch import Tensor
 
 from coachable.envs.racing.measures import TelemetryMeasures
 from coachable.envs.racing.scenarios import rolling_start
 from coachable.envs.racing.simulation import CONTROL_STEP
+from coachable.envs.racing.styles import GAP_COLUMNS, GAPS, NEAR_DISTANCE
 from coachable.evaluation.rollouts import record_episodes
 from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation, wilson_interval
 from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_csv
+from coachable.keys import STYLE_FEATURES
 from coachable.transforms import coachable_env
 
 matplotlib.use("Agg")
@@ -41,6 +45,15 @@ LAPS = 4
 RACE_STEPS = 10_000
 _AGAIN = 1.0  # [s], after which touching counts as another contact
 _METRICS = {"win_rate": "wins", "places_gained": "places gained", "contacts": "contacts per race"}
+_RANKED = _METRICS | {"near": "time near others"}
+
+
+class _RaceMeasures(TelemetryMeasures):
+    """Also whether any opponent is near."""
+
+    def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
+        near = transition.get(("next", STYLE_FEATURES))[:, GAPS + GAP_COLUMNS.index("near") :: len(GAP_COLUMNS)]
+        return super().step(transition) | {"near": near.any(-1).float()}
 
 
 def evaluate_aggressiveness(
@@ -74,7 +87,7 @@ def evaluate_aggressiveness(
             name: rank_correlation(
                 *(np.array([r[key] for r in rows if r["setting"] == setting]) for key in ("lateral", name))
             )
-            for name in _METRICS
+            for name in _RANKED
         }
         for setting in SETTINGS
     }
@@ -95,7 +108,7 @@ def _race(
     seed: int,
     progress: bool,
 ) -> dict[str, np.ndarray]:
-    """Of each race and car of its pair, (races, 2): top_two, won, places_gained, contacts, off, metres."""
+    """Of each race and car of its pair, (races, 2): top_two, won, places_gained, contacts, near, off, metres."""
     space, count = agent.space, len(races)
     simulation: Any = domain.make_env(
         num_envs=CARS * count,
@@ -126,7 +139,7 @@ def _race(
         env,
         agent.actor,
         theta.reshape(CARS * count, -1),
-        TelemetryMeasures("distance", "contact", "off"),
+        _RaceMeasures("distance", "contact", "off"),
         steps=steps,
         seed=seed,
         progress=f"{count} races of {CARS} cars" if progress else None,
@@ -157,6 +170,7 @@ def _pair_results(
         "won": (places == 0)[chosen].astype(float),
         "places_gained": (slots - places)[chosen].astype(float),
         "contacts": np.array([_count(touched[:, car]) for car in np.flatnonzero(chosen)], dtype=float),
+        "near": race["near"][:end, chosen].mean(0),
         "off": race["off"][:end, chosen].mean(0),
         "metres": distance[end - 1, chosen].astype(float),
     }
@@ -177,7 +191,7 @@ def _rows(cells: Sequence[tuple[str, float]], found: Mapping[str, np.ndarray]) -
         row["win_rate"] = float(of["top_two"].mean())
         row["win_rate_low"], row["win_rate_high"] = wilson_interval(int(of["top_two"].sum()), of["top_two"].size)
         row["either_won"] = float(of["won"].max(1).mean())
-        for name in ("places_gained", "contacts"):
+        for name in ("places_gained", "contacts", "near"):
             per_race = of[name].mean(1)
             row[name] = float(per_race.mean())
             row[f"{name}_low"], row[f"{name}_high"] = bootstrap_interval(per_race)
@@ -223,11 +237,12 @@ def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Map
     )
     text += "![radar](radar.png)\n\n"
     formats = {"setting": "", "lateral": "g", "win_rate": ".0%", "either_won": ".0%", "places_gained": "+.2f"}
-    text += markdown_table(rows, formats | {"contacts": ".1f", "off": ".1%", "kilometres": ".1f"})
+    text += markdown_table(rows, formats | {"contacts": ".1f", "near": ".1%", "off": ".1%", "kilometres": ".1f"})
     text += "\nWin rate: share of the pair that ends among the first two. Contacts: per car and race, those within a "
-    text += "second count once.\n\nRank correlation with the margin: "
+    text += f"second count once. Near: share of the time with another car within {NEAR_DISTANCE:g} m, centre to centre."
+    text += "\n\nRank correlation with the margin: "
     parts = [
-        f"{setting}: " + ", ".join(f"{_METRICS[name]} {value:.2f}" for name, value in summary[setting].items())
+        f"{setting}: " + ", ".join(f"{_RANKED[name]} {value:.2f}" for name, value in summary[setting].items())
         for setting in SETTINGS
     ]
     return text + "; ".join(parts) + ".\n"
