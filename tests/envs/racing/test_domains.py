@@ -59,6 +59,8 @@ def test_pictures_follow_the_car():
 
 def test_a_domain_is_as_its_training_made_it():
     settings = {"_target_": "x", "family": "resources", "num_envs": 256, "track": "ring", "car": "gt3"}
+    # As a configuration has them; a file must not choose what is imported and called.
+    settings |= {"scenarios": [{"_target_": "x"}], "conditions": {"_target_": "x"}, "weights": {"_target_": "x"}}
     domain = load_domain("racing_resources", {"env": {**settings, "episode_steps": 20, "course_points": 5}})
     env = domain.make_env(num_envs=2, seed=0)
     assert (env.track.name, env.num_envs, domain.episode_steps) == ("ring", 2, 20)

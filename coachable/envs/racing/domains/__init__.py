@@ -15,6 +15,10 @@ from coachable.envs.racing.observation import COURSE_POINTS, observation_groups
 from coachable.envs.racing.render import RacingRenderer
 from coachable.envs.racing.simulation import CONTROL_STEP
 
+# Of a training's environment, what an agent is not shown or measured with: how many cars learn, how their episodes
+# start, what they are rewarded for.
+_OF_TRAINING = ("_target_", "family", "num_envs", "scenarios", "conditions", "weights", "driver")
+
 
 def racing_domain(
     family: str,
@@ -38,7 +42,7 @@ def racing_domain(
 
     def as_trained(settings: Mapping[str, Any]) -> Domain:
         """With the track, the car and the observation of a training, and its length of an episode."""
-        chosen = {name: value for name, value in settings.items() if name not in ("_target_", "family", "num_envs")}
+        chosen = {name: value for name, value in settings.items() if name not in _OF_TRAINING}
         chosen |= {"compiled": False, "device": "cpu", **options}
         pool, points = chosen.get("car") == "pool", chosen.get("course_points", COURSE_POINTS)
         return replace(
