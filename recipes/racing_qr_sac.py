@@ -2,12 +2,14 @@
 
 python recipes/racing_qr_sac.py                                        tyre and fuel saving, cpu or gpu
 python recipes/racing_qr_sac.py family=drift sampler=with_requests     drifting on request
-python recipes/racing_qr_sac.py family=aggressiveness                  margins to two agents and two rivals; they are kept
-                                                                       better after three stages:
+python recipes/racing_qr_sac.py family=aggressiveness                  margins to two agents and two rivals
+python recipes/racing_qr_sac.py preset=smoke                           every part once, within a minute
+
+Margins are kept better after three stages: alone, among others, and on tyres as hot as they are late in a race.
+
 python recipes/racing_qr_sac.py preset=cpu_alone run_dir=runs/alone
 python recipes/racing_qr_sac.py preset=cpu_races init_from=runs/alone run_dir=runs/races
 python recipes/racing_qr_sac.py preset=cpu_late_races init_from=runs/races
-python recipes/racing_qr_sac.py preset=smoke                           every part once, within a minute
 """
 
 from typing import Any
