@@ -1,5 +1,7 @@
 """Every recipe with every loss and replay buffer: composed, and trained for a few updates."""
 
+import subprocess
+import sys
 from importlib import import_module
 from pathlib import Path
 
@@ -118,3 +120,10 @@ def test_runs_with_tables_resume_bit_for_bit(loss, replay, tmp_path):
 def test_what_makes_no_sense_fails_at_the_start_with_one_sentence(recipe, arguments, message, tmp_path):
     with pytest.raises((ValueError, RuntimeError), match=message):
         _train(recipe, tmp_path, *arguments)
+
+
+@pytest.mark.parametrize("recipe", ["humanoid_sac", "racing_qr_sac"])
+def test_help_names_the_recipe(recipe):
+    script = Path(__file__).resolve().parents[2] / "recipes" / f"{recipe}.py"
+    shown = subprocess.run([sys.executable, str(script), "--help"], capture_output=True, text=True, check=True).stdout
+    assert f"python recipes/{recipe}.py preset=smoke" in shown
