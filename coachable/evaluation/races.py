@@ -21,7 +21,7 @@ from torch import Tensor
 from coachable.envs.racing.measures import TelemetryMeasures
 from coachable.envs.racing.scenarios import rolling_start
 from coachable.envs.racing.simulation import CONTROL_STEP
-from coachable.envs.racing.styles import GAP_COLUMNS, GAPS, NEAR_DISTANCE
+from coachable.envs.racing.styles import NEAR_DISTANCE, anyone_near
 from coachable.evaluation.rollouts import record_episodes
 from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation, wilson_interval
@@ -52,8 +52,8 @@ class _RaceMeasures(TelemetryMeasures):
     """Also whether any opponent is near."""
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
-        near = transition.get(("next", STYLE_FEATURES))[:, GAPS + GAP_COLUMNS.index("near") :: len(GAP_COLUMNS)]
-        return super().step(transition) | {"near": near.any(-1).float()}
+        near = anyone_near(transition.get(("next", STYLE_FEATURES)))
+        return super().step(transition) | {"near": near.float()}
 
 
 def evaluate_aggressiveness(

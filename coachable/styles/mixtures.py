@@ -2,7 +2,7 @@
 
 from typing import Literal, get_args
 
-from coachable.styles.parameters import Choice, Weight
+from coachable.styles.parameters import Setpoint, Weight
 from coachable.styles.samplers import ContinuousOneHot, Mixture, OneHot, PointMass, Product, Sampler, Shared, Uniform
 from coachable.styles.space import StyleSpace
 
@@ -37,9 +37,9 @@ def style_mixture(
     """
     if single not in get_args(Single):
         raise ValueError(f"single is {single!r}: expected one of {', '.join(get_args(Single))}")
-    if single == "independent" and _no_weights(space):
+    if single == "independent" and _others(space, (Weight,)):
         return StyleSpace(space.parameters).sampler
-    _require_weights(space, f"sampler {single} leaves all weights but one at 0")
+    _require((Weight,), space, f"sampler {single} leaves all weights but one at 0, which {{}} cannot be (not a weight)")
     low, high = space.low.tolist(), space.high.tolist()
     every = Uniform(low, high)
     one = {"continuous_one_hot": ContinuousOneHot(low, high), "one_hot": OneHot(high), "independent": every}[single]
@@ -64,7 +64,7 @@ def with_requests(space: StyleSpace, *, positive: float = 0.25, full: float = 0.
     Raises:
         ValueError: If a parameter is no weight, or the probabilities exceed 1 together.
     """
-    _require_weights(space, "sampler with_requests asks for weights of 0")
+    _require((Weight,), space, "sampler with_requests asks for weights of 0, which {} cannot be (not a weight)")
     high, zero = space.high.tolist(), [0.0] * space.dim
     parts = [PointMass(zero), PointMass(high), Uniform(zero, high), space.sampler]
     return Mixture(parts, [neutral, full, positive, 1.0 - neutral - full - positive])
@@ -85,12 +85,7 @@ def with_extremes(space: StyleSpace, *, share: float = 0.5) -> Sampler:
     Raises:
         ValueError: If a parameter is a choice, or the share is not in [0, 1].
     """
-    choices = [p.name for p in space.parameters if isinstance(p, Choice)]
-    if choices:
-        raise ValueError(
-            f"sampler with_extremes asks for bounds, which {', '.join(choices)} of the style space {space.name!r} does "
-            "not have (a choice): expected sampler=default or sampler=independent"
-        )
+    _require((Weight, Setpoint), space, "sampler with_extremes asks for bounds, which {} cannot have (a choice)")
     bounds = zip(space.low.tolist(), space.high.tolist(), strict=True)
     extremes = Product([Mixture([PointMass(low), PointMass(high)], [0.5, 0.5]) for low, high in bounds])
     if isinstance(space.sampler, Shared):
@@ -98,15 +93,13 @@ def with_extremes(space: StyleSpace, *, share: float = 0.5) -> Sampler:
     return Mixture([extremes, space.sampler], [share, 1.0 - share])
 
 
-def _no_weights(space: StyleSpace) -> list[str]:
-    """Names of the parameters that are not weights."""
-    return [p.name for p in space.parameters if not isinstance(p, Weight)]
+def _others(space: StyleSpace, kinds: tuple[type, ...]) -> list[str]:
+    """Names of the parameters that are of none of these kinds."""
+    return [p.name for p in space.parameters if not isinstance(p, kinds)]
 
 
-def _require_weights(space: StyleSpace, why: str) -> None:
-    others = _no_weights(space)
-    if others:
-        raise ValueError(
-            f"{why}, which {', '.join(others)} of the style space {space.name!r} cannot be (not a weight): expected "
-            "sampler=default or sampler=independent"
-        )
+def _require(kinds: tuple[type, ...], space: StyleSpace, why: str) -> None:
+    """Refuses parameters of other kinds; "{}" in `why` stands for them."""
+    if others := _others(space, kinds):
+        named = f"{', '.join(others)} of the style space {space.name!r}"
+        raise ValueError(f"{why.format(named)}: expected sampler=default or sampler=independent")

@@ -78,7 +78,7 @@ def test_every_choice_composes(recipe, group):
 def test_the_presets_of_races_are_of_their_family(tmp_path):
     config = compose_config("racing_qr_sac", ["preset=cpu_races"])
     assert config["domain"] == "racing_aggressiveness" and config["style_reward"] == {"weight": 2.0}
-    assert sum(scenario["share"] for scenario in config["env"]["scenarios"]) == pytest.approx(1.0)
+    assert sum(config["env"]["scenarios"]["shares"].values()) == pytest.approx(1.0)
     config = compose_config("racing_qr_sac", ["preset=cpu_races", "family=drift", f"run_dir={tmp_path}"])
     with pytest.raises(ValueError, match="style_reward has weight: racing_drift takes none"):
         import_module("racing_qr_sac").build(config)

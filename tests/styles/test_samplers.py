@@ -272,7 +272,6 @@ def test_extremes_are_drawn_beside_the_spaces_own_styles(copies):
     for a in (0.0, 2.0):
         for b in (0.0, 1.0):
             assert ((first == a) & (second == b)).float().mean() == pytest.approx(0.1, abs=0.005)
-    assert ((first > 0.0) & (first < 2.0) & (second > 0.0) & (second < 1.0)).float().mean() == pytest.approx(
-        0.6, abs=5e-3
-    )
+    inside = (first > 0.0) & (first < 2.0) & (second > 0.0) & (second < 1.0)
+    assert inside.float().mean() == pytest.approx(0.6, abs=0.005)
     assert (theta[:N] == theta[N : 2 * N]).all() == (copies == 3)

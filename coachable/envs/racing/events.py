@@ -9,7 +9,7 @@ from torch import Tensor
 
 from coachable.envs.racing.families import check_family
 from coachable.envs.racing.observation import own_columns
-from coachable.envs.racing.styles import DRIFT_NAMES, GAPS, OVERTAKE
+from coachable.envs.racing.styles import DRIFT_NAMES, OVERTAKE, anyone_near
 from coachable.keys import STYLE_FEATURES
 from coachable.replay import PredicateEvents
 
@@ -56,9 +56,8 @@ def _slide(steps: TensorDictBase) -> Tensor:
 
 
 def _overtake(steps: TensorDictBase) -> Tensor:
-    gained = steps["next", STYLE_FEATURES][..., OVERTAKE]
-    near = steps["next", STYLE_FEATURES][..., GAPS + 2 :: 3].any(-1)
-    return (gained > 0.0) & near
+    features = steps["next", STYLE_FEATURES]
+    return (features[..., OVERTAKE] > 0.0) & anyone_near(features)
 
 
 def _slipstream(steps: TensorDictBase) -> Tensor:

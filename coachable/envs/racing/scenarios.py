@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -23,6 +23,8 @@ _FUEL = (10.0, 100.0)  # [l]
 _HEAT = (30.0, 130.0)  # [°C], as hot as a stint makes them
 _MEDIUM = COMPOUNDS.index("race_medium")
 _DRAWS = 16  # random numbers per car and episode
+_SHARES = {"solo": 0.30, "one_to_one": 0.15, "field": 0.25, "rolling": 0.10, "slipstream": 0.10, "recovery": 0.10}
+_SHARES_ALONE = {"solo": 0.8, "recovery": 0.2}
 
 
 @dataclass(frozen=True)
@@ -53,18 +55,29 @@ def drift_scenarios() -> tuple[Scenario, ...]:
     return (Scenario("launch", 1.0, "launch"),)
 
 
-def race_scenarios(cars: int) -> tuple[Scenario, ...]:
-    """The mixture of multi-tables (racing.md, 5.3): with one car, those without opponents."""
-    if cars == 1:
-        return (Scenario("solo", 0.8, "solo"), Scenario("recovery", 0.2, "recovery"))
-    return (
-        Scenario("solo", 0.30, "solo"),
-        Scenario("one_to_one", 0.15, "field", 2),
-        Scenario("field", 0.25, "field", cars),
-        Scenario("rolling", 0.10, "rolling", cars),
-        Scenario("slipstream", 0.10, "slipstream", cars),
-        Scenario("recovery", 0.10, "recovery"),
-    )
+def race_scenarios(cars: int, shares: Mapping[str, float] | None = None) -> tuple[Scenario, ...]:
+    """The mixture of multi-tables (racing.md, 5.3).
+
+    Args:
+        cars: of a race.
+        shares: of each kind of start, by its name; by default the design's, and with one car those without opponents.
+
+    Raises:
+        ValueError: if there is no such kind.
+    """
+    if shares is None:
+        shares = _SHARES if cars > 1 else _SHARES_ALONE
+    kinds = {
+        "solo": ("solo", 1),
+        "one_to_one": ("field", 2),
+        "field": ("field", cars),
+        "rolling": ("rolling", cars),
+        "slipstream": ("slipstream", cars),
+        "recovery": ("recovery", 1),
+    }
+    if unknown := set(shares) - set(kinds):
+        raise ValueError(f"shares of {', '.join(sorted(unknown))} given: expected some of {', '.join(kinds)}")
+    return tuple(Scenario(name, shares[name], *kind) for name, kind in kinds.items() if name in shares)
 
 
 def rolling_start(cars: int) -> tuple[Scenario, ...]:

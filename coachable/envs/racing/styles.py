@@ -46,6 +46,11 @@ def style_features_size(cars: int) -> int:
     return GAPS + len(GAP_COLUMNS) * (cars - 1)
 
 
+def anyone_near(features: Tensor) -> Tensor:
+    """Whether an opponent is near, (...) bool, from style features (..., F) of races."""
+    return features[..., GAPS + GAP_COLUMNS.index("near") :: len(GAP_COLUMNS)].any(-1)
+
+
 def _three_way(neutral: float, bounds: tuple[float, float]) -> Mixture:
     """Neutral with a probability, otherwise negative or positive, equally likely."""
     low, high = bounds

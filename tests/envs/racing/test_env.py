@@ -21,7 +21,7 @@ from coachable.envs.racing.observation import observation_groups
 from coachable.envs.racing.parameters import Resources
 from coachable.envs.racing.referee import TELEMETRY
 from coachable.envs.racing.run import Others
-from coachable.envs.racing.scenarios import Conditions, Scenario, drift_scenarios, rolling_start
+from coachable.envs.racing.scenarios import Conditions, Scenario, drift_scenarios, race_scenarios, rolling_start
 from coachable.envs.racing.state import HEATS, ROW, WEARS
 from coachable.envs.racing.task import TaskWeights, metres_gained
 from coachable.transforms import coachable_env
@@ -127,6 +127,13 @@ def test_bad_actions_are_refused():
 def test_bad_arguments_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         RacingEnv(**{"track": "ring", **options})
+
+
+def test_races_of_shares_that_are_given():
+    shares = {"rolling": 0.75, "solo": 0.25}
+    assert race_scenarios(5, shares) == (Scenario("solo", 0.25, "solo"), Scenario("rolling", 0.75, "rolling", 5))
+    with pytest.raises(ValueError, match="shares of pit given: expected some of solo, one_to_one, field"):
+        race_scenarios(5, {"pit": 1.0})
 
 
 def test_task_reward_of_a_clean_straight_is_progress():

@@ -15,8 +15,8 @@ from coachable.envs.racing.observation import COURSE_POINTS, observation_groups
 from coachable.envs.racing.render import RacingRenderer
 from coachable.envs.racing.simulation import CONTROL_STEP
 
-# Of a training's environment, what an agent is not shown or measured with: how many cars learn, how their episodes
-# start, what they are rewarded for.
+# Of a training's environment, what an agent is not shown or measured with: how many cars learn, among whom, how their
+# episodes start, what they are rewarded for.
 _OF_TRAINING = ("_target_", "family", "num_envs", "scenarios", "conditions", "weights", "driver")
 
 
