@@ -44,7 +44,13 @@ LONGITUDINAL = 1.0  # [m], of all
 LAPS = 4
 RACE_STEPS = 10_000
 _AGAIN = 1.0  # [s], after which touching counts as another contact
-_METRICS = {"win_rate": "wins", "places_gained": "places gained", "contacts": "contacts per race"}
+_PASSED = 5.0  # [m], about a car's length: as far ahead of another who was ahead, a car has overtaken it
+_METRICS = {
+    "win_rate": "wins",
+    "places_gained": "places gained",
+    "overtakes": "overtakes per race",
+    "contacts": "contacts per race",
+}
 _RANKED = _METRICS | {"near": "time near others"}
 
 
@@ -108,7 +114,7 @@ def _race(
     seed: int,
     progress: bool,
 ) -> dict[str, np.ndarray]:
-    """Of each race and car of its pair, (races, 2): top_two, won, places_gained, contacts, near, off, metres."""
+    """What `_pair_results` finds in each race, (races, 2)."""
     space, count = agent.space, len(races)
     simulation: Any = domain.make_env(
         num_envs=CARS * count,
@@ -159,7 +165,7 @@ def _race(
 def _pair_results(
     race: Mapping[str, np.ndarray], slots: np.ndarray, chosen: np.ndarray, finish: float
 ) -> dict[str, np.ndarray]:
-    """Of the two chosen cars of one race, whose steps are (T, A)."""
+    """Of the two chosen cars of one race, whose steps are (T, A): values (2,)."""
     distance = race["distance"]
     done = np.flatnonzero(distance.max(1) >= finish)
     end = int(done[0]) + 1 if len(done) else len(distance)
@@ -169,6 +175,7 @@ def _pair_results(
         "top_two": (places < 2)[chosen].astype(float),
         "won": (places == 0)[chosen].astype(float),
         "places_gained": (slots - places)[chosen].astype(float),
+        "overtakes": np.array([_overtakes(distance[:end], car) for car in np.flatnonzero(chosen)], dtype=float),
         "contacts": np.array([_count(touched[:, car]) for car in np.flatnonzero(chosen)], dtype=float),
         "near": race["near"][:end, chosen].mean(0),
         "off": race["off"][:end, chosen].mean(0),
@@ -182,6 +189,17 @@ def _count(touched: np.ndarray) -> int:
     return int((np.diff(steps, prepend=-np.inf) > _AGAIN / CONTROL_STEP).sum()) if len(steps) else 0
 
 
+def _overtakes(distance: np.ndarray, car: int) -> int:
+    """How often a car overtook one of the others, from the distances (T, A) of all [m]."""
+    gap = distance[:, [car]] - np.delete(distance, car, axis=1)
+    side = np.where(np.abs(gap) < _PASSED, 0.0, np.sign(gap))
+    total = 0
+    for one in side.T:
+        clear = one[one != 0.0]
+        total += int((np.diff(clear) > 0.0).sum())
+    return total
+
+
 def _rows(cells: Sequence[tuple[str, float]], found: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
     """Means by setting and margin with 95 % intervals, of values (cells, races, 2)."""
     rows = []
@@ -191,7 +209,7 @@ def _rows(cells: Sequence[tuple[str, float]], found: Mapping[str, np.ndarray]) -
         row["win_rate"] = float(of["top_two"].mean())
         row["win_rate_low"], row["win_rate_high"] = wilson_interval(int(of["top_two"].sum()), of["top_two"].size)
         row["either_won"] = float(of["won"].max(1).mean())
-        for name in ("places_gained", "contacts", "near"):
+        for name in ("places_gained", "overtakes", "contacts", "near"):
             per_race = of[name].mean(1)
             row[name] = float(per_race.mean())
             row[f"{name}_low"], row[f"{name}_high"] = bootstrap_interval(per_race)
@@ -237,9 +255,11 @@ def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Map
     )
     text += "![radar](radar.png)\n\n"
     formats = {"setting": "", "lateral": "g", "win_rate": ".0%", "either_won": ".0%", "places_gained": "+.2f"}
-    text += markdown_table(rows, formats | {"contacts": ".1f", "near": ".1%", "off": ".1%", "kilometres": ".1f"})
-    text += "\nWin rate: share of the pair that ends among the first two. Contacts: per car and race, those within a "
-    text += f"second count once. Near: share of the time with another car within {NEAR_DISTANCE:g} m, centre to centre."
+    formats |= {"overtakes": ".1f", "contacts": ".1f", "near": ".1%", "off": ".1%", "kilometres": ".1f"}
+    text += markdown_table(rows, formats)
+    text += "\nWin rate: share of the pair that ends among the first two. Overtakes, contacts: per car and race; a "
+    text += f"car has overtaken who was ahead when it is {_PASSED:g} m ahead; contacts within a second count once. "
+    text += f"Near: share of the time with another car within {NEAR_DISTANCE:g} m, centre to centre."
     text += "\n\nRank correlation with the margin: "
     parts = [
         f"{setting}: " + ", ".join(f"{_RANKED[name]} {value:.2f}" for name, value in summary[setting].items())

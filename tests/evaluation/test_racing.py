@@ -16,7 +16,7 @@ from coachable.envs.racing.families import family_style
 from coachable.envs.racing.measures import whole_turns
 from coachable.envs.racing.parameters import load_car
 from coachable.evaluation.drifts import evaluate_drift
-from coachable.evaluation.races import _count, _pair_results, evaluate_aggressiveness
+from coachable.evaluation.races import _count, _overtakes, _pair_results, evaluate_aggressiveness
 from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.statistics import wilson_interval
 from coachable.evaluation.stints import _stint, evaluate_resources, range_at
@@ -90,6 +90,16 @@ def test_contacts_within_a_second_count_once():
     touched[[3, 4, 12, 40, 51]] = True  # 0.8 s and 1.1 s after the last one
     assert _count(touched) == 3
     assert _count(np.zeros(5, dtype=bool)) == 0
+
+
+def test_whoever_is_ahead_by_a_length_after_being_behind_has_overtaken():
+    own = np.array([0.0, 10.0, 20.0, 30.0, 40.0, 50.0])
+    rival = own + np.array([8.0, -4.0, 4.0, -6.0, 7.0, -8.0])
+    beside = own + np.array([9.0, 4.0, -4.9, 3.0, 6.0, 0.0])  # never passed
+    distance = np.stack([rival, own, beside], axis=1)
+    assert _overtakes(distance, 1) == 2
+    assert _overtakes(distance[:, :2], 0) == 1
+    assert _overtakes(distance[:2], 1) == 0
 
 
 def test_a_race_ends_when_the_first_car_does():

@@ -14,10 +14,11 @@ from coachable.envs.racing.parameters import COMPOUNDS, RACE_COMPOUNDS, Car
 from coachable.envs.racing.state import HEATS, ROW, SPINS, STATE_ROWS, WEARS
 from coachable.envs.racing.track import Course
 
-STARTS = ("solo", "field", "rolling", "slipstream", "recovery", "launch")
+STARTS = ("solo", "field", "rolling", "slipstream", "passing", "recovery", "launch")
 GRID_SLOTS = 20
 ROLLING_GAP = 14.0  # [m] between cars of a rolling start
 _LAUNCH_SPEED = 60.0  # [m/s]
+_PASSING_SPREAD = 0.2  # of the speed, between the slowest and the fastest car of a passing start
 _WEAR_MAX, _WEAR_SPREAD = 0.75, 0.05
 _FUEL = (10.0, 100.0)  # [l]
 _HEAT = (30.0, 130.0)  # [°C], as hot as a stint makes them
@@ -35,7 +36,8 @@ class Scenario:
         name: also of its replay table.
         share: of the episodes.
         start: "solo" (anywhere, alone), "field" (cars one behind the other), "rolling" (two columns before the line),
-            "slipstream" (close together on the longest straight), "recovery" (off course, spun, slow) or "launch" (any
+            "slipstream" (one behind the other, close, on the longest straight), "passing" (there too, but spread across
+            the track and some up to a fifth faster than others), "recovery" (off course, spun, slow) or "launch" (any
             heading and up to 60 m/s, every second time an ordinary start).
         group: cars that see and touch each other; cars of different groups share the road without meeting.
     """
@@ -73,6 +75,7 @@ def race_scenarios(cars: int, shares: Mapping[str, float] | None = None) -> tupl
         "field": ("field", cars),
         "rolling": ("rolling", cars),
         "slipstream": ("slipstream", cars),
+        "passing": ("passing", cars),
         "recovery": ("recovery", 1),
     }
     if unknown := set(shares) - set(kinds):
@@ -169,13 +172,14 @@ class Starter:
 
         length, half = self.course.length, self._half_width()
         rank = (order % size).to(u.dtype)  # place within the group, from the front
+        close = chosen("slipstream", "passing")
         gap = torch.where(
             chosen("rolling"),
             ROLLING_GAP,
-            torch.where(chosen("slipstream"), 7.0 + 6.0 * first[2], 8.0 + 22.0 * first[2]),
+            torch.where(close, 7.0 + 6.0 * first[2], 8.0 + 22.0 * first[2]),
         )
         straight, extent = self._straight
-        lead = torch.where(chosen("slipstream"), straight + extent * (0.2 + 0.4 * first[3]), length * first[3])
+        lead = torch.where(close, straight + extent * (0.2 + 0.4 * first[3]), length * first[3])
         lead = torch.where(chosen("rolling"), length - 10.0, lead)
         # Groups that do not meet spread over the track.
         s = torch.where(alone, length * u[4], lead + group * 97.0 - rank * gap)
@@ -190,6 +194,7 @@ class Starter:
         sensible = self._sensible(s)
         slowest = sensible.min(0).values
         speed = pace * torch.where(alone, sensible, slowest)
+        speed = torch.where(chosen("passing"), speed * (1.0 + _PASSING_SPREAD * (u[9] - 0.5)), speed)
         yaw_error = 0.05 * (2.0 * u[8] - 1.0)
 
         beside = half + float(self.course.table[:, 7].min()) - 3.0

@@ -20,7 +20,7 @@ from coachable.envs.racing.driver import LineFollower
 from coachable.envs.racing.observation import observation_groups
 from coachable.envs.racing.parameters import Resources
 from coachable.envs.racing.referee import TELEMETRY
-from coachable.envs.racing.run import Others
+from coachable.envs.racing.run import Others, Run
 from coachable.envs.racing.scenarios import Conditions, Scenario, drift_scenarios, race_scenarios, rolling_start
 from coachable.envs.racing.state import HEATS, ROW, WEARS
 from coachable.envs.racing.task import TaskWeights, metres_gained
@@ -134,6 +134,15 @@ def test_races_of_shares_that_are_given():
     assert race_scenarios(5, shares) == (Scenario("solo", 0.25, "solo"), Scenario("rolling", 0.75, "rolling", 5))
     with pytest.raises(ValueError, match="shares of pit given: expected some of solo, one_to_one, field"):
         race_scenarios(5, {"pit": 1.0})
+
+
+def test_cars_of_a_passing_start_are_close_and_some_are_faster():
+    env = RacingEnv(100, cars=5, track="oval", scenarios=(Scenario("p", 1.0, "passing", 5),), seed=0)
+    env.reset()
+    speed = env.state[ROW["vx"]].reshape(5, 20)
+    distance = env.run[Run._fields.index("distance")].reshape(5, 20)
+    assert ((speed.amax(0) / speed.amin(0) > 1.01) & (speed.amax(0) / speed.amin(0) <= 1.1 / 0.9)).all()
+    assert ((distance.amin(0) >= -4 * 13.0) & (distance.amin(0) <= -4 * 7.0)).all()
 
 
 def test_task_reward_of_a_clean_straight_is_progress():
