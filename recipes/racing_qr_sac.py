@@ -5,11 +5,12 @@ python recipes/racing_qr_sac.py family=drift sampler=with_requests     drifting 
 python recipes/racing_qr_sac.py family=aggressiveness                  margins to two agents and two rivals
 python recipes/racing_qr_sac.py preset=smoke                           every part once, within a minute
 
-Margins are kept better after three stages: alone, among others, and on tyres as hot as they are late in a race.
+Margins are kept better after four stages: alone, keeping away from others, overtaking them, and all of it as asked.
 
 python recipes/racing_qr_sac.py preset=cpu_alone run_dir=runs/alone
 python recipes/racing_qr_sac.py preset=cpu_races init_from=runs/alone run_dir=runs/races
-python recipes/racing_qr_sac.py preset=cpu_late_races init_from=runs/races
+python recipes/racing_qr_sac.py preset=cpu_passing init_from=runs/races run_dir=runs/passing
+python recipes/racing_qr_sac.py preset=cpu_late_races init_from=runs/passing
 """
 
 from typing import Any

@@ -75,11 +75,12 @@ def test_every_choice_composes(recipe, group):
         assert config["preset"] != "auto", "auto was replaced by what it chose"
 
 
-def test_the_presets_of_races_are_of_their_family(tmp_path):
-    config = compose_config("racing_qr_sac", ["preset=cpu_races"])
-    assert config["domain"] == "racing_aggressiveness" and config["style_reward"] == {"weight": 2.0}
+@pytest.mark.parametrize("preset, weight", [("cpu_races", 2.0), ("cpu_passing", 1.0), ("cpu_late_races", 3.0)])
+def test_the_presets_of_races_are_of_their_family(preset, weight, tmp_path):
+    config = compose_config("racing_qr_sac", [f"preset={preset}"])
+    assert config["domain"] == "racing_aggressiveness" and config["style_reward"] == {"weight": weight}
     assert sum(config["env"]["scenarios"]["shares"].values()) == pytest.approx(1.0)
-    config = compose_config("racing_qr_sac", ["preset=cpu_races", "family=drift", f"run_dir={tmp_path}"])
+    config = compose_config("racing_qr_sac", [f"preset={preset}", "family=drift", f"run_dir={tmp_path}"])
     with pytest.raises(ValueError, match="style_reward has weight: racing_drift takes none"):
         import_module("racing_qr_sac").build(config)
 
