@@ -236,6 +236,7 @@ def draw_radar(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
             )
         labels = [f"{text}\n{a:.2f} to {b:.2f}" for text, a, b in zip(_METRICS.values(), low, high, strict=True)]
         panel.set_xticks(angles, labels, fontsize=8)
+        panel.tick_params(axis="x", pad=26)  # clear of the circle, left and right
         panel.set_yticks([])
         panel.set_ylim(0.0, 1.05)
         panel.set_title(setting)
