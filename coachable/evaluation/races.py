@@ -1,4 +1,4 @@
-"""Races of five agents with different margins: places, contacts and wins of a pair that attacks or defends (paper).
+"""Races of five agents with different margins: wins, places, overtakes, contacts of a pair, ahead or behind (paper).
 
 Two of five cars get the lateral margin under test, the other three moderate ones. The pair starts last ("pursuer") or
 first ("leader"), as in Werner et al. (2023).
@@ -170,13 +170,14 @@ def _pair_results(
     done = np.flatnonzero(distance.max(1) >= finish)
     end = int(done[0]) + 1 if len(done) else len(distance)
     places = (-distance[end - 1]).argsort().argsort()
+    cars = np.flatnonzero(chosen).tolist()
     touched = race["contact"][:end] > 0
     return {
         "top_two": (places < 2)[chosen].astype(float),
         "won": (places == 0)[chosen].astype(float),
         "places_gained": (slots - places)[chosen].astype(float),
-        "overtakes": np.array([_overtakes(distance[:end], car) for car in np.flatnonzero(chosen)], dtype=float),
-        "contacts": np.array([_count(touched[:, car]) for car in np.flatnonzero(chosen)], dtype=float),
+        "overtakes": np.array([_overtakes(distance[:end], car) for car in cars], dtype=float),
+        "contacts": np.array([_count(touched[:, car]) for car in cars], dtype=float),
         "near": race["near"][:end, chosen].mean(0),
         "off": race["off"][:end, chosen].mean(0),
         "metres": distance[end - 1, chosen].astype(float),
@@ -192,12 +193,7 @@ def _count(touched: np.ndarray) -> int:
 def _overtakes(distance: np.ndarray, car: int) -> int:
     """How often a car overtook one of the others, from the distances (T, A) of all [m]."""
     gap = distance[:, [car]] - np.delete(distance, car, axis=1)
-    side = np.where(np.abs(gap) < _PASSED, 0.0, np.sign(gap))
-    total = 0
-    for one in side.T:
-        clear = one[one != 0.0]
-        total += int((np.diff(clear) > 0.0).sum())
-    return total
+    return sum(int((np.diff(np.sign(one[np.abs(one) >= _PASSED])) > 0.0).sum()) for one in gap.T)
 
 
 def _rows(cells: Sequence[tuple[str, float]], found: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
