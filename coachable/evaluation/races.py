@@ -21,7 +21,7 @@ from torch import Tensor
 from coachable.envs.racing.measures import TelemetryMeasures
 from coachable.envs.racing.scenarios import rolling_start
 from coachable.envs.racing.simulation import CONTROL_STEP
-from coachable.envs.racing.styles import NEAR_DISTANCE, anyone_near
+from coachable.envs.racing.styles import anyone_beside
 from coachable.evaluation.rollouts import record_episodes
 from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation, wilson_interval
@@ -51,15 +51,15 @@ _METRICS = {
     "overtakes": "overtakes per race",
     "contacts": "contacts per race",
 }
-_RANKED = _METRICS | {"near": "time near others"}
+_RANKED = _METRICS | {"beside": "time beside others"}
 
 
 class _RaceMeasures(TelemetryMeasures):
-    """Also whether any opponent is near."""
+    """Also whether any opponent is beside, closer than the largest margin."""
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
-        near = anyone_near(transition.get(("next", STYLE_FEATURES)))
-        return super().step(transition) | {"near": near.float()}
+        beside = anyone_beside(transition.get(("next", STYLE_FEATURES)), within=LATERAL[-1])
+        return super().step(transition) | {"beside": beside.float()}
 
 
 def evaluate_aggressiveness(
@@ -178,7 +178,7 @@ def _pair_results(
         "places_gained": (slots - places)[chosen].astype(float),
         "overtakes": np.array([_overtakes(distance[:end], car) for car in cars], dtype=float),
         "contacts": np.array([_count(touched[:, car]) for car in cars], dtype=float),
-        "near": race["near"][:end, chosen].mean(0),
+        "beside": race["beside"][:end, chosen].mean(0),
         "off": race["off"][:end, chosen].mean(0),
         "metres": distance[end - 1, chosen].astype(float),
     }
@@ -205,7 +205,7 @@ def _rows(cells: Sequence[tuple[str, float]], found: Mapping[str, np.ndarray]) -
         row["win_rate"] = float(of["top_two"].mean())
         row["win_rate_low"], row["win_rate_high"] = wilson_interval(int(of["top_two"].sum()), of["top_two"].size)
         row["either_won"] = float(of["won"].max(1).mean())
-        for name in ("places_gained", "overtakes", "contacts", "near"):
+        for name in ("places_gained", "overtakes", "contacts", "beside"):
             per_race = of[name].mean(1)
             row[name] = float(per_race.mean())
             row[f"{name}_low"], row[f"{name}_high"] = bootstrap_interval(per_race)
@@ -252,11 +252,11 @@ def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Map
     )
     text += "![radar](radar.png)\n\n"
     formats = {"setting": "", "lateral": "g", "win_rate": ".0%", "either_won": ".0%", "places_gained": "+.2f"}
-    formats |= {"overtakes": ".1f", "contacts": ".1f", "near": ".1%", "off": ".1%", "kilometres": ".1f"}
+    formats |= {"overtakes": ".1f", "contacts": ".1f", "beside": ".1%", "off": ".1%", "kilometres": ".1f"}
     text += markdown_table(rows, formats)
     text += "\nWin rate: share of the pair that ends among the first two. Overtakes, contacts: per car and race; a "
     text += f"car has overtaken who was ahead when it is {_PASSED:g} m ahead; contacts within a second count once. "
-    text += f"Near: share of the time with another car within {NEAR_DISTANCE:g} m, centre to centre."
+    text += f"Beside: share of the time with another car alongside, less than {LATERAL[-1]:g} m away."
     text += "\n\nRank correlation with the margin: "
     parts = [
         f"{setting}: " + ", ".join(f"{_RANKED[name]} {value:.2f}" for name, value in summary[setting].items())

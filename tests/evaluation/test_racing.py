@@ -104,13 +104,13 @@ def test_whoever_is_ahead_by_a_length_after_being_behind_has_overtaken():
 
 def test_a_race_ends_when_the_first_car_does():
     distance = np.array([[90.0, 80.0, 70.0], [101.0, 95.0, 99.0], [110.0, 140.0, 150.0]])
-    race = {"distance": distance, "contact": np.eye(3), "near": np.eye(3), "off": np.zeros((3, 3))}
+    race = {"distance": distance, "contact": np.eye(3), "beside": np.eye(3), "off": np.zeros((3, 3))}
     result = _pair_results(race, np.array([2, 0, 1]), np.array([True, False, True]), 100.0)
     assert result["top_two"].tolist() == [1.0, 1.0]
     assert result["won"].tolist() == [1.0, 0.0]
     assert result["places_gained"].tolist() == [2.0, 0.0]
     assert result["contacts"].tolist() == [1.0, 0.0]  # the last one came after the end
-    assert result["near"].tolist() == [0.5, 0.0]
+    assert result["beside"].tolist() == [0.5, 0.0]
 
 
 def test_wilson_interval():
@@ -155,5 +155,5 @@ def test_races_of_the_scripted_driver(tmp_path):
     assert float(by_setting["leader"]["win_rate"]) > 0.9
     assert float(by_setting["pursuer"]["win_rate"]) < 0.1
     # A rolling start puts 14 m between cars; one driver on one line keeps them apart.
-    assert all(0.0 <= float(row["near"]) < 0.5 for row in rows)
+    assert all(0.0 <= float(row["beside"]) < 0.5 for row in rows)
     assert "races per row, 4 laps" in report and (tmp_path / "radar.png").exists()

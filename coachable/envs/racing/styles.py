@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Mapping, Sequence
-from functools import reduce
 
 import torch
 from torch import Tensor
@@ -48,7 +46,18 @@ def style_features_size(cars: int) -> int:
 
 def anyone_near(features: Tensor) -> Tensor:
     """Whether an opponent is near, (...) bool, from style features (..., F) of races."""
-    return features[..., GAPS + GAP_COLUMNS.index("near") :: len(GAP_COLUMNS)].any(-1)
+    return _gap_columns(features)[2].any(-1)
+
+
+def anyone_beside(features: Tensor, *, within: float) -> Tensor:
+    """Whether an opponent overlaps lengthwise and is less than so many metres away sideways, (...) bool."""
+    long, lat, near = _gap_columns(features)
+    return ((near > 0.0) & (long == 0.0) & (lat < within)).any(-1)
+
+
+def _gap_columns(features: Tensor) -> tuple[Tensor, ...]:
+    """Longitudinal gaps, lateral gaps [m] and near flags of all opponents, (..., A - 1) each."""
+    return tuple(features[..., GAPS + column :: len(GAP_COLUMNS)] for column in range(len(GAP_COLUMNS)))
 
 
 def _three_way(neutral: float, bounds: tuple[float, float]) -> Mixture:
@@ -103,31 +112,29 @@ def resource_style_reward(space: StyleSpace) -> StyleReward:
     return StyleReward(space, {"resources": WeightedSum(RESOURCE_NAMES, RESOURCES)})
 
 
-def aggressiveness_style_reward(space: StyleSpace, *, weight: float = 1.0, gate: str = "radius") -> StyleReward:
+def aggressiveness_style_reward(space: StyleSpace, *, weight: float = 1.0, apart: float = 1.0) -> StyleReward:
     """Σ over near opponents of weight · (min(0, d_lon - ξ_lon) + min(0, d_lat - ξ_lat)).
 
     Args:
         space: `aggressiveness_style_space`.
         weight: per metre that a margin is short, in each control step; the paper has none.
-        gate: "radius" charges both gaps of every near car, literally; "overlap" charges a gap only where the cars
-            overlap along the other axis, so that a car straight ahead costs no lateral margin.
+        apart: share of the weight of a gap along one axis while the cars do not overlap along the other, as the
+            lateral gap to a car straight ahead. 1 charges both gaps of every near car, as the paper's formula does; 0
+            those only that more room would widen.
 
     Raises:
-        ValueError: if the gate is unknown.
+        ValueError: if `apart` is not in [0, 1].
     """
-    if gate not in ("radius", "overlap"):
-        raise ValueError(f"gate is {gate!r}: expected 'radius' or 'overlap'")
+    if not 0.0 <= apart <= 1.0:
+        raise ValueError(f"apart is {apart}: expected a share between 0 and 1")
 
     def margins(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
-        parts: list[Tensor] = []
-        for column in range(GAPS, features.shape[-1], len(GAP_COLUMNS)):
-            long, lat, near = features[..., column], features[..., column + 1], features[..., column + 2]
-            too_long = torch.clamp(long - style["longitudinal"], max=0.0)
-            too_lat = torch.clamp(lat - style["lateral"], max=0.0)
-            if gate == "overlap":
-                too_long, too_lat = torch.where(lat == 0.0, too_long, 0.0), torch.where(long == 0.0, too_lat, 0.0)
-            parts.append(weight * near * (too_long + too_lat))
-        return reduce(operator.add, parts) if parts else torch.zeros_like(style["lateral"])
+        long, lat, near = _gap_columns(features)
+        too_long = torch.clamp(long - style["longitudinal"].unsqueeze(-1), max=0.0)
+        too_lat = torch.clamp(lat - style["lateral"].unsqueeze(-1), max=0.0)
+        too_long = torch.where(lat == 0.0, too_long, apart * too_long)
+        too_lat = torch.where(long == 0.0, too_lat, apart * too_lat)
+        return weight * (near * (too_long + too_lat)).sum(-1)
 
     return StyleReward(space, {"margins": Term(margins, parameters=("longitudinal", "lateral"))})
 

@@ -6,6 +6,7 @@ import torch
 from coachable.envs.racing.styles import (
     aggressiveness_style_reward,
     aggressiveness_style_space,
+    anyone_beside,
     drift_style_reward,
     drift_style_space,
     resource_style_reward,
@@ -92,6 +93,15 @@ def test_margin_reward_by_hand():
     assert aggressiveness_style_reward(space, weight=4.0)(features, theta).item() == pytest.approx(-9.0)
     ahead = torch.tensor([[0.0] * 8 + [1.0, 0.0, 1.0]])
     assert aggressiveness_style_reward(space)(ahead, theta).item() == pytest.approx(-2.0)
-    assert aggressiveness_style_reward(space, gate="overlap")(ahead, theta).item() == pytest.approx(-1.0)
-    with pytest.raises(ValueError, match="expected 'radius' or 'overlap'"):
-        aggressiveness_style_reward(space, gate="distance")
+    assert aggressiveness_style_reward(space, apart=0.0)(ahead, theta).item() == pytest.approx(-1.0)
+    assert aggressiveness_style_reward(space, apart=0.1)(ahead, theta).item() == pytest.approx(-1.1)
+    with pytest.raises(ValueError, match="apart is 2: expected a share"):
+        aggressiveness_style_reward(space, apart=2)
+
+
+def test_beside_is_alongside_within_so_many_metres():
+    """Two opponents each: one 0.6 m beside; one ahead; one beside but not near."""
+    far = [3.0, 2.0, 0.0]
+    features = torch.tensor([[0.0] * 8 + far + gaps for gaps in ([0.0, 0.6, 1.0], [0.5, 0.0, 1.0], [0.0, 0.6, 0.0])])
+    assert anyone_beside(features, within=1.0).tolist() == [True, False, False]
+    assert not anyone_beside(features, within=0.5).any()
