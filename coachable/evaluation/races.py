@@ -40,7 +40,7 @@ CARS = 5
 SETTINGS = {"pursuer": (3, 4), "leader": (0, 1)}  # slots of the pair, 0 in front
 LATERAL = (0.0, 0.25, 0.5, 0.75, 1.0)  # [m], of the pair
 OTHERS = tuple(product((0.5, 0.75), repeat=3))  # [m], of the other three
-LONGITUDINAL = 0.0  # [m], of all: a larger one charges cars beside each other, however far they keep apart
+LONGITUDINAL = 0.0  # [m], of all: the lateral margin alone is to act
 LAPS = 4
 RACE_STEPS = 10_000
 _AGAIN = 1.0  # [s], after which touching counts as another contact

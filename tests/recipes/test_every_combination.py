@@ -75,13 +75,20 @@ def test_every_choice_composes(recipe, group):
         assert config["preset"] != "auto", "auto was replaced by what it chose"
 
 
-@pytest.mark.parametrize("preset, weight", [("cpu_races", 2.0), ("cpu_passing", 1.0), ("cpu_late_races", 3.0)])
-def test_the_presets_of_races_are_of_their_family(preset, weight, tmp_path):
+@pytest.mark.parametrize(
+    "preset, margins",
+    [
+        ("cpu_races", {"weight": 2.0}),
+        ("cpu_passing", {"weight": 1.0}),
+        ("cpu_late_races", {"weight": 8.0, "apart": 0.25}),
+    ],
+)
+def test_the_presets_of_races_are_of_their_family(preset, margins, tmp_path):
     config = compose_config("racing_qr_sac", [f"preset={preset}"])
-    assert config["domain"] == "racing_aggressiveness" and config["style_reward"] == {"weight": weight}
+    assert config["domain"] == "racing_aggressiveness" and config["style_reward"] == margins
     assert sum(config["env"]["scenarios"]["shares"].values()) == pytest.approx(1.0)
     config = compose_config("racing_qr_sac", [f"preset={preset}", "family=drift", f"run_dir={tmp_path}"])
-    with pytest.raises(ValueError, match="style_reward has weight: racing_drift takes none"):
+    with pytest.raises(ValueError, match="style_reward has .*weight.*: racing_drift takes none"):
         import_module("racing_qr_sac").build(config)
 
 
