@@ -154,6 +154,6 @@ def test_races_of_the_scripted_driver(tmp_path):
     by_setting = {row["setting"]: row for row in rows}
     assert float(by_setting["leader"]["win_rate"]) > 0.9
     assert float(by_setting["pursuer"]["win_rate"]) < 0.1
-    # A rolling start puts 14 m between cars; one driver on one line keeps them apart.
-    assert all(0.0 <= float(row["beside"]) < 0.5 for row in rows)
+    # A rolling start puts 14 m between cars; one driver on one line hardly ever brings them beside each other.
+    assert all(0.0 <= float(row["beside"]) < 0.05 for row in rows)
     assert "races per row, 4 laps" in report and (tmp_path / "radar.png").exists()

@@ -13,7 +13,7 @@ from coachable.envs.racing.families import check_family
 from coachable.envs.racing.observation import own_columns
 from coachable.envs.racing.referee import TELEMETRY
 from coachable.envs.racing.simulation import CONTROL_STEP
-from coachable.envs.racing.styles import FUEL, GAP_COLUMNS, GAPS, TIRE
+from coachable.envs.racing.styles import FUEL, TIRE, gap_columns
 from coachable.keys import STYLE, STYLE_FEATURES
 
 DRIFT_ANGLE_DEG = 20.0  # that counts as a drift
@@ -132,8 +132,5 @@ def whole_turns(heading: Tensor, alive: Tensor) -> Tensor:
 
 def _margins_kept(features: Tensor, theta: Tensor) -> Tensor:
     """(N,) bool: no near opponent within the longitudinal and the lateral margin at once."""
-    kept = torch.ones(len(features), dtype=torch.bool, device=features.device)
-    for column in range(GAPS, features.shape[1], len(GAP_COLUMNS)):
-        long, lat, near = features[:, column], features[:, column + 1], features[:, column + 2] > 0
-        kept &= ~(near & (long < theta[:, 0]) & (lat < theta[:, 1]))
-    return kept
+    long, lat, near = gap_columns(features)
+    return ~((near > 0.0) & (long < theta[:, :1]) & (lat < theta[:, 1:2])).any(-1)

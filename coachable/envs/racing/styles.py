@@ -46,16 +46,16 @@ def style_features_size(cars: int) -> int:
 
 def anyone_near(features: Tensor) -> Tensor:
     """Whether an opponent is near, (...) bool, from style features (..., F) of races."""
-    return _gap_columns(features)[2].any(-1)
+    return gap_columns(features)[2].any(-1)
 
 
 def anyone_beside(features: Tensor, *, within: float) -> Tensor:
     """Whether an opponent overlaps lengthwise and is less than so many metres away sideways, (...) bool."""
-    long, lat, near = _gap_columns(features)
+    long, lat, near = gap_columns(features)
     return ((near > 0.0) & (long == 0.0) & (lat < within)).any(-1)
 
 
-def _gap_columns(features: Tensor) -> tuple[Tensor, ...]:
+def gap_columns(features: Tensor) -> tuple[Tensor, ...]:
     """Longitudinal gaps, lateral gaps [m] and near flags of all opponents, (..., A - 1) each."""
     return tuple(features[..., GAPS + column :: len(GAP_COLUMNS)] for column in range(len(GAP_COLUMNS)))
 
@@ -129,7 +129,7 @@ def aggressiveness_style_reward(space: StyleSpace, *, weight: float = 1.0, apart
         raise ValueError(f"apart is {apart}: expected a share between 0 and 1")
 
     def margins(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
-        long, lat, near = _gap_columns(features)
+        long, lat, near = gap_columns(features)
         too_long = torch.clamp(long - style["longitudinal"].unsqueeze(-1), max=0.0)
         too_lat = torch.clamp(lat - style["lateral"].unsqueeze(-1), max=0.0)
         too_long = torch.where(lat == 0.0, too_long, apart * too_long)
