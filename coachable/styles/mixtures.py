@@ -70,14 +70,16 @@ def with_requests(space: StyleSpace, *, positive: float = 0.25, full: float = 0.
     return Mixture(parts, [neutral, full, positive, 1.0 - neutral - full - positive])
 
 
-def with_extremes(space: StyleSpace, *, share: float = 0.5) -> Sampler:
+def with_extremes(space: StyleSpace, *, share: float = 0.5, shared: bool = True) -> Sampler:
     """The space's own sampler, mixed with styles whose every parameter is at one of its bounds.
 
     What tells two styles apart is largest between bounds, so that networks hear of it sooner.
 
     Args:
-        space: Its parameters, weights or set-points. Rows that share a style (`Shared`) go on to share it.
+        space: Its parameters, weights or set-points.
         share: Probability that every parameter is at its lower or its upper bound, each equally likely.
+        shared: Whether rows that share a style in the space's own sampler (`Shared`), such as the cars of a race, go on
+            to share it. Otherwise each row has its own: agents then meet others of another style than theirs.
 
     Returns:
         A sampler of the space's dimension.
@@ -88,9 +90,11 @@ def with_extremes(space: StyleSpace, *, share: float = 0.5) -> Sampler:
     _require((Weight, Setpoint), space, "sampler with_extremes asks for bounds, which {} cannot have (a choice)")
     bounds = zip(space.low.tolist(), space.high.tolist(), strict=True)
     extremes = Product([Mixture([PointMass(low), PointMass(high)], [0.5, 0.5]) for low, high in bounds])
-    if isinstance(space.sampler, Shared):
-        return Shared(Mixture([extremes, space.sampler.sampler], [share, 1.0 - share]), space.sampler.copies)
-    return Mixture([extremes, space.sampler], [share, 1.0 - share])
+    own = space.sampler
+    if not isinstance(own, Shared):
+        return Mixture([extremes, own], [share, 1.0 - share])
+    mixed = Mixture([extremes, own.sampler], [share, 1.0 - share])
+    return Shared(mixed, own.copies) if shared else mixed
 
 
 def _others(space: StyleSpace, kinds: tuple[type, ...]) -> list[str]:

@@ -263,15 +263,16 @@ def test_requests_are_drawn_beside_the_spaces_own_styles():
     assert every == pytest.approx(0.25 + 0.5 * 0.25**4, abs=0.005)
 
 
-@pytest.mark.parametrize("copies", [1, 3])
-def test_extremes_are_drawn_beside_the_spaces_own_styles(copies):
+@pytest.mark.parametrize(("copies", "shared"), [(1, True), (3, True), (3, False)])
+def test_extremes_are_drawn_beside_the_spaces_own_styles(copies, shared):
     own = Uniform([0.0, 0.0], [2.0, 1.0])
     space = StyleSpace([Setpoint("a", 0.0, 2.0), Setpoint("b", 0.0, 1.0)], Shared(own, copies) if copies > 1 else own)
-    theta = with_extremes(space, share=0.4).sample((3 * N,), torch.Generator().manual_seed(0))
+    theta = with_extremes(space, share=0.4, shared=shared).sample((3 * N,), torch.Generator().manual_seed(0))
     first, second = theta.unbind(-1)
     for a in (0.0, 2.0):
         for b in (0.0, 1.0):
             assert ((first == a) & (second == b)).float().mean() == pytest.approx(0.1, abs=0.005)
     inside = (first > 0.0) & (first < 2.0) & (second > 0.0) & (second < 1.0)
     assert inside.float().mean() == pytest.approx(0.6, abs=0.005)
-    assert (theta[:N] == theta[N : 2 * N]).all() == (copies == 3)
+    same = (theta[:N] == theta[N : 2 * N]).all(-1).float().mean()
+    assert same == 1.0 if copies == 3 and shared else same == pytest.approx(4 * 0.1**2, abs=0.005)
