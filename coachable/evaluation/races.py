@@ -86,7 +86,7 @@ def evaluate_aggressiveness(
     out.mkdir(parents=True, exist_ok=True)
     cells = [(setting, lateral) for setting in SETTINGS for lateral in LATERAL]
     races = [(setting, lateral, others) for setting, lateral in cells for others in OTHERS for _ in range(episodes)]
-    found = _race(domain, agent, races, settings.steps or RACE_STEPS, seed, settings.progress)
+    found = _race(domain, agent, races, len(cells), settings.steps or RACE_STEPS, seed, settings.progress)
     rows = _rows(cells, {name: values.reshape(len(cells), -1, 2) for name, values in found.items()})
     summary: dict[str, Any] = {
         setting: {
@@ -110,11 +110,12 @@ def _race(
     domain: Domain,
     agent: LoadedPolicy,
     races: Sequence[tuple[str, float, tuple[float, ...]]],
+    cells: int,
     steps: int,
     seed: int,
     progress: bool,
 ) -> dict[str, np.ndarray]:
-    """What `_pair_results` finds in each race, (races, 2)."""
+    """What `_pair_results` finds in each race, (races, 2); those of all cells start alike."""
     space, count = agent.space, len(races)
     simulation: Any = domain.make_env(
         num_envs=CARS * count,
@@ -123,6 +124,8 @@ def _race(
         driver=None,
         scenarios=rolling_start(CARS),
         episode_steps=steps + 1,
+        put_back=True,
+        copies=cells,
     )
     env = coachable_env(simulation, space, domain.make_reward(space), seed=seed)
     # Who starts where is drawn with the start: look, then start again with the same seed.

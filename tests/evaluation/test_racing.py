@@ -147,9 +147,12 @@ def test_a_driver_who_never_drifts(tmp_path):
 
 def test_races_of_the_scripted_driver(tmp_path):
     domain, agent = scripted("aggressiveness", "gt3")
-    report = evaluate_aggressiveness(domain, agent, tmp_path, EvaluationSettings(episodes=1, steps=40, progress=False))
+    settings = EvaluationSettings(episodes=1, steps=40, seed=1, progress=False)
+    report = evaluate_aggressiveness(domain, agent, tmp_path, settings)
     rows = read(tmp_path / "races.csv")
     assert len(rows) == 10 and {row["races"] for row in rows} == {"8"}
+    # It knows no style, and the races of all margins start alike.
+    assert all(row | {"lateral": "0"} in (rows[0], rows[5]) for row in rows)
     # In four seconds nobody overtakes: the leaders stay in front, the pursuers behind.
     by_setting = {row["setting"]: row for row in rows}
     assert float(by_setting["leader"]["win_rate"]) > 0.9

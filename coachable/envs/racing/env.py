@@ -16,7 +16,8 @@ from coachable.envs.racing.garage import Garage
 from coachable.envs.racing.observation import COURSE_POINTS, observation_groups
 from coachable.envs.racing.parameters import Resources, compound_table
 from coachable.envs.racing.profile import Envelope, speed_profile
-from coachable.envs.racing.referee import TELEMETRY, WRONG_WAY_TIME, Referee
+from coachable.envs.racing.referee import TELEMETRY, WRONG_WAY_TIME, Referee, Verdict
+from coachable.envs.racing.rescue import put_back, way_clear
 from coachable.envs.racing.rivals import Rivals
 from coachable.envs.racing.run import RUN_ROWS, Run
 from coachable.envs.racing.scenarios import Conditions, Scenario, Starter, race_scenarios
@@ -40,7 +41,7 @@ class RacingEnv(EnvBase):
 
     Rows, not nested agents: styles, rewards, replay and losses then treat a car like any other environment. Cars of a
     race start together and end together: when one terminates (wrong way, stopped, outside the walls), the others of
-    its race are truncated. None of this depends on the style.
+    its race are truncated, unless stranded cars are put back. None of this depends on the style.
 
     Args:
         num_envs: rows, the cars that the agent drives: races times `controlled`.
@@ -57,11 +58,15 @@ class RacingEnv(EnvBase):
         course_points: points of each edge of the track that a driver sees.
         episode_steps: control steps (0.1 s) after which an episode is truncated.
         wrong_way_time: of going backwards that ends an episode [s].
+        put_back: whether stranded cars (wrong way, stopped, outside the walls) are put back on the track, at 15 m/s, as
+            soon as nobody is near, and no episode terminates: for races. They pay `TaskWeights.stranded` in every step
+            until then.
+        copies: of each start: race b starts like race b + races / copies, to compare styles on equal terms.
         substeps: of physics in a control step; 40 for accurate runs.
         compiled: whether to compile the physics and the task: minutes at first, then several times faster. (TorchRL
             takes `compile` for itself.)
         device: where everything runs.
-        seed: of the starts; race b gets a stream of its own.
+        seed: of the starts; each race, up to `copies`, gets a stream of its own.
         num_threads: ignored; torch's own threads are used.
 
     Keys written: `observation` (N, D), `task_reward` (N, 1), `style_features` (N, 8 + 3 (A - 1)), `telemetry` (N, 12),
@@ -92,6 +97,8 @@ class RacingEnv(EnvBase):
         course_points: int = COURSE_POINTS,
         episode_steps: int = EPISODE_STEPS,
         wrong_way_time: float = WRONG_WAY_TIME,
+        put_back: bool = False,
+        copies: int = 1,
         substeps: int = SUBSTEPS,
         compiled: bool = False,
         device: torch.device | str = "cpu",
@@ -107,9 +114,12 @@ class RacingEnv(EnvBase):
             )
         if controlled < cars and driver is None:
             raise ValueError(f"{cars - controlled} cars of each race have no driver: pass driver=")
+        if copies < 1 or (num_envs // controlled) % copies:
+            raise ValueError(f"copies is {copies}: expected a divisor of the {num_envs // controlled} races")
         super().__init__(device=device, batch_size=torch.Size((num_envs,)))
         self.num_envs, self.cars, self.controlled = num_envs, cars, controlled
         self.races, self.driver, self.episode_steps = num_envs // controlled, driver, episode_steps
+        self.put_back, self.copies = put_back, copies
         self.track = load_track(track) if isinstance(track, str) else track
         place = torch.device(device)
         self.course = Course(self.track, place)
@@ -181,7 +191,8 @@ class RacingEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         start = int(torch.randint(2**31, ()).item()) if seed is None else seed
-        self.seeds = start * 1_000_003 + torch.arange(self.races, device=self.seeds.device)
+        start_of_race = torch.arange(self.races, device=self.seeds.device) % (self.races // self.copies)
+        self.seeds = start * 1_000_003 + start_of_race
         self.episode = torch.zeros_like(self.episode)
         self.garage.reset(start)
 
@@ -231,6 +242,8 @@ class RacingEnv(EnvBase):
         verdict = self._judge(
             old, new, self.run, action, self.compound, self.garage.car, self.simulation.wheels, *several
         )
+        if self.put_back:
+            verdict = self._rescue(verdict)
         self.state, self.run, self._observation = verdict.state, verdict.run, verdict.observation
         n = self.num_envs
         terminated = verdict.terminated[:n, None]
@@ -303,6 +316,21 @@ class RacingEnv(EnvBase):
 
     def _scenario_rows(self) -> Tensor:
         return self.scenario.repeat(self.controlled)[:, None]
+
+    def _rescue(self, verdict: Verdict) -> Verdict:
+        """The verdict with stranded cars back on the track where the way is clear; nobody's episode terminates."""
+        stranded, course, car = verdict.terminated, self.course, self.garage.car
+        verdict = verdict._replace(terminated=torch.zeros_like(stranded))
+        if not stranded.any():
+            return verdict
+        run = Run(*verdict.run.unbind(0))
+        helped = stranded & way_clear(course, run, stranded, self.group)
+        state = torch.where(helped, put_back(course, car, verdict.state, run), verdict.state)
+        begun = Run(*self.referee.begin(state, run.s, run.distance, car, self._groups).unbind(0))
+        begun = begun._replace(steps=run.steps, spins=run.spins)
+        packed_run = torch.where(helped, torch.stack(list(begun)), verdict.run)
+        observation = self.referee.observe(state, packed_run, self.compound, car, self.simulation.wheels, self._groups)
+        return verdict._replace(state=state, run=packed_run, observation=observation)
 
     def _start_races(self, races: Tensor) -> None:
         """New episodes of the races (B,) bool; the others stay as they are."""

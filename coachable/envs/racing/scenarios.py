@@ -213,14 +213,7 @@ class Starter:
 
     def _state(self, car: Car, s: Tensor, offset: Tensor, yaw_error: Tensor, speed: Tensor, u: Tensor) -> Tensor:
         """Packed state (29, A, B): rolling wheels, a fitting gear, tyres and fuel as the conditions ask."""
-        state = torch.zeros(STATE_ROWS, *s.shape, dtype=self.course.table.dtype, device=s.device)
-        x, y, direction = self.course.place(s, offset)
-        yaw = direction + yaw_error
-        radius = car.wheel_radius.reshape(s.shape) if isinstance(car.wheel_radius, Tensor) else car.wheel_radius
-        for name, value in (("x", x), ("y", y), ("yaw", yaw), ("vx", speed)):
-            state[ROW[name]] = value
-        state[SPINS] = speed / radius
-        state[ROW["gear"]] = (1.0 + speed / 14.0).floor().clamp(max=5.0)
+        state = rolling_cars(self.course, car, s, offset, yaw_error, speed)
         conditions = self.conditions
         low, high = _HEAT
         state[HEATS] = low + (high - low) * u[11] if conditions.heat is None else conditions.heat
@@ -238,6 +231,27 @@ class Starter:
 
     def _sensible(self, s: Tensor) -> Tensor:
         return self.speeds[self.course.node(s)]
+
+
+def rolling_cars(course: Course, car: Car, s: Tensor, offset: Tensor, yaw_error: Tensor, speed: Tensor) -> Tensor:
+    """Packed state (29, ...) of cars that roll freely, in a fitting gear, without heat, wear and fuel.
+
+    Args:
+        course: track.
+        car: parameters.
+        s: distance along the track [m]; likewise the following, all of one shape.
+        offset: from the centre line [m].
+        yaw_error: heading relative to the track [rad].
+        speed: [m/s].
+    """
+    state = torch.zeros(STATE_ROWS, *s.shape, dtype=course.table.dtype, device=s.device)
+    x, y, direction = course.place(s, offset)
+    radius = car.wheel_radius.reshape(s.shape) if isinstance(car.wheel_radius, Tensor) else car.wheel_radius
+    for name, value in (("x", x), ("y", y), ("yaw", direction + yaw_error), ("vx", speed)):
+        state[ROW[name]] = value
+    state[SPINS] = speed / radius
+    state[ROW["gear"]] = (1.0 + speed / 14.0).floor().clamp(max=5.0)
+    return state
 
 
 def _longest_straight(course: Course) -> tuple[float, float]:
