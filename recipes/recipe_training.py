@@ -81,7 +81,7 @@ def build_training(
     loss_module.make_value_estimator(gamma=config["gamma"])
     loss_module.to(device)
     if config["init_from"]:
-        initialise_from(config["init_from"], actor, loss_module, space)
+        initialise_from(config["init_from"], actor, loss_module, space, config["init_new_observations"])
     learner = make(config["learner"])(loss_module)
 
     # Replay and collector

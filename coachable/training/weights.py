@@ -124,7 +124,11 @@ def export_weights(checkpoint: Path | str, out: Path | str) -> Path:
 
 
 def initialise_from(
-    path_or_domain: Path | str, actor: TensorDictModuleBase, loss_module: LossModule, space: StyleSpace
+    path_or_domain: Path | str,
+    actor: TensorDictModuleBase,
+    loss_module: LossModule,
+    space: StyleSpace,
+    new_observations: int = 0,
 ) -> None:
     """Starts a new training from the actor and critics of another one; optimisers and replay start empty.
 
@@ -133,6 +137,8 @@ def initialise_from(
         actor: overwritten.
         loss_module: built from `actor`; its critics and their targets are overwritten.
         space: of the new training; it may draw its styles otherwise.
+        new_observations: columns at the end of the observation that the other training did not have. The networks
+            start out blind to them: as good as before, with something new to learn from.
 
     Raises:
         CheckpointError: if style parameters or network shapes differ.
@@ -141,12 +147,27 @@ def initialise_from(
     state = read_state(file)
     _check_space({**state["space"], "sampler": space.to_dict()["sampler"]}, space, file)
     present = loss_module.state_dict()
+    if new_observations:
+        seen = state["network"]["actor"]["obs_dim"]
+        wider = {"actor": _tensors(actor.state_dict()), "critics": _with_prefix(present, _CRITICS)}
+        for part, shapes in wider.items():
+            state[part] = _blind_to(state[part], shapes, seen, new_observations)
     check_fits(state["actor"], _tensors(actor.state_dict()), "actor", file)
     check_fits(state["critics"], _with_prefix(present, _CRITICS), "critics", file)
     actor.load_state_dict(state["actor"])
     for name, value in state["critics"].items():
         for prefix in (_CRITICS, "target_" + _CRITICS):
             present[prefix + name].copy_(value)
+
+
+def _blind_to(saved: Mapping[str, Tensor], present: Mapping[str, Tensor], seen: int, new: int) -> dict[str, Tensor]:
+    """Saved weights with zeros for `new` inputs after the first `seen`, wherever the present ones have as many more."""
+    widened = dict(saved)
+    for name, value in saved.items():
+        if name in present and present[name].shape == (*value.shape[:-1], value.shape[-1] + new):
+            nothing = value.new_zeros(*value.shape[:-1], new)
+            widened[name] = torch.cat([value[..., :seen], nothing, value[..., seen:]], -1)
+    return widened
 
 
 def require_same_agent(saved: Mapping[str, Any], present: Mapping[str, Any], source: Path | str) -> None:

@@ -56,6 +56,7 @@ class RacingEnv(EnvBase):
         resources: wear and fuel rates.
         weights: of the task reward.
         course_points: points of each edge of the track that a driver sees.
+        opponents: whether drivers see opponents; default: in races. A car alone sees none, in as many columns.
         episode_steps: control steps (0.1 s) after which an episode is truncated.
         wrong_way_time: of going backwards that ends an episode [s].
         put_back: whether stranded cars (wrong way, stopped, outside the walls) are put back on the track, at 15 m/s, as
@@ -95,6 +96,7 @@ class RacingEnv(EnvBase):
         resources: Resources | None = None,
         weights: TaskWeights | None = None,
         course_points: int = COURSE_POINTS,
+        opponents: bool | None = None,
         episode_steps: int = EPISODE_STEPS,
         wrong_way_time: float = WRONG_WAY_TIME,
         put_back: bool = False,
@@ -116,6 +118,9 @@ class RacingEnv(EnvBase):
             raise ValueError(f"{cars - controlled} cars of each race have no driver: pass driver=")
         if copies < 1 or (num_envs // controlled) % copies:
             raise ValueError(f"copies is {copies}: expected a divisor of the {num_envs // controlled} races")
+        opponents = cars > 1 if opponents is None else opponents
+        if cars > 1 and not opponents:
+            raise ValueError(f"opponents is False for {cars} cars: expected True, drivers see whom they race against")
         super().__init__(device=device, batch_size=torch.Size((num_envs,)))
         self.num_envs, self.cars, self.controlled = num_envs, cars, controlled
         self.races, self.driver, self.episode_steps = num_envs // controlled, driver, episode_steps
@@ -134,6 +139,7 @@ class RacingEnv(EnvBase):
             substeps,
             course_points,
             pool=self.garage.pooled,
+            opponents=opponents,
             wrong_way_time=wrong_way_time,
         )
         profile = speed_profile(Envelope(self.garage.typical), self.track.table[:, 4].numpy(), self.track.spacing)
@@ -151,7 +157,9 @@ class RacingEnv(EnvBase):
         self.scenario = torch.zeros(self.races, dtype=torch.int64, device=place)
         self.episode = torch.zeros(self.races, dtype=torch.int64, device=place)
         self.seeds = torch.zeros(self.races, dtype=torch.int64, device=place)
-        self.observation_size = sum(width for _, width in observation_groups(cars, self.garage.pooled, course_points))
+        self.observation_size = sum(
+            width for _, width in observation_groups(opponents, self.garage.pooled, course_points)
+        )
         self._observation = torch.zeros(rows, self.observation_size, device=place)
         self._set_seed(seed)
         self._make_specs()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -21,6 +21,7 @@ from coachable.envs.racing.styles import (
     resource_style_space,
 )
 from coachable.envs.racing.task import TaskWeights
+from coachable.envs.racing.track import Track
 from coachable.styles import StyleReward, StyleSpace
 
 RIVALS_GRIP = 0.97  # of the fastest scripted opponents; the slowest use 0.8
@@ -44,7 +45,13 @@ def drift_env(num_envs: int = 64, **options: Any) -> RacingEnv:
 
 
 def resource_env(num_envs: int = 64, **options: Any) -> RacingEnv:
-    """X2019 on Lakeside, tyres and fuel of any state; stints last about ten laps."""
+    """X2019 on Lakeside, tyres and fuel of any state; stints last about ten laps.
+
+    With several `cars`, all are agents, or one is, among scripted ones, where `num_envs` is no multiple of them.
+    """
+    cars = options.get("cars", 1)
+    if num_envs % cars:
+        options = {"controlled": 1, "driver": _line_follower(options, "lakeside", "x2019")[1]} | options
     defaults: dict[str, Any] = {
         "track": "lakeside",
         "car": "x2019",
@@ -71,17 +78,22 @@ def rival_env(num_envs: int = AGENTS * 21, **options: Any) -> RacingEnv:
 
     One agent among four rivals where `num_envs` is no multiple of three.
     """
-    track, car = options.get("track", "endurance"), options.get("car", "gt3")
-    course = load_track(track) if isinstance(track, str) else track
-    driver = LineFollower(course, load_car(car), grip=RIVALS_GRIP, lanes=(0.0, 2.2, -2.2))
+    course, driver = _line_follower(options, "endurance", "gt3")
     defaults: dict[str, Any] = {
         "cars": CARS,
         "controlled": AGENTS if num_envs % AGENTS == 0 else 1,
         "driver": Rivals(driver, aggressiveness_style_space(), slowest=0.8 / RIVALS_GRIP),
-        "car": car,
+        "car": "gt3",
         "scenarios": race_scenarios(CARS),
     }
     return RacingEnv(num_envs, **{**defaults, **options, "track": course})
+
+
+def _line_follower(options: Mapping[str, Any], track: str, car: str) -> tuple[Track, LineFollower]:
+    """The track of an environment with these options, and the fastest scripted opponent on it."""
+    chosen = options.get("track", track)
+    course = load_track(chosen) if isinstance(chosen, str) else chosen
+    return course, LineFollower(course, load_car(options.get("car", car)), grip=RIVALS_GRIP, lanes=(0.0, 2.2, -2.2))
 
 
 class Family(NamedTuple):

@@ -19,11 +19,12 @@ COURSE_POINTS = 20
 COURSE_TIME = 6.0  # [s] of travel that the course points cover
 _COURSE_SPEED_MIN = 10.0  # [m/s], so that a slow car sees further than its bonnet
 OPPONENTS = 4
+OPPONENT_COLUMNS = 8 * OPPONENTS + 1  # with the slipstream
 _SEEN = 150.0  # [m]
 
 
-def observation_groups(cars: int, pool: bool, course_points: int = COURSE_POINTS) -> tuple[tuple[str, int], ...]:
-    """Name and width of each block, in order."""
+def observation_groups(opponents: bool, pool: bool, course_points: int = COURSE_POINTS) -> tuple[tuple[str, int], ...]:
+    """Name and width of each block, in order. What drivers see of opponents comes last."""
     groups = [
         ("motion", 5),
         ("tyre_load", 4),
@@ -42,7 +43,7 @@ def observation_groups(cars: int, pool: bool, course_points: int = COURSE_POINTS
     if pool:
         groups.append(("car", 8))
     groups.append(("course", 4 * course_points))
-    if cars > 1:
+    if opponents:
         groups += [("opponents", 8 * OPPONENTS), ("slipstream", 1)]
     return tuple(groups)
 
@@ -54,7 +55,7 @@ def own_columns(name: str) -> slice:
         KeyError: if there is no such block.
     """
     first = 0
-    for block, width in observation_groups(1, pool=False):
+    for block, width in observation_groups(False, pool=False):
         if block == name:
             return slice(first, first + width)
         first += width

@@ -11,6 +11,7 @@ from torch import Tensor
 from coachable.envs.racing.dynamics import WheelSet
 from coachable.envs.racing.observation import (
     COURSE_POINTS,
+    OPPONENT_COLUMNS,
     car_columns,
     course_ahead,
     opponents_seen,
@@ -78,6 +79,7 @@ class Referee:
         course_points: points of each edge that a driver sees.
         substeps: of a control step.
         pool: whether cars differ, so that drivers are told which they have.
+        opponents: whether drivers see opponents.
         wrong_way_time: of going backwards that ends an episode [s].
     """
 
@@ -87,6 +89,7 @@ class Referee:
     substeps: int
     course_points: int = COURSE_POINTS
     pool: bool = False
+    opponents: bool = False
     wrong_way_time: float = WRONG_WAY_TIME
 
     def command(self, packed: Tensor, packed_run: Tensor, action: Tensor, compound: Tensor) -> tuple[Tensor, Tensor]:
@@ -213,6 +216,8 @@ class Referee:
             bodies = bodies_of(packed, car, self.cars)
             others = look_around(self._split(run.s), self._split(run.offset), group, self.course.length)
             parts += [opponents_seen(bodies, others), run.slipstream[:, None]]
+        elif self.opponents:
+            parts.append(run.slipstream.new_zeros(len(run.slipstream), OPPONENT_COLUMNS))
         return torch.cat(parts, dim=1)
 
     def begin(self, packed: Tensor, s: Tensor, distance: Tensor, car: Car, group: Tensor | None) -> Tensor:
