@@ -17,8 +17,10 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from coachable.envs.racing.measures import TelemetryMeasures
+from coachable.envs.racing.run import Run
 from coachable.envs.racing.scenarios import rolling_start
 from coachable.envs.racing.simulation import CONTROL_STEP
 from coachable.envs.racing.styles import anyone_beside
@@ -34,6 +36,7 @@ from matplotlib import pyplot as plt
 
 if TYPE_CHECKING:
     from coachable.domain import Domain
+    from coachable.envs.racing.env import RacingEnv
     from coachable.training.weights import LoadedPolicy
 
 CARS = 5
@@ -128,11 +131,7 @@ def _race(
         copies=cells,
     )
     env = coachable_env(simulation, space, domain.make_reward(space), seed=seed)
-    # Who starts where is drawn with the start: look, then start again with the same seed.
-    env.set_seed(seed)
-    env.reset()
-    ahead = simulation.run[4].reshape(CARS, count)  # distance: 0 for the first car, then negative
-    slots = (-ahead).argsort(0).argsort(0)
+    slots = starting_slots(env, simulation, seed)
     theta = space.default.repeat(CARS * count, 1).reshape(CARS, count, -1)
     theta[..., space.slices["longitudinal"]] = LONGITUDINAL
     lateral = torch.empty(CARS, count)
@@ -163,6 +162,20 @@ def _race(
         for race, chosen in enumerate(pair.T.numpy())
     ]
     return {name: np.stack([car[name] for car in cars]) for name in cars[0]}
+
+
+def starting_slots(env: EnvBase, simulation: RacingEnv, seed: int) -> Tensor:
+    """Who starts where, (A, B), 0 in front. Starts the races to see it: to race, start again with the same seed.
+
+    Args:
+        env: with style transforms.
+        simulation: inside it, every car controlled.
+        seed: of the races.
+    """
+    env.set_seed(seed)
+    env.reset()
+    ahead = Run(*simulation.run.unbind(0)).distance  # 0 for the first car, then negative
+    return (-ahead.reshape(simulation.cars, -1)).argsort(0).argsort(0)
 
 
 def _pair_results(

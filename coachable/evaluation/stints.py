@@ -22,6 +22,7 @@ from coachable.evaluation.rollouts import record_episodes
 from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
 from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_csv
+from coachable.evaluation.traffic import draw_traffic, race_in_traffic, traffic_report, traffic_response
 from coachable.transforms import coachable_env
 
 matplotlib.use("Agg")
@@ -74,7 +75,8 @@ def evaluate_resources(
 
     As in the paper, the other resource is switched off. Files: `stints.csv` (by resource and weight), `laps.csv` (every
     lap), `stints.png` (resource left and lap times over laps), `tradeoff.png` (range against pace, with the frontier),
-    `report.md`, `summary.json`.
+    `report.md`, `summary.json`. An agent that was trained among others also races them, see `race_in_traffic`:
+    `traffic.csv`, `traffic.png`.
 
     Args:
         domain: racing_resources, as the agent was trained in.
@@ -114,6 +116,11 @@ def evaluate_resources(
         domain, agent, [{}], max(episodes, 10), rates, Conditions(fuel=TANK / 2), "fuel", label="trial", **options
     )
     summary = _summary(rows, trial, frontiers["fuel"][0]["lap_time"], episodes, seed)
+    traffic = race_in_traffic(domain, agent, settings) if trained.get("cars", 1) > 1 else []
+    if traffic:
+        summary["traffic"] = traffic_response(traffic)
+        write_csv(traffic, out / "traffic.csv")
+        draw_traffic(traffic, out / "traffic.png")
     write_csv(rows, out / "stints.csv")
     if every:
         write_csv(every, out / "laps.csv")
@@ -121,6 +128,8 @@ def evaluate_resources(
     draw_tradeoff(rows, frontiers, out / "tradeoff.png")
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     report = _report(agent, rows, summary, seed, episodes)
+    if traffic:
+        report += traffic_report(traffic, summary["traffic"])
     (out / "report.md").write_text(report)
     return report
 

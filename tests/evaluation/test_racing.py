@@ -160,3 +160,17 @@ def test_races_of_the_scripted_driver(tmp_path):
     # A rolling start puts 14 m between cars; one driver on one line hardly ever brings them beside each other.
     assert all(0.0 <= float(row["beside"]) < 0.05 for row in rows)
     assert "races per row, 4 laps" in report and (tmp_path / "radar.png").exists()
+
+
+def test_traffic_of_the_scripted_driver():
+    domain, agent = scripted("resources", "x2019", cars=3)
+    rows = race_in_traffic(domain, agent, EvaluationSettings(episodes=1, steps=20, progress=False))
+    assert [(row["sweep"], row["weight"]) for row in rows[4:6]] == [("overtake", 2.0), ("defend", 0.0)]
+    # It knows no style, and the races of all weights start alike.
+    for sweep in (rows[:5], rows[5:]):
+        assert all(row | {"weight": 0.0} == sweep[0] for row in sweep)
+    # Whoever starts last has nobody behind, whoever starts first nobody ahead.
+    assert rows[0]["defend"] == 0.0 and rows[5]["overtake"] == 0.0 and rows[0]["overtake"] != 0.0
+    response = traffic_response([row | {row["sweep"]: row["weight"] ** 2} for row in rows])
+    assert response == {"overtake": pytest.approx(1.0), "defend": pytest.approx(1.0)}
+    assert "\n## Among others\n" in traffic_report(rows, response)
