@@ -113,16 +113,16 @@ def draw_drift(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         own = [row for row in rows if row["sweep"] == sweep]
         weights, angle = [row["weight"] for row in own], np.array([row[ANGLE] for row in own])
         error = np.abs(np.array([[row["angle_low"], row["angle_high"]] for row in own]) - angle[:, None]).T
-        left.errorbar(weights, angle, error, marker=marker, capsize=3, label=f"{sweep}, 95 % interval")
+        left.errorbar(weights, angle, error, marker=marker, capsize=3)
         right.plot(weights, [row["pace_kept"] for row in own], marker=marker, label=sweep)
     for line in (DRIFT_ANGLE_DEG, GRIP_ANGLE_DEG):
         left.axhline(line, color="0.6", lw=1, ls=":")
-    left.set(xlabel="requested weight", ylabel="mean slip angle of the rear tyres [deg]")
+    left.set(xlabel="requested weight", ylabel="mean slip angle of the rear tyres [deg], 95 % interval")
     right.set(xlabel="requested weight", ylabel="progress, share of that at 0")
+    right.legend(fontsize=8, loc="lower left")  # of both: on the left the lines leave no room
     for panel in (left, right):
         panel.set_ylim(0.0, None)
         panel.grid(alpha=0.3)
-        panel.legend(fontsize=8)
     figure.savefig(path, dpi=130)
     plt.close(figure)
 

@@ -20,6 +20,7 @@ from coachable.evaluation.races import _count, _overtakes, _pair_results, evalua
 from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.statistics import wilson_interval
 from coachable.evaluation.stints import _stint, evaluate_resources, range_at
+from coachable.evaluation.traffic import race_in_traffic, traffic_report, traffic_response
 from coachable.training.weights import LoadedPolicy
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from recipe_config import compose_config, config_groups
+from tensordict import TensorDict
 
 from coachable.envs.racing.families import racing_family
 from coachable.training.checkpoint import find_checkpoint, read_state
@@ -91,6 +92,18 @@ def test_the_presets_of_races_are_of_their_family(preset, margins, shared, tmp_p
     config = compose_config("racing_qr_sac", [f"preset={preset}", "family=drift", f"run_dir={tmp_path}"])
     with pytest.raises(ValueError, match=f"style_reward has {', '.join(sorted(margins))}: racing_drift takes none"):
         import_module("racing_qr_sac").build(config)
+
+
+def test_a_driver_who_drove_alone_starts_out_blind_to_others(tmp_path):
+    alone = _train("racing_qr_sac", tmp_path / "alone", "family=resources")
+    choice = ["family=resources", "+env.cars=3", "env.num_envs=3", f"init_from={tmp_path / 'alone'}"]
+    with pytest.raises(RuntimeError, match=r"\(\d+, 141\) in the checkpoint, \(\d+, 174\) here"):
+        _train("racing_qr_sac", tmp_path / "refused", *choice)
+    among = _train("racing_qr_sac", tmp_path / "among", *choice, "init_new_observations=33", "train.utd_ratio=0")
+    seen, theta, others = torch.randn(5, 137), torch.randn(5, 4), torch.randn(5, 33)
+    action = alone.collector.policy(TensorDict({"observation": seen, "style": theta}, [5]))["loc"]
+    wider = TensorDict({"observation": torch.cat([seen, others], -1), "style": theta}, [5])
+    torch.testing.assert_close(among.collector.policy(wider)["loc"], action)
 
 
 @pytest.mark.parametrize("loss, replay", [("sac", "uniform"), ("cat_rac", "event_tables")])

@@ -30,16 +30,12 @@ AGENTS, CARS = 3, 5  # in a race of the aggressiveness family
 
 
 def drift_env(num_envs: int = 64, **options: Any) -> RacingEnv:
-    """Street car on Ridge, launched anywhere in any direction; it may slide backwards for ten seconds.
-
-    Changes of the steering command cost nothing: its agent was trained so, and a slide is steered by flicks.
-    """
+    """Street car on Ridge, launched anywhere in any direction; it may slide backwards for ten seconds."""
     defaults: dict[str, Any] = {
         "track": "ridge",
         "car": "street",
         "scenarios": drift_scenarios(),
         "wrong_way_time": 10.0,
-        "weights": TaskWeights(steering_change=0.0),
     }
     return RacingEnv(num_envs, **(defaults | options))
 
