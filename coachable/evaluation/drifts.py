@@ -107,7 +107,7 @@ def _rows(sweep: str, episodes: Mapping[str, np.ndarray]) -> list[dict[str, Any]
 
 
 def draw_drift(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Rear slip angle, and pace, over the weight, a line per sweep."""
+    """Mean rear slip angle with its 95 % interval, and pace, over the weight, a line per sweep."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.8), layout="constrained")
     for sweep, marker in zip(SWEEPS, "ovs", strict=True):
         own = [row for row in rows if row["sweep"] == sweep]
@@ -117,7 +117,7 @@ def draw_drift(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         right.plot(weights, [row["pace_kept"] for row in own], marker=marker, label=sweep)
     for line in (DRIFT_ANGLE_DEG, GRIP_ANGLE_DEG):
         left.axhline(line, color="0.6", lw=1, ls=":")
-    left.set(xlabel="requested weight", ylabel="mean slip angle of the rear tyres [deg], 95 % interval")
+    left.set(xlabel="requested weight", ylabel="slip angle of the rear tyres [deg], 95 %")
     right.set(xlabel="requested weight", ylabel="progress, share of that at 0")
     right.legend(fontsize=8, loc="lower left")  # of both: on the left the lines leave no room
     for panel in (left, right):
