@@ -45,6 +45,21 @@ def test_five_cars_from_the_pool_start_a_race():
     assert len(set(env.compound[2:].argmax(0).reshape(5, 2)[:, 0].tolist())) == 1
 
 
+def test_who_learnt_among_others_is_shown_alone():
+    domain = load_domain("racing_resources", {"env": {"track": "ring", "cars": 3}})
+    alone, before = domain.make_env(num_envs=4, seed=0), load_domain("racing_resources", {"env": {"track": "ring"}})
+    seen = alone.reset()["observation"]
+    assert alone.cars == 1 and seen.shape[-1] == sum(width for _, width in domain.observation_groups)
+    assert torch.equal(seen[:, :-33], before.make_env(num_envs=4, seed=0).reset()["observation"])
+    assert not seen[:, -33:].any()
+
+
+def test_an_agent_of_tyres_and_fuel_races_agents_or_scripted_drivers():
+    agents, one = (family_env(n, family="resources", cars=3, track="ring", seed=0) for n in (6, 4))
+    assert (agents.races, agents.controlled, one.races, one.controlled) == (2, 3, 4, 1)
+    assert one.rollout(3)["next", "observation"].isfinite().all()
+
+
 def test_an_unknown_family_is_refused():
     with pytest.raises(ValueError, match="unknown family 'speed'"):
         RacingMeasures("speed")

@@ -128,6 +128,7 @@ def test_bad_actions_are_refused():
         ({"num_envs": 21, "cars": 21}, "20 grid slots"),
         ({"num_envs": 2, "cars": 2, "controlled": 1}, "no driver"),
         ({"num_envs": 6, "cars": 2, "copies": 2}, "divisor of the 3 races"),
+        ({"num_envs": 2, "cars": 2, "opponents": False}, "opponents is False for 2 cars"),
         ({"num_envs": 2, "car": "tractor"}, "unknown car"),
         ({"num_envs": 2, "track": "road"}, "unknown track"),
         ({"num_envs": 2, "scenarios": (Scenario("a", 0.5, "solo"),)}, "add up to 0.5"),
