@@ -46,6 +46,7 @@ OTHERS = tuple(product((0.5, 0.75), repeat=3))  # [m], of the other three
 LONGITUDINAL = 0.0  # [m], of all: the lateral margin alone is to act
 LAPS = 4
 RACE_STEPS = 10_000
+START_STEPS = 600  # a minute, in which the field sorts itself out
 _AGAIN = 1.0  # [s], after which touching counts as another contact
 _PASSED = 5.0  # [m], about a car's length: as far ahead of another who was ahead, a car has overtaken it
 _METRICS = {
@@ -54,7 +55,7 @@ _METRICS = {
     "overtakes": "overtakes per race",
     "contacts": "contacts per race",
 }
-_RANKED = _METRICS | {"beside": "time beside others"}
+_RANKED = _METRICS | {"places_later": "places gained after the first minute", "beside": "time beside others"}
 
 
 class _RaceMeasures(TelemetryMeasures):
@@ -185,13 +186,14 @@ def _pair_results(
     distance = race["distance"]
     done = np.flatnonzero(distance.max(1) >= finish)
     end = int(done[0]) + 1 if len(done) else len(distance)
-    places = (-distance[end - 1]).argsort().argsort()
+    places, early = ((-distance[step - 1]).argsort().argsort() for step in (end, min(START_STEPS, end)))
     cars = np.flatnonzero(chosen).tolist()
     touched = race["contact"][:end] > 0
     return {
         "top_two": (places < 2)[chosen].astype(float),
         "won": (places == 0)[chosen].astype(float),
         "places_gained": (slots - places)[chosen].astype(float),
+        "places_later": (early - places)[chosen].astype(float),
         "overtakes": np.array([_overtakes(distance[:end], car) for car in cars], dtype=float),
         "contacts": np.array([_count(touched[:, car]) for car in cars], dtype=float),
         "beside": race["beside"][:end, chosen].mean(0),
@@ -221,7 +223,7 @@ def _rows(cells: Sequence[tuple[str, float]], found: Mapping[str, np.ndarray]) -
         row["win_rate"] = float(of["top_two"].mean())
         row["win_rate_low"], row["win_rate_high"] = wilson_interval(int(of["top_two"].sum()), of["top_two"].size)
         row["either_won"] = float(of["won"].max(1).mean())
-        for name in ("places_gained", "overtakes", "contacts", "beside"):
+        for name in ("places_gained", "places_later", "overtakes", "contacts", "beside"):
             per_race = of[name].mean(1)
             row[name] = float(per_race.mean())
             row[f"{name}_low"], row[f"{name}_high"] = bootstrap_interval(per_race)
@@ -268,10 +270,12 @@ def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Map
     )
     text += "![radar](radar.png)\n\n"
     formats = {"setting": "", "lateral": "g", "win_rate": ".0%", "either_won": ".0%", "places_gained": "+.2f"}
+    formats |= {"places_later": "+.2f"}
     formats |= {"overtakes": ".1f", "contacts": ".1f", "beside": ".1%", "off": ".1%", "kilometres": ".1f"}
     text += markdown_table(rows, formats)
     text += "\nWin rate: share of the pair that ends among the first two. Overtakes, contacts: per car and race; a "
     text += f"car has overtaken who was ahead when it is {_PASSED:g} m ahead; contacts within a second count once. "
+    text += "Places later: gained after the first minute. "
     text += f"Beside: share of the time with another car alongside, less than {LATERAL[-1]:g} m away."
     text += "\n\nRank correlation with the margin: "
     parts = [

@@ -114,6 +114,15 @@ def test_a_race_ends_when_the_first_car_does():
     assert result["beside"].tolist() == [0.5, 0.0]
 
 
+def test_places_of_the_first_minute_count_apart():
+    steps = np.arange(700.0)
+    distance = np.stack([40 * steps, 41 * steps - 25, 20 * steps + 13_100], axis=1)  # the third is passed at 655, 625
+    race = {name: np.zeros((700, 3)) for name in ("contact", "beside", "off")}
+    result = _pair_results({"distance": distance, **race}, np.array([1, 2, 0]), np.array([True, True, False]), 1e9)
+    assert result["places_gained"].tolist() == [0.0, 2.0]
+    assert result["places_later"].tolist() == [1.0, 1.0]
+
+
 def test_wilson_interval():
     low, high = wilson_interval(8, 10)
     assert (low, high) == (pytest.approx(0.4902, abs=1e-4), pytest.approx(0.9433, abs=1e-4))
