@@ -27,7 +27,18 @@ from coachable.training.loop import Train
 CONFIGS = Path(__file__).resolve().parent / "configs"
 
 # What a checkpoint decides: its weights, its replay buffer and its generators belong to these values.
-_FIXED = ("domain", "seed", "network", "loss", "gamma", "style_reward", "replay", "replay_capacity", "init_from")
+_FIXED = (
+    "domain",
+    "seed",
+    "network",
+    "loss",
+    "gamma",
+    "style_reward",
+    "replay",
+    "replay_capacity",
+    "init_from",
+    "init_new_observations",
+)
 
 # Options of Hydra that are followed by a value.
 _VALUED = (

@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
 
 from coachable.envs.racing.measures import TelemetryMeasures
 from coachable.envs.racing.run import Run
@@ -36,7 +35,6 @@ from matplotlib import pyplot as plt
 
 if TYPE_CHECKING:
     from coachable.domain import Domain
-    from coachable.envs.racing.env import RacingEnv
     from coachable.training.weights import LoadedPolicy
 
 CARS = 5
@@ -90,7 +88,7 @@ def evaluate_aggressiveness(
     out.mkdir(parents=True, exist_ok=True)
     cells = [(setting, lateral) for setting in SETTINGS for lateral in LATERAL]
     races = [(setting, lateral, others) for setting, lateral in cells for others in OTHERS for _ in range(episodes)]
-    found = _race(domain, agent, races, len(cells), settings.steps or RACE_STEPS, seed, settings.progress)
+    found = _race(domain, agent, races, len(cells), settings)
     rows = _rows(cells, {name: values.reshape(len(cells), -1, 2) for name, values in found.items()})
     summary: dict[str, Any] = {
         setting: {
@@ -115,68 +113,94 @@ def _race(
     agent: LoadedPolicy,
     races: Sequence[tuple[str, float, tuple[float, ...]]],
     cells: int,
-    steps: int,
-    seed: int,
-    progress: bool,
+    settings: EvaluationSettings,
 ) -> dict[str, np.ndarray]:
     """What `_pair_results` finds in each race, (races, 2); those of all cells start alike."""
     space, count = agent.space, len(races)
-    simulation: Any = domain.make_env(
-        num_envs=CARS * count,
-        cars=CARS,
-        controlled=CARS,
-        driver=None,
-        scenarios=rolling_start(CARS),
-        episode_steps=steps + 1,
-        put_back=True,
-        copies=cells,
-    )
-    env = coachable_env(simulation, space, domain.make_reward(space), seed=seed)
-    slots = starting_slots(env, simulation, seed)
-    theta = space.default.repeat(CARS * count, 1).reshape(CARS, count, -1)
+    theta = space.default.repeat(CARS, count, 1)
     theta[..., space.slices["longitudinal"]] = LONGITUDINAL
-    lateral = torch.empty(CARS, count)
-    pair = torch.zeros(CARS, count, dtype=torch.bool)
+    pair = np.zeros((CARS, count), dtype=bool)
     for race, (setting, margin, others) in enumerate(races):
-        by_slot = list(others)
+        lateral = list(others)
         for slot in SETTINGS[setting]:
-            by_slot.insert(slot, margin)
-            pair[slots[:, race] == slot, race] = True
-        lateral[:, race] = torch.tensor(by_slot)[slots[:, race]]
-    theta[..., space.slices["lateral"]] = lateral[..., None]
-    record = record_episodes(
-        env,
-        agent.actor,
-        theta.reshape(CARS * count, -1),
+            lateral.insert(slot, margin)
+            pair[slot, race] = True
+        theta[:, race, space.slices["lateral"]] = torch.tensor(lateral)[:, None]
+    measured, length = race_alike(
+        domain,
+        agent,
+        theta,
         _RaceMeasures("distance", "contact", "off"),
-        steps=steps,
-        seed=seed,
-        progress=f"{count} races of {CARS} cars" if progress else None,
+        settings,
+        copies=cells,
+        steps=settings.steps or RACE_STEPS,
+        scenarios=rolling_start(CARS),
     )
-    env.close()
-    shaped = {name: value.reshape(len(value), CARS, count).numpy() for name, value in record.measures.items()}
-    finish = LAPS * simulation.course.length
+    values, slots = {name: value.numpy() for name, value in measured.items()}, np.arange(CARS)
     cars = [
-        _pair_results(
-            {name: values[:, :, race] for name, values in shaped.items()}, slots[:, race].numpy(), chosen, finish
-        )
-        for race, chosen in enumerate(pair.T.numpy())
+        _pair_results({name: value[:, :, race] for name, value in values.items()}, slots, pair[:, race], LAPS * length)
+        for race in range(count)
     ]
     return {name: np.stack([car[name] for car in cars]) for name in cars[0]}
 
 
-def starting_slots(env: EnvBase, simulation: RacingEnv, seed: int) -> Tensor:
-    """Who starts where, (A, B), 0 in front. Starts the races to see it: to race, start again with the same seed.
+def race_alike(
+    domain: Domain,
+    agent: LoadedPolicy,
+    theta: Tensor,
+    measures: TelemetryMeasures,
+    settings: EvaluationSettings,
+    *,
+    copies: int,
+    steps: int,
+    **options: Any,
+) -> tuple[dict[str, Tensor], float]:
+    """Races between copies of an agent on equal terms. Cars go by the slots they start from, 0 in front.
 
     Args:
-        env: with style transforms.
-        simulation: inside it, every car controlled.
-        seed: of the races.
+        domain: as the agent was trained in.
+        agent: the policy of all cars; acts deterministically.
+        theta: (A, B, d) styles of A cars in B races.
+        measures: what is measured.
+        settings: seed, and whether to show a progress bar.
+        copies: of each start: race b starts like race b + B / copies.
+        steps: of each race; stranded cars are put back on the track.
+        **options: of the environment.
+
+    Returns:
+        What is measured, (T, A, B) each, and the length of the track [m].
     """
-    env.set_seed(seed)
+    cars, races, _ = theta.shape
+    simulation: Any = domain.make_env(
+        num_envs=cars * races,
+        cars=cars,
+        controlled=cars,
+        driver=None,
+        episode_steps=steps + 1,
+        put_back=True,
+        copies=copies,
+        **options,
+    )
+    env = coachable_env(simulation, agent.space, domain.make_reward(agent.space), seed=settings.seed)
+    # Who starts where is drawn with the start: look, then start again with the same seed.
+    env.set_seed(settings.seed)
     env.reset()
-    ahead = Run(*simulation.run.unbind(0)).distance  # 0 for the first car, then negative
-    return (-ahead.reshape(simulation.cars, -1)).argsort(0).argsort(0)
+    distance = Run(*simulation.run.unbind(0)).distance  # 0 for the first car, then negative
+    car_at = (-distance.reshape(cars, races)).argsort(0)  # each slot
+    rows = theta.gather(0, car_at.argsort(0)[..., None].expand_as(theta))
+    record = record_episodes(
+        env,
+        agent.actor,
+        rows.reshape(cars * races, -1),
+        measures,
+        steps=steps,
+        seed=settings.seed,
+        progress=f"{races} races of {cars} cars" if settings.progress else None,
+    )
+    env.close()
+    measured = {name: values.reshape(-1, cars, races) for name, values in record.measures.items()}
+    by_slot = {name: values.gather(1, car_at.expand_as(values)) for name, values in measured.items()}
+    return by_slot, simulation.course.length
 
 
 def _pair_results(
@@ -270,8 +294,14 @@ def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Map
     )
     text += "![radar](radar.png)\n\n"
     formats = {"setting": "", "lateral": "g", "win_rate": ".0%", "either_won": ".0%", "places_gained": "+.2f"}
-    formats |= {"places_later": "+.2f"}
-    formats |= {"overtakes": ".1f", "contacts": ".1f", "beside": ".1%", "off": ".1%", "kilometres": ".1f"}
+    formats |= {
+        "places_later": "+.2f",
+        "overtakes": ".1f",
+        "contacts": ".1f",
+        "beside": ".1%",
+        "off": ".1%",
+        "kilometres": ".1f",
+    }
     text += markdown_table(rows, formats)
     text += "\nWin rate: share of the pair that ends among the first two. Overtakes, contacts: per car and race; a "
     text += f"car has overtaken who was ahead when it is {_PASSED:g} m ahead; contacts within a second count once. "

@@ -15,13 +15,11 @@ from torch import Tensor
 from coachable.envs.racing.measures import TelemetryMeasures
 from coachable.envs.racing.scenarios import Conditions, Scenario
 from coachable.envs.racing.styles import DEFEND, OVERTAKE
-from coachable.evaluation.races import starting_slots
-from coachable.evaluation.rollouts import record_episodes
+from coachable.evaluation.races import race_alike
 from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
 from coachable.evaluation.style_grid import markdown_table
 from coachable.keys import STYLE_FEATURES
-from coachable.transforms import coachable_env
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -37,7 +35,6 @@ OTHERS_WEIGHT = 1.0  # of overtaking and of defending, of the other cars; and of
 TRAFFIC_STEPS = 600  # 60 s
 RACES = 32  # per weight, for each of `EvaluationSettings.episodes`
 _START = (Scenario("passing", 1.0, "passing", CARS),)
-_MEASURED = ("overtake", "defend", "places_gained", "contact", "off")
 
 
 class _TrafficMeasures(TelemetryMeasures):
@@ -65,48 +62,32 @@ def race_in_traffic(domain: Domain, agent: LoadedPolicy, settings: EvaluationSet
     """
     races, steps = RACES * settings.episodes, min(settings.steps or TRAFFIC_STEPS, TRAFFIC_STEPS)
     cells = [(name, weight) for name in SLOTS for weight in TRAFFIC_WEIGHTS]
-    count, space = len(cells) * races, agent.space
-    simulation: Any = domain.make_env(
-        num_envs=CARS * count,
-        cars=CARS,
-        opponents=True,
+    space = agent.space
+    theta = space.make(strict=True, overtake=OTHERS_WEIGHT, defend=OTHERS_WEIGHT).repeat(CARS, len(cells) * races, 1)
+    for index, (name, weight) in enumerate(cells):
+        theta[SLOTS[name], index * races : (index + 1) * races, space.slices[name]] = weight
+    measured, _ = race_alike(
+        domain,
+        agent,
+        theta,
+        _TrafficMeasures("contact", "off", "place"),
+        settings,
+        copies=len(cells),
+        steps=steps,
         scenarios=_START,
         conditions=Conditions.resources(),
-        episode_steps=steps + 1,
-        put_back=True,
-        copies=len(cells),
     )
-    env = coachable_env(simulation, space, domain.make_reward(space), seed=settings.seed)
-    slots = starting_slots(env, simulation, settings.seed)
-    theta = space.make(strict=True, overtake=OTHERS_WEIGHT, defend=OTHERS_WEIGHT).repeat(CARS, count, 1)
-    chosen = torch.zeros(CARS, count, dtype=torch.bool)
-    for index, (name, weight) in enumerate(cells):
-        own = slice(index * races, (index + 1) * races)
-        chosen[:, own] = slots[:, own] == SLOTS[name]
-        column = theta[:, own, space.slices[name]]
-        theta[:, own, space.slices[name]] = torch.where(chosen[:, own, None], weight, column)
-    record = record_episodes(
-        env,
-        agent.actor,
-        theta.reshape(CARS * count, -1),
-        _TrafficMeasures("contact", "off", "place"),
-        steps=steps,
-        seed=settings.seed,
-        progress=f"traffic: {count} races of {CARS} cars" if settings.progress else None,
-    )
-    env.close()
-    shaped = {name: value.reshape(len(value), CARS, count).double() for name, value in record.measures.items()}
-    found = {name: shaped[name].sum(0) for name in ("overtake", "defend")}
-    found |= {name: shaped[name].mean(0) for name in ("contact", "off")}
-    found["places_gained"] = slots + 1.0 - shaped["place"][-1]
+    values = {name: value.double() for name, value in measured.items()}
+    found = {name: values[name].sum(0) for name in ("overtake", "defend")}
+    found["places_gained"] = torch.arange(1.0, CARS + 1.0)[:, None] - values["place"][-1]
+    found |= {name: values[name].mean(0) for name in ("contact", "off")}
     rows = []
     for index, (name, weight) in enumerate(cells):
-        own = chosen[:, index * races : (index + 1) * races]
         row: dict[str, Any] = {"sweep": name, "weight": weight, "races": races}
-        for measure in _MEASURED:
-            values = found[measure][:, index * races : (index + 1) * races][own].numpy()
-            low, high = bootstrap_interval(values)
-            row |= {measure: float(values.mean()), f"{measure}_low": low, f"{measure}_high": high}
+        for measure, by_slot in found.items():
+            own = by_slot[SLOTS[name], index * races : (index + 1) * races].numpy()
+            low, high = bootstrap_interval(own)
+            row |= {measure: float(own.mean()), f"{measure}_low": low, f"{measure}_high": high}
         rows.append(row)
     return rows
 

@@ -147,13 +147,11 @@ def initialise_from(
     state = read_state(file)
     _check_space({**state["space"], "sampler": space.to_dict()["sampler"]}, space, file)
     present = loss_module.state_dict()
-    if new_observations:
-        seen = state["network"]["actor"]["obs_dim"]
-        wider = {"actor": _tensors(actor.state_dict()), "critics": _with_prefix(present, _CRITICS)}
-        for part, shapes in wider.items():
-            state[part] = _blind_to(state[part], shapes, seen, new_observations)
-    check_fits(state["actor"], _tensors(actor.state_dict()), "actor", file)
-    check_fits(state["critics"], _with_prefix(present, _CRITICS), "critics", file)
+    for part, fresh in (("actor", _tensors(actor.state_dict())), ("critics", _with_prefix(present, _CRITICS))):
+        if new_observations:
+            seen = state["network"]["actor"]["obs_dim"]
+            state[part] = _blind_to(state[part], fresh, seen, new_observations)
+        check_fits(state[part], fresh, part, file)
     actor.load_state_dict(state["actor"])
     for name, value in state["critics"].items():
         for prefix in (_CRITICS, "target_" + _CRITICS):

@@ -17,7 +17,7 @@ from coachable.envs.racing.observation import COURSE_POINTS, observation_groups
 from coachable.envs.racing.parameters import Resources, compound_table
 from coachable.envs.racing.profile import Envelope, speed_profile
 from coachable.envs.racing.referee import TELEMETRY, WRONG_WAY_TIME, Referee, Verdict
-from coachable.envs.racing.rescue import put_back, way_clear
+from coachable.envs.racing.rescue import back_on_track, way_clear
 from coachable.envs.racing.rivals import Rivals
 from coachable.envs.racing.run import RUN_ROWS, Run
 from coachable.envs.racing.scenarios import Conditions, Scenario, Starter, race_scenarios
@@ -333,7 +333,7 @@ class RacingEnv(EnvBase):
             return verdict
         run = Run(*verdict.run.unbind(0))
         helped = stranded & way_clear(course, run, stranded, self.group)
-        state = torch.where(helped, put_back(course, car, verdict.state, run), verdict.state)
+        state = torch.where(helped, back_on_track(course, car, verdict.state, run), verdict.state)
         begun = Run(*self.referee.begin(state, run.s, run.distance, car, self._groups).unbind(0))
         begun = begun._replace(steps=run.steps, spins=run.spins)
         packed_run = torch.where(helped, torch.stack(list(begun)), verdict.run)

@@ -19,7 +19,8 @@ COURSE_POINTS = 20
 COURSE_TIME = 6.0  # [s] of travel that the course points cover
 _COURSE_SPEED_MIN = 10.0  # [m/s], so that a slow car sees further than its bonnet
 OPPONENTS = 4
-OPPONENT_COLUMNS = 8 * OPPONENTS + 1  # with the slipstream
+_OPPONENT_GROUPS = (("opponents", 8 * OPPONENTS), ("slipstream", 1))
+OPPONENT_COLUMNS = sum(width for _, width in _OPPONENT_GROUPS)
 _SEEN = 150.0  # [m]
 
 
@@ -44,7 +45,7 @@ def observation_groups(opponents: bool, pool: bool, course_points: int = COURSE_
         groups.append(("car", 8))
     groups.append(("course", 4 * course_points))
     if opponents:
-        groups += [("opponents", 8 * OPPONENTS), ("slipstream", 1)]
+        groups += _OPPONENT_GROUPS
     return tuple(groups)
 
 

@@ -34,7 +34,7 @@ def way_clear(course: Course, run: Run, stranded: Tensor, group: Tensor) -> Tens
     return ~(near & ~waiting).any(0).reshape(-1)
 
 
-def put_back(course: Course, car: Car, packed: Tensor, run: Run) -> Tensor:
+def back_on_track(course: Course, car: Car, packed: Tensor, run: Run) -> Tensor:
     """State (29, N) of cars that roll along the centre line where they were, with the tyres and the fuel they had.
 
     Args:

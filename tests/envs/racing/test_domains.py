@@ -52,6 +52,10 @@ def test_who_learnt_among_others_is_shown_alone():
     assert alone.cars == 1 and seen.shape[-1] == sum(width for _, width in domain.observation_groups)
     assert torch.equal(seen[:, :-33], before.make_env(num_envs=4, seed=0).reset()["observation"])
     assert not seen[:, -33:].any()
+    ready = load_domain(
+        "racing_resources", {"env": {"track": "ring", "opponents": True}}
+    )  # alone, with room for others
+    assert torch.equal(ready.make_env(num_envs=4, seed=0).reset()["observation"], seen)
 
 
 def test_an_agent_of_tyres_and_fuel_races_agents_or_scripted_drivers():

@@ -20,7 +20,6 @@ from coachable.envs.racing.driver import LineFollower
 from coachable.envs.racing.observation import observation_groups
 from coachable.envs.racing.parameters import Resources
 from coachable.envs.racing.referee import TELEMETRY
-from coachable.envs.racing.rescue import way_clear
 from coachable.envs.racing.run import Others, Run
 from coachable.envs.racing.scenarios import Conditions, Scenario, drift_scenarios, race_scenarios, rolling_start
 from coachable.envs.racing.state import HEATS, ROW, WEARS
@@ -324,42 +323,6 @@ def test_cars_of_one_race_end_together_and_only_the_culprit_terminates():
     by_car = after["done"].reshape(5, 2)
     assert by_car[:, 0].all() and not by_car[:, 1].any()
     assert after["terminated"].flatten().nonzero().tolist() == [[0]]
-
-
-@pytest.mark.parametrize("cars", [1, 2])
-def test_stranded_cars_are_put_back_where_they_were(cars):
-    env = RacingEnv(2 * cars, cars=cars, track="ring", seed=0, put_back=True, scenarios=rolling_start(cars))
-    start = env.reset()
-    x, y, along = env.course.place(env.run[0, :1], torch.tensor([8.0]))  # row 0, car 0 of race 0: beside the track
-    env.state[ROW["x"] : ROW["vx"], 0] = torch.cat([x, y, along + math.pi])  # against it, and braking
-    env.state[ROW["vx"] : ROW["spin_rr"] + 1, 0] = 0.0
-    action = torch.tensor([0.0, 0.2]).repeat(2 * cars, 1)
-    action[0, 1] = -1.0
-    seen = []
-    for _ in range(40):
-        seen.append(env.step(start.set("action", action))["next"].clone())
-    assert not torch.stack(seen)["done"].any()
-    telemetry = torch.stack(seen)["telemetry"][:, 0]
-    back = int((telemetry[:, T["speed"]] > 10.0).int().argmax())
-    assert 29 <= back <= 31
-    assert telemetry[back - 1, T["offset"]].abs() > 3.0
-    torch.testing.assert_close(telemetry[back, T["offset"]], torch.tensor(0.0), atol=0.01, rtol=0)
-    torch.testing.assert_close(telemetry[back, T["heading"]], torch.tensor(0.0), atol=0.01, rtol=0)
-    torch.testing.assert_close(
-        telemetry[back, T["distance"]], torch.tensor(1.5), atol=0.1, rtol=0
-    )  # of 0.1 s at 15 m/s
-    assert telemetry[back, T["fuel"]] <= telemetry[back - 1, T["fuel"]] and telemetry[back, T["fuel"]] > 29.0
-    assert (env._steps == 40).all()
-
-
-def test_a_stranded_car_waits_for_others_to_pass():
-    env = RacingEnv(3, cars=3, track="ring", seed=0, put_back=True, scenarios=rolling_start(3))
-    env.reset()
-    env.run[0] = env.run[0, 0] + torch.tensor([0.0, -10.0, 300.0])  # the second car is close behind the first
-    run = Run(*env.run.unbind(0))
-    first, second = torch.tensor([True, False, False]), torch.tensor([True, True, False])
-    assert way_clear(env.course, run, first, env.group).tolist() == [False, False, True]
-    assert way_clear(env.course, run, second, env.group).tolist() == [True, False, True]
 
 
 def test_scripted_opponents_drive_the_other_cars():

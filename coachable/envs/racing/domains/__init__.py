@@ -44,15 +44,15 @@ def racing_domain(
         """With the track, the car and the observation of a training, and its length of an episode."""
         chosen = {name: value for name, value in settings.items() if name not in _OF_TRAINING}
         chosen |= {"compiled": False, "device": "cpu", **options}
+        chosen.setdefault("opponents", chosen.get("cars", cars) > 1)
         if cars == 1:  # drives alone, whoever was there when it learnt
-            chosen["opponents"] = chosen.pop("cars", 1) > 1
+            chosen.pop("cars", None)
         pool, points = chosen.get("car") == "pool", chosen.get("course_points", COURSE_POINTS)
-        opponents = chosen.get("opponents", chosen.get("cars", cars) > 1)
         return replace(
             domain,
             make_env=partial(make_env, **chosen),
             episode_steps=chosen.get("episode_steps", domain.episode_steps),
-            observation_groups=observation_groups(opponents, pool, points),
+            observation_groups=observation_groups(chosen["opponents"], pool, points),
         )
 
     domain = Domain(
