@@ -1,5 +1,6 @@
 """Distributions of training styles for any space of weights: combat's, its ablations, and one for sliders."""
 
+from collections.abc import Sequence
 from typing import Literal, get_args
 
 from coachable.styles.parameters import Setpoint, Weight
@@ -70,7 +71,9 @@ def with_requests(space: StyleSpace, *, positive: float = 0.25, full: float = 0.
     return Mixture(parts, [neutral, full, positive, 1.0 - neutral - full - positive])
 
 
-def with_extremes(space: StyleSpace, *, share: float = 0.5, shared: bool = True) -> Sampler:
+def with_extremes(
+    space: StyleSpace, *, share: float = 0.5, shared: bool = True, only: Sequence[str] | None = None
+) -> Sampler:
     """The space's own sampler, mixed with styles whose every parameter is at one of its bounds.
 
     What tells two styles apart is largest between bounds, so that networks hear of it sooner.
@@ -78,6 +81,7 @@ def with_extremes(space: StyleSpace, *, share: float = 0.5, shared: bool = True)
     Args:
         space: Its parameters, weights or set-points.
         share: Probability that every parameter is at its lower or its upper bound, each equally likely.
+        only: Parameters that are at a bound in that share; the others are at their default there. By default all.
         shared: Whether rows that share a style in the space's own sampler (`Shared`), such as the cars of a race, go on
             to share it. Otherwise each row has its own: agents then meet others of another style than theirs.
 
@@ -85,11 +89,19 @@ def with_extremes(space: StyleSpace, *, share: float = 0.5, shared: bool = True)
         A sampler of the space's dimension.
 
     Raises:
-        ValueError: If a parameter is a choice, or the share is not in [0, 1].
+        ValueError: If a parameter is a choice or unknown, or the share is not in [0, 1].
     """
     _require((Weight, Setpoint), space, "sampler with_extremes asks for bounds, which {} cannot have (a choice)")
-    bounds = zip(space.low.tolist(), space.high.tolist(), strict=True)
-    extremes = Product([Mixture([PointMass(low), PointMass(high)], [0.5, 0.5]) for low, high in bounds])
+    chosen = space.names if only is None else tuple(only)
+    if unknown := sorted(set(chosen) - set(space.names)):
+        raise ValueError(f"extremes of {', '.join(unknown)} asked for: expected some of {', '.join(space.names)}")
+    bounds = zip(space.names, space.low.tolist(), space.high.tolist(), space.default.tolist(), strict=True)
+    extremes = Product(
+        [
+            Mixture([PointMass(low), PointMass(high)], [0.5, 0.5]) if name in chosen else PointMass(default)
+            for name, low, high, default in bounds
+        ]
+    )
     own = space.sampler
     if not isinstance(own, Shared):
         return Mixture([extremes, own], [share, 1.0 - share])

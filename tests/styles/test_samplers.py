@@ -246,6 +246,7 @@ def test_names_of_samplers_are_unique():
         (lambda: with_requests(StyleSpace([Setpoint("pace", 0.0, 1.0)])), "with_requests asks for weights of 0.*pace"),
         (lambda: with_extremes(StyleSpace([Setpoint("pace", 0.0, 1.0)]), share=2.0), "probabilities that sum to 1"),
         (lambda: with_extremes(StyleSpace([Choice("gait", ("run", "hop"))])), "with_extremes asks for bounds.*gait"),
+        (lambda: with_extremes(StyleSpace([Setpoint("pace", 0, 1)]), only=["gait"]), "extremes of gait.*some of pace"),
         (lambda: Sampler.from_dict({"type": "Levy"}), "unknown sampler type 'Levy'"),
     ],
 )
@@ -276,3 +277,13 @@ def test_extremes_are_drawn_beside_the_spaces_own_styles(copies, shared):
     assert inside.float().mean() == pytest.approx(0.6, abs=0.005)
     same = (theta[:N] == theta[N : 2 * N]).all(-1).float().mean()
     assert same == 1.0 if copies == 3 and shared else same == pytest.approx(4 * 0.1**2, abs=0.005)
+
+
+def test_extremes_of_some_parameters_leave_the_others_at_their_default():
+    space = StyleSpace([Setpoint("a", 0.0, 2.0), Setpoint("b", 0.0, 1.0, default=0.2), Weight("c", -1.0, 1.0)])
+    theta = with_extremes(space, share=0.4, only=["a"]).sample((N,), torch.Generator().manual_seed(0))
+    first, second, third = theta.unbind(-1)
+    rest = (second == space.default[1]) & (third == 0.0)
+    for bound in (0.0, 2.0):
+        assert ((first == bound) & rest).float().mean() == pytest.approx(0.2, abs=0.005)
+    assert rest.float().mean() == pytest.approx(0.4, abs=0.005)
