@@ -88,6 +88,8 @@ class Domain:
             every entry is a group of its own.
         as_trained: this domain as the settings of a training made it (`env` of its configuration: which machines,
             which cars); None where trainings do not differ.
+        coached: options of `make_env` for an agent that a person watches, where it then meets others than when it is
+            measured.
         evaluation: what `coachable evaluate` does instead of running the grid and switched styles: `(domain, policy,
             folder, settings) -> report`, with the loaded policy and `coachable.evaluation.settings`.
     """
@@ -104,6 +106,7 @@ class Domain:
     columns: Mapping[str, str] = field(default_factory=dict)
     observation_groups: Sequence[tuple[str, int]] = ()
     as_trained: Callable[[Mapping[str, Any]], Domain] | None = None
+    coached: Mapping[str, Any] = field(default_factory=dict)
     evaluation: Callable[..., str] | None = None
 
     def cells(self) -> list[dict[str, Any]]:

@@ -37,7 +37,8 @@ class LiveEpisodes:
     """
 
     def __init__(self, domain: Domain, space: StyleSpace, *, endless: bool, terminated: str) -> None:
-        self.env = coachable_env(domain.make_env(num_envs=1, num_threads=1), space, domain.make_reward(space))
+        simulation = domain.make_env(num_envs=1, num_threads=1, **domain.coached)
+        self.env = coachable_env(simulation, space, domain.make_reward(space))
         self.endless, self._terminated = endless, terminated
         self.ended: str | None = None
         self.number = self.steps = 0

@@ -121,7 +121,8 @@ def _film(
     every: int,
 ) -> Iterator[np.ndarray]:
     """Frames of each request's `period` steps, of every `every`-th step."""
-    env = coachable_env(domain.make_env(num_envs=1, num_threads=1), space, domain.make_reward(space), seed=seed)
+    simulation = domain.make_env(num_envs=1, num_threads=1, **domain.coached)
+    env = coachable_env(simulation, space, domain.make_reward(space), seed=seed)
     renderer = domain.make_renderer(size[0], size[1] - CAPTION)
     chance = RandomStream(seed)
     env.set_seed(seed)

@@ -45,13 +45,15 @@ def test_five_cars_from_the_pool_start_a_race():
     assert len(set(env.compound[2:].argmax(0).reshape(5, 2)[:, 0].tolist())) == 1
 
 
-def test_who_learnt_among_others_is_shown_alone():
+def test_who_learnt_among_others_is_measured_alone_and_coached_among_others():
     domain = load_domain("racing_resources", {"env": {"track": "ring", "cars": 3}})
     alone, before = domain.make_env(num_envs=4, seed=0), load_domain("racing_resources", {"env": {"track": "ring"}})
     seen = alone.reset()["observation"]
     assert alone.cars == 1 and seen.shape[-1] == sum(width for _, width in domain.observation_groups)
     assert torch.equal(seen[:, :-33], before.make_env(num_envs=4, seed=0).reset()["observation"])
     assert not seen[:, -33:].any()
+    coached = domain.make_env(num_envs=1, seed=0, **domain.coached)
+    assert (coached.cars, coached.controlled) == (3, 1) and coached.reset()["observation"][:, -33:].any()
     ready = load_domain(
         "racing_resources", {"env": {"track": "ring", "opponents": True}}
     )  # alone, with room for others

@@ -13,6 +13,7 @@ from coachable.envs.racing.families import racing_family
 from coachable.envs.racing.measures import RacingMeasures
 from coachable.envs.racing.observation import COURSE_POINTS, observation_groups
 from coachable.envs.racing.render import RacingRenderer
+from coachable.envs.racing.scenarios import rolling_start
 from coachable.envs.racing.simulation import CONTROL_STEP
 
 # Of a training's environment, what an agent is not shown or measured with: how many cars learn, among whom, how their
@@ -44,13 +45,15 @@ def racing_domain(
         """With the track, the car and the observation of a training, and its length of an episode."""
         chosen = {name: value for name, value in settings.items() if name not in _OF_TRAINING}
         chosen |= {"compiled": False, "device": "cpu", **options}
+        coached = {}
         chosen.setdefault("opponents", chosen.get("cars", cars) > 1)
-        if cars == 1:  # drives alone, whoever was there when it learnt
-            chosen.pop("cars", None)
+        if cars == 1 and (met := chosen.pop("cars", 1)) > 1:  # measured alone, whoever was there when it learnt
+            coached = {"cars": met, "scenarios": rolling_start(met)}
         pool, points = chosen.get("car") == "pool", chosen.get("course_points", COURSE_POINTS)
         return replace(
             domain,
             make_env=partial(make_env, **chosen),
+            coached=coached,
             episode_steps=chosen.get("episode_steps", domain.episode_steps),
             observation_groups=observation_groups(chosen["opponents"], pool, points),
         )
