@@ -24,7 +24,6 @@ from coachable.styles import (
 
 # Columns of `style_features`. Then three per opponent: longitudinal and lateral gap [m], near.
 DRIFT_NAMES = ("slip_angle_front", "slip_angle_rear", "slip_ratio_front", "slip_ratio_rear")
-RESOURCE_NAMES = ("overtake", "defend", "tire", "fuel")
 DRIFT = slice(0, 4)
 RESOURCES = slice(4, 8)
 OVERTAKE, DEFEND, TIRE, FUEL = range(RESOURCES.start, RESOURCES.stop)
@@ -107,9 +106,17 @@ def drift_style_reward(space: StyleSpace) -> StyleReward:
     return StyleReward(space, {"drift": WeightedSum(DRIFT_NAMES, DRIFT)})
 
 
-def resource_style_reward(space: StyleSpace) -> StyleReward:
-    """Σ w_i g_i: metres gained ahead and behind, minus mean wear, minus fuel [l]."""
-    return StyleReward(space, {"resources": WeightedSum(RESOURCE_NAMES, RESOURCES)})
+def resource_style_reward(space: StyleSpace, *, gained: float = 1.0) -> StyleReward:
+    """Σ w_i g_i: metres gained ahead and behind, minus mean wear, minus fuel [l].
+
+    Args:
+        space: `resource_style_space`.
+        gained: how often metres gained count; once in the paper.
+    """
+    passing = WeightedSum(("overtake", "defend"), slice(OVERTAKE, DEFEND + 1))
+    saving = WeightedSum(("tire", "fuel"), slice(TIRE, FUEL + 1))
+    scaled = Term(lambda features, style: gained * passing(features, style), parameters=passing.parameters)
+    return StyleReward(space, {"passing": scaled, "saving": saving})
 
 
 def aggressiveness_style_reward(space: StyleSpace, *, weight: float = 1.0, apart: float = 1.0) -> StyleReward:
