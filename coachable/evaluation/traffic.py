@@ -92,13 +92,17 @@ def race_in_traffic(domain: Domain, agent: LoadedPolicy, settings: EvaluationSet
     return rows
 
 
-def traffic_response(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
-    """Rank correlation of each weight with the metres that it asks for, from the rows of `race_in_traffic`."""
-    columns = {name: [(row["weight"], row[name]) for row in rows if row["sweep"] == name] for name in SLOTS}
-    return {name: rank_correlation(*np.array(pairs).T) for name, pairs in columns.items()}
+def traffic_response(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """Rank correlation of each weight with the metres that it asks for and with places, from `race_in_traffic`."""
+
+    def follows(sweep: str, measure: str) -> float:
+        pairs = [(row["weight"], row[measure]) for row in rows if row["sweep"] == sweep]
+        return rank_correlation(*np.array(pairs).T)
+
+    return {name: {"metres": follows(name, name), "places": follows(name, "places_gained")} for name in SLOTS}
 
 
-def traffic_report(rows: Sequence[dict[str, Any]], response: dict[str, float]) -> str:
+def traffic_report(rows: Sequence[dict[str, Any]], response: dict[str, dict[str, float]]) -> str:
     """The rows as Markdown."""
     text = f"\n## Among others\n\n{CARS} copies close together on a straight, on tyres and fuel of any state, for a "
     text += (
@@ -108,20 +112,28 @@ def traffic_report(rows: Sequence[dict[str, Any]], response: dict[str, float]) -
     text += "![traffic](traffic.png)\n\n"
     formats = {"sweep": "", "weight": "g", "overtake": "+.1f", "defend": "+.1f", "places_gained": "+.2f"}
     text += markdown_table(rows, formats | {"contact": ".2%", "off": ".2%"})
-    text += "\nOvertake, defend: metres gained on cars ahead and on cars behind. Rank correlation with the weight: "
-    return text + ", ".join(f"{name} {value:.2f}" for name, value in response.items()) + ".\n"
+    text += "\nOvertake, defend: metres gained on cars ahead and on cars behind. Rank correlation with the weight of "
+    found = [
+        f"{name} {values['metres']:.2f} in metres, {values['places']:.2f} in places"
+        for name, values in response.items()
+    ]
+    return text + "; of ".join(found) + ".\n"
 
 
 def draw_traffic(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Metres gained over the weight that asks for them, with 95 % intervals."""
-    figure, panels = plt.subplots(1, len(SLOTS), figsize=(9.5, 3.6), layout="constrained")
+    """Metres and places gained over the weight that asks for them, with 95 % intervals."""
+    figure, panels = plt.subplots(2, len(SLOTS), figsize=(9.5, 6.4), layout="constrained", sharex=True)
     titles = {"overtake": "on cars ahead, starting last", "defend": "on cars behind, starting first"}
-    for axes, name in zip(panels, SLOTS, strict=True):
+    for column, name in zip(panels.T, SLOTS, strict=True):
         own = [row for row in rows if row["sweep"] == name]
         weights = [row["weight"] for row in own]
-        axes.plot(weights, [row[name] for row in own], marker="o")
-        axes.fill_between(weights, [row[f"{name}_low"] for row in own], [row[f"{name}_high"] for row in own], alpha=0.2)
-        axes.set(xlabel=f"weight of {name}", ylabel="metres gained in a minute", title=titles[name])
-        axes.grid(alpha=0.3)
+        for axes, measure, unit in zip(column, (name, "places_gained"), ("metres", "places"), strict=True):
+            low, high = ([row[f"{measure}_{end}"] for row in own] for end in ("low", "high"))
+            axes.plot(weights, [row[measure] for row in own], marker="o")
+            axes.fill_between(weights, low, high, alpha=0.2)
+            axes.set(ylabel=f"{unit} gained in a minute")
+            axes.grid(alpha=0.3)
+        column[0].set(title=titles[name])
+        column[1].set(xlabel=f"weight of {name}")
     figure.savefig(path, dpi=130)
     plt.close(figure)

@@ -181,6 +181,8 @@ def test_traffic_of_the_scripted_driver():
         assert all(row | {"weight": 0.0} == sweep[0] for row in sweep)
     # Whoever starts last has nobody behind, whoever starts first nobody ahead.
     assert rows[0]["defend"] == 0.0 and rows[5]["overtake"] == 0.0 and rows[0]["overtake"] != 0.0
-    response = traffic_response([row | {row["sweep"]: row["weight"] ** 2} for row in rows])
-    assert response == {"overtake": pytest.approx(1.0), "defend": pytest.approx(1.0)}
-    assert "\n## Among others\n" in traffic_report(rows, response)
+    follows = [row | {row["sweep"]: row["weight"] ** 2, "places_gained": -row["weight"]} for row in rows]
+    response = traffic_response(follows)
+    each = {"metres": pytest.approx(1.0), "places": pytest.approx(-1.0)}
+    assert response == {"overtake": each, "defend": each}
+    assert "of defend 1.00 in metres, -1.00 in places.\n" in traffic_report(rows, response)
