@@ -125,7 +125,8 @@ def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
         SystemExit: naming what is misspelt or of a wrong type, and the valid choices.
     """
     try:
-        overrides = OverridesParser.create().parse_overrides(_without_options(arguments))
+        options, given = _options_apart(arguments)
+        overrides = OverridesParser.create().parse_overrides(given)
     except HydraException as error:
         raise SystemExit(f"error: {error}\nexpected KEY=VALUE, for example loss=sac or train.batch_size=256") from None
     groups = config_groups(config_name)
@@ -150,7 +151,8 @@ def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
     for override in overrides:
         if override.key_or_group not in groups and not override.key_or_group.startswith("hydra"):
             _check(override, known)
-    return [a for a in arguments if not a.startswith("preset=")] + [f"preset={','.join(presets)}"]
+    # Hydra's parser takes overrides in one piece only, not before and after its options.
+    return [*options, *(a for a in given if not a.startswith("preset=")), f"preset={','.join(presets)}"]
 
 
 def plain_config(cfg: DictConfig, overrides: list[str]) -> dict[str, Any]:
@@ -242,10 +244,13 @@ def _same_kind(default: Any, value: Any) -> bool:
     return isinstance(value, dict)
 
 
-def _without_options(arguments: list[str]) -> list[str]:
-    """Leaves out Hydra's own options, such as `--cfg job`, with their values."""
-    pairs = itertools.pairwise(["", *arguments])
-    return [argument for before, argument in pairs if not argument.startswith("-") and before not in _VALUED]
+def _options_apart(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """Hydra's own options, such as `--cfg job`, with their values; and the overrides."""
+    options: list[str] = []
+    overrides: list[str] = []
+    for before, argument in itertools.pairwise(["", *arguments]):
+        (options if argument.startswith("-") or before in _VALUED else overrides).append(argument)
+    return options, overrides
 
 
 def _choices(given: str, valid: list[str]) -> str:
