@@ -168,6 +168,7 @@ _COACHING = {
             "flat out": {"tire": 0.0, "fuel": 0.0},
             "save tyres": {"tire": 12000.0},
             "save fuel": {"fuel": 105.0},
+            "attack": {"overtake": 2.0, "tire": 0.0, "fuel": 0.0},
         },
         terminated="retired",
     ),
