@@ -113,10 +113,11 @@ def resource_style_reward(space: StyleSpace, *, gained: float = 1.0) -> StyleRew
         space: `resource_style_space`.
         gained: how often metres gained count; once in the paper.
     """
-    passing = WeightedSum(("overtake", "defend"), slice(OVERTAKE, DEFEND + 1))
-    saving = WeightedSum(("tire", "fuel"), slice(TIRE, FUEL + 1))
-    scaled = Term(lambda features, style: gained * passing(features, style), parameters=passing.parameters)
-    return StyleReward(space, {"passing": scaled, "saving": saving})
+    terms = {
+        "passing": WeightedSum(("overtake", "defend"), slice(OVERTAKE, DEFEND + 1)),
+        "saving": WeightedSum(("tire", "fuel"), slice(TIRE, FUEL + 1)),
+    }
+    return StyleReward(space, terms, {"passing": gained})
 
 
 def aggressiveness_style_reward(space: StyleSpace, *, weight: float = 1.0, apart: float = 1.0) -> StyleReward:

@@ -82,7 +82,9 @@ def test_resource_reward_by_hand():
     features = torch.tensor([[9.0, 9.0, 9.0, 9.0, 3.0, -1.0, -8e-5, -0.01]])
     space, theta = resource_style_space(), torch.tensor([[2.0, 0.5, 12000.0, 105.0]])
     assert resource_style_reward(space)(features, theta).item() == pytest.approx(6.0 - 0.5 - 0.96 - 1.05)
-    assert resource_style_reward(space, gained=4.0)(features, theta).item() == pytest.approx(4 * 5.5 - 0.96 - 1.05)
+    more = resource_style_reward(space, gained=4.0)
+    assert more(features, theta).item() == pytest.approx(4 * 5.5 - 0.96 - 1.05)
+    assert more.is_linear, "n-step transitions can be relabelled"
 
 
 def test_margin_reward_by_hand():
