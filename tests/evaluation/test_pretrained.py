@@ -10,14 +10,16 @@ import coachable.pretrained
 from coachable.domain import load_domain
 from coachable.training.weights import load_policy
 
+ANOTHER_NAME = {"racing_traffic": "racing_resources"}  # its last preset got a name only afterwards
 SHIPPED = sorted(file.parent.name for file in Path(coachable.pretrained.__path__[0]).glob("*/weights.pt"))
 
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_weights_act_in_their_domain(name):
     agent = load_policy(name)
-    assert name in (agent.metadata["domain"], f"{agent.metadata['domain']}_{agent.config['preset']}")
-    domain = load_domain(agent.metadata["domain"], agent.config)
+    owner = agent.metadata["domain"]
+    assert ANOTHER_NAME.get(name) == owner or name in (owner, f"{owner}_{agent.config['preset']}")
+    domain = load_domain(owner, agent.config)
     space = domain.make_space()
     assert agent.space.with_sampler(space.sampler) == space  # it may have been trained on styles drawn otherwise
     env = domain.make_env(num_envs=2, num_threads=1)
