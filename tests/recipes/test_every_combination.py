@@ -77,6 +77,16 @@ def test_every_choice_composes(recipe, group):
 
 
 @pytest.mark.parametrize(
+    "preset, style_reward, new", [("cpu_traffic", {}, 33), ("cpu_late_traffic", {"gained": 4.0}, 0)]
+)
+def test_the_presets_of_traffic_are_of_the_tyre_and_fuel_family(preset, style_reward, new):
+    config = compose_config("racing_qr_sac", [f"preset={preset}"])
+    assert config["domain"] == "racing_resources" and config["style_reward"] == style_reward
+    assert config["sampler"]["only"] == ["overtake", "defend"] and config["init_new_observations"] == new
+    assert sum(config["env"]["scenarios"]["shares"].values()) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
     "preset, margins",
     [
         ("cpu_races", {"weight": 2.0}),

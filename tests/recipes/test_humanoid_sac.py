@@ -105,8 +105,7 @@ def test_the_bare_command_chooses_a_preset():
 
 
 def test_hydras_options_pass_through():
-    given = ["preset=cpu", "--cfg", "job", "train.total_frames=1e6"]
-    arguments = checked_arguments("humanoid_sac", given)
+    arguments = checked_arguments("humanoid_sac", ["preset=cpu", "--cfg", "job", "train.total_frames=1e6"])
     assert arguments == ["--cfg", "job", "train.total_frames=1e6", "preset=humanoid_sac/cpu"]
     assert _compose("+note=mine")["note"] == "mine"
     arguments = checked_arguments("humanoid_sac", ["--multirun", "preset=smoke,cpu", "seed=0,1"])

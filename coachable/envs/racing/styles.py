@@ -25,8 +25,7 @@ from coachable.styles import (
 # Columns of `style_features`. Then three per opponent: longitudinal and lateral gap [m], near.
 DRIFT_NAMES = ("slip_angle_front", "slip_angle_rear", "slip_ratio_front", "slip_ratio_rear")
 DRIFT = slice(0, 4)
-RESOURCES = slice(4, 8)
-OVERTAKE, DEFEND, TIRE, FUEL = range(RESOURCES.start, RESOURCES.stop)
+OVERTAKE, DEFEND, TIRE, FUEL = range(4, 8)
 GAPS = 8
 GAP_COLUMNS = ("longitudinal", "lateral", "near")
 

@@ -45,8 +45,8 @@ def racing_domain(
         """With the track, the car and the observation of a training, and its length of an episode."""
         chosen = {name: value for name, value in settings.items() if name not in _OF_TRAINING}
         chosen |= {"compiled": False, "device": "cpu", **options}
-        coached = {}
         chosen.setdefault("opponents", chosen.get("cars", cars) > 1)
+        coached = {}
         if cars == 1 and (met := chosen.pop("cars", 1)) > 1:  # measured alone, whoever was there when it learnt
             coached = {"cars": met, "scenarios": rolling_start(met)}
         pool, points = chosen.get("car") == "pool", chosen.get("course_points", COURSE_POINTS)
