@@ -105,18 +105,20 @@ def drift_style_reward(space: StyleSpace) -> StyleReward:
     return StyleReward(space, {"drift": WeightedSum(DRIFT_NAMES, DRIFT)})
 
 
-def resource_style_reward(space: StyleSpace, *, gained: float = 1.0) -> StyleReward:
+def resource_style_reward(space: StyleSpace, *, gained: float = 1.0, defended: float | None = None) -> StyleReward:
     """Σ w_i g_i: metres gained ahead and behind, minus mean wear, minus fuel [l].
 
     Args:
         space: `resource_style_space`.
         gained: how often metres gained count; once in the paper.
+        defended: how often those on cars behind count, by default as often.
     """
     terms = {
-        "passing": WeightedSum(("overtake", "defend"), slice(OVERTAKE, DEFEND + 1)),
+        "overtaking": WeightedSum(("overtake",), slice(OVERTAKE, OVERTAKE + 1)),
+        "defending": WeightedSum(("defend",), slice(DEFEND, DEFEND + 1)),
         "saving": WeightedSum(("tire", "fuel"), slice(TIRE, FUEL + 1)),
     }
-    return StyleReward(space, terms, {"passing": gained})
+    return StyleReward(space, terms, {"overtaking": gained, "defending": gained if defended is None else defended})
 
 
 def aggressiveness_style_reward(space: StyleSpace, *, weight: float = 1.0, apart: float = 1.0) -> StyleReward:

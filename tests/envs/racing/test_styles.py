@@ -84,6 +84,8 @@ def test_resource_reward_by_hand():
     assert resource_style_reward(space)(features, theta).item() == pytest.approx(6.0 - 0.5 - 0.96 - 1.05)
     more = resource_style_reward(space, gained=4.0)
     assert more(features, theta).item() == pytest.approx(4 * 5.5 - 0.96 - 1.05)
+    apart = resource_style_reward(space, gained=2.0, defended=8.0)
+    assert apart(features, theta).item() == pytest.approx(2 * 6.0 - 8 * 0.5 - 0.96 - 1.05)
     assert more.is_linear, "n-step transitions can be relabelled"
 
 
