@@ -6,7 +6,7 @@ zeros, or cuts it, to the width of the layer. Heads are linear. Source: the pape
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal, get_args
 
 import torch
@@ -190,6 +190,47 @@ class ResidualMLP(nn.Module):
         With a plan, gradients go where the plan says and not into the parameters' `.grad`.
         """
         self._plan = plan
+
+
+def with_new_inputs(weights: Mapping[str, Tensor], seen: int, new: int) -> dict[str, Tensor]:
+    """State of a :class:`ResidualMLP` with `new` inputs more, which do what the others did while the new ones are 0.
+
+    Weights of the new inputs are 0. That alone is not enough where the first layer is wider than its input: the identity
+    path then carries inputs behind the new ones elsewhere, so that the units of all layers change places with them. What
+    it carries of the new inputs goes on top of units that carried nothing.
+
+    Args:
+        weights: `blocks.0.linear.weight` and so on, with any leading dimensions (a stack of critics).
+        seen: Inputs before the new ones.
+        new: How many there are.
+
+    Raises:
+        ValueError: If layers differ in width, or the first ends among the inputs: there is no such state then.
+    """
+    first = weights["blocks.0.linear.weight"]
+    width, inputs = first.shape[-2:]
+    wide = dict(weights)
+    wide["blocks.0.linear.weight"] = torch.cat(
+        [first[..., :seen], first.new_zeros(*first.shape[:-1], new), first[..., seen:]], -1
+    )
+    if width <= seen:  # the identity path ends before the new inputs
+        return wide
+    widths = [value.shape[-1] for name, value in weights.items() if name.endswith("linear.bias")]
+    if width < inputs + new or set(widths) != {width}:
+        raise ValueError(
+            f"layers of {widths} units cannot get {new} inputs after the first {seen} of {inputs}: expected equal layers "
+            f"of at most {seen} or at least {inputs + new} units"
+        )
+    units = torch.arange(width)
+    moved = (units[:seen], units[inputs : inputs + new], units[seen:inputs], units[inputs + new :])
+    order = torch.cat(moved).to(first.device)
+    for name, value in wide.items():
+        if name.startswith("blocks."):
+            value = value.index_select(-2 if name.endswith("linear.weight") else -1, order)
+        if name.endswith("weight") and not name.startswith("blocks.0.") and "norm" not in name:
+            value = value.index_select(-1, order)
+        wide[name] = value
+    return wide
 
 
 def _sides(padding: Padding | Sequence[Side], layers: int) -> tuple[Side, ...]:

@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from coachable.networks.residual import with_new_inputs
 from coachable.styles import StyleSpace
 from coachable.training.checkpoint import SCHEMA_VERSION, CheckpointError, check_fits, find_checkpoint, read_state
 
@@ -137,11 +138,11 @@ def initialise_from(
         actor: overwritten.
         loss_module: built from `actor`; its critics and their targets are overwritten.
         space: of the new training; it may draw its styles otherwise.
-        new_observations: columns at the end of the observation that the other training did not have. The networks
-            start out blind to them: as good as before, with something new to learn from.
+        new_observations: columns at the end of the observation that the other training did not have. While they are 0
+            the networks do what they did.
 
     Raises:
-        CheckpointError: if style parameters or network shapes differ.
+        CheckpointError: if style parameters or network shapes differ, or there is no room for new observations.
     """
     file = _locate(path_or_domain)
     state = read_state(file)
@@ -150,7 +151,10 @@ def initialise_from(
     for part, fresh in (("actor", _tensors(actor.state_dict())), ("critics", _with_prefix(present, _CRITICS))):
         if new_observations:
             seen = state["network"]["actor"]["obs_dim"]
-            state[part] = _blind_to(state[part], fresh, seen, new_observations)
+            try:
+                state[part] = _widened(state[part], seen, new_observations)
+            except ValueError as error:
+                raise CheckpointError(f"{file}: {error}") from error
         check_fits(state[part], fresh, part, file)
     actor.load_state_dict(state["actor"])
     for name, value in state["critics"].items():
@@ -158,13 +162,14 @@ def initialise_from(
             present[prefix + name].copy_(value)
 
 
-def _blind_to(saved: Mapping[str, Tensor], present: Mapping[str, Tensor], seen: int, new: int) -> dict[str, Tensor]:
-    """Saved weights with zeros for `new` inputs after the first `seen`, wherever the present ones have as many more."""
+def _widened(saved: Mapping[str, Tensor], seen: int, new: int) -> dict[str, Tensor]:
+    """Weights with `new` inputs after the first `seen`, in networks of residual layers."""
+    first = "blocks.0.linear.weight"
+    trunks = [name.removesuffix(first) for name in saved if name.endswith(first)]
     widened = dict(saved)
-    for name, value in saved.items():
-        if name in present and present[name].shape == (*value.shape[:-1], value.shape[-1] + new):
-            nothing = value.new_zeros(*value.shape[:-1], new)
-            widened[name] = torch.cat([value[..., :seen], nothing, value[..., seen:]], -1)
+    for trunk in trunks:
+        own = _with_prefix(saved, trunk)
+        widened |= {trunk + name: value for name, value in with_new_inputs(own, seen, new).items()}
     return widened
 
 
