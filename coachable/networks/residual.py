@@ -195,12 +195,13 @@ class ResidualMLP(nn.Module):
 def with_new_inputs(weights: Mapping[str, Tensor], seen: int, new: int) -> dict[str, Tensor]:
     """State of a :class:`ResidualMLP` with `new` inputs more, which do what the others did while the new ones are 0.
 
-    Weights of the new inputs are 0. That alone is not enough where the first layer is wider than its input: the identity
-    path then carries inputs behind the new ones elsewhere, so that the units of all layers change places with them. What
-    it carries of the new inputs goes on top of units that carried nothing.
+    Weights of the new inputs are 0. That alone is not enough where the first layer is wider than its input: the
+    identity path then carries inputs behind the new ones elsewhere, so that the units of all layers change places with
+    them. What it carries of the new inputs goes on top of units that carried nothing.
 
     Args:
-        weights: `blocks.0.linear.weight` and so on, with any leading dimensions (a stack of critics).
+        weights: `blocks.0.linear.weight` and so on, with any leading dimensions (a stack of critics), of a network
+            whose first layer pads at the end, as it does by default.
         seen: Inputs before the new ones.
         new: How many there are.
 
@@ -218,8 +219,8 @@ def with_new_inputs(weights: Mapping[str, Tensor], seen: int, new: int) -> dict[
     widths = [value.shape[-1] for name, value in weights.items() if name.endswith("linear.bias")]
     if width < inputs + new or set(widths) != {width}:
         raise ValueError(
-            f"layers of {widths} units cannot get {new} inputs after the first {seen} of {inputs}: expected equal layers "
-            f"of at most {seen} or at least {inputs + new} units"
+            f"layers of {widths} units cannot get {new} inputs after the first {seen} of {inputs}: expected equal "
+            f"layers of at most {seen} or at least {inputs + new} units"
         )
     units = torch.arange(width)
     moved = (units[:seen], units[inputs : inputs + new], units[seen:inputs], units[inputs + new :])

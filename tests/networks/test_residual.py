@@ -3,7 +3,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from coachable.networks.residual import ResidualBlock, ResidualMLP, fit_features
+from coachable.networks.residual import ResidualBlock, ResidualMLP, fit_features, with_new_inputs
 
 COMBAT = (4096, 2048, 1024, 512)
 
@@ -111,3 +111,29 @@ def test_head_gain_scales_the_initial_head():
         weight = ResidualMLP(6, 3, (64, 64), head_gain=gain).head.weight
         bound = gain * (6 / 67) ** 0.5
         assert 0.9 * bound < weight.abs().max() <= bound
+
+
+@pytest.mark.parametrize("widths", [(4, 4), (16, 16, 16)], ids=["cut", "padded"])
+def test_new_inputs_change_nothing_while_they_are_zero(widths):
+    """Behind them are two inputs that a padded identity path then carries elsewhere."""
+    net, wide = ResidualMLP(8, 3, widths), ResidualMLP(13, 3, widths)
+    for name, value in net.named_parameters():
+        if "norm" in name or "bias" in name:
+            nn.init.normal_(value)
+    wide.load_state_dict(with_new_inputs(net.state_dict(), seen=6, new=5))
+    x = torch.randn(7, 8)
+    torch.testing.assert_close(wide(x[:, :6], torch.zeros(7, 5), x[:, 6:]), net(x))
+
+
+def test_new_inputs_of_a_stack_of_networks():
+    nets = [ResidualMLP(8, 3, (16, 16)) for _ in range(2)]
+    stack = {name: torch.stack([net.state_dict()[name] for net in nets]) for name in nets[0].state_dict()}
+    for name, value in with_new_inputs(stack, seen=6, new=5).items():
+        for member, net in zip(value, nets, strict=True):
+            assert torch.equal(member, with_new_inputs(net.state_dict(), seen=6, new=5)[name])
+
+
+@pytest.mark.parametrize("widths", [(12, 12), (16, 20)], ids=["too narrow", "unequal"])
+def test_no_room_for_new_inputs(widths):
+    with pytest.raises(ValueError, match=r"cannot get 5 inputs after the first 6 of 8: expected equal layers"):
+        with_new_inputs(ResidualMLP(8, 3, widths).state_dict(), seen=6, new=5)

@@ -11,7 +11,7 @@ from recipe_config import compose_config, config_groups
 from tensordict import TensorDict
 
 from coachable.envs.racing.families import racing_family
-from coachable.training.checkpoint import find_checkpoint, read_state
+from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
 from coachable.training.loop import REPLAY_KEYS
 
 RECIPES = sorted(file.stem for file in (Path(__file__).resolve().parents[2] / "recipes" / "configs").glob("*_*.yaml"))
@@ -19,6 +19,8 @@ TINY = ["preset=smoke", "env.num_envs=2", "threads.simulator=1", "threads.learne
 TINY += ["init_random_frames=8", "train.warmup_frames=8", "train.batch_size=12", "eval.max_steps=5"]
 TINY += ["train.total_frames=28", "train.utd_ratio=0.125", "impersonation.n=0"]
 POLICY_FIRST = {"qr_sac", "rac", "cat_rac", "sac_categorical"}  # paper, Appendix B
+
+WIDE = [f"network.{part}.widths=[256,256]" for part in ("actor", "critic")]  # than the input
 
 
 def _train(recipe, run_dir, *arguments):
@@ -104,16 +106,33 @@ def test_the_presets_of_races_are_of_their_family(preset, margins, tmp_path):
         import_module("racing_qr_sac").build(config)
 
 
-def test_a_driver_who_drove_alone_starts_out_blind_to_others(tmp_path):
-    alone = _train("racing_qr_sac", tmp_path / "alone", "family=resources")
-    choice = ["family=resources", "+env.cars=3", "env.num_envs=3", f"init_from={tmp_path / 'alone'}"]
+def test_a_driver_who_drove_alone_still_can_when_there_are_others(tmp_path):
+    alone = _train("racing_qr_sac", tmp_path / "alone", "family=resources", *WIDE)
+    choice = ["family=resources", *WIDE, "+env.cars=3", "env.num_envs=3", f"init_from={tmp_path / 'alone'}"]
     with pytest.raises(RuntimeError, match=r"\(\d+, 141\) in the checkpoint, \(\d+, 174\) here"):
         _train("racing_qr_sac", tmp_path / "refused", *choice)
     among = _train("racing_qr_sac", tmp_path / "among", *choice, "init_new_observations=33", "train.utd_ratio=0")
-    seen, theta, others = torch.randn(5, 137), torch.randn(5, 4), torch.randn(5, 33)
-    action = alone.collector.policy(TensorDict({"observation": seen, "style": theta}, [5]))["loc"]
-    wider = TensorDict({"observation": torch.cat([seen, others], -1), "style": theta}, [5])
-    torch.testing.assert_close(among.collector.policy(wider)["loc"], action)
+    seen, theta, action = torch.randn(5, 137), torch.randn(5, 4), torch.rand(5, 2)
+    drive = TensorDict({"observation": seen, "style": theta, "action": action}, [5])
+    nobody = drive.clone().set("observation", torch.cat([seen, torch.zeros(5, 33)], -1))
+    torch.testing.assert_close(among.collector.policy(nobody)["loc"], alone.collector.policy(drive)["loc"])
+    old, new = alone.learner.loss_module, among.learner.loss_module
+    value = _value(old, old.qvalue_network_params, drive)
+    for params in (new.qvalue_network_params, new.target_qvalue_network_params):
+        torch.testing.assert_close(_value(new, params, nobody), value)
+
+
+def _value(loss, params, data):
+    with params[1].to_module(loss.qvalue_network):
+        return loss.qvalue_network(data.clone())["state_action_value"]
+
+
+def test_networks_without_room_for_others_are_refused(tmp_path):
+    narrow = ["family=resources", *(f"network.{part}.widths=[150,150]" for part in ("actor", "critic"))]
+    _train("racing_qr_sac", tmp_path / "alone", *narrow)
+    choice = ["+env.cars=3", "env.num_envs=3", "init_new_observations=33", f"init_from={tmp_path / 'alone'}"]
+    with pytest.raises(CheckpointError, match=r"layers of \[150, 150\] units cannot get 33 inputs"):
+        _train("racing_qr_sac", tmp_path / "among", *narrow, *choice)
 
 
 @pytest.mark.parametrize("loss, replay", [("sac", "uniform"), ("cat_rac", "event_tables")])
