@@ -33,7 +33,7 @@ SLOTS = {"overtake": CARS - 1, "defend": 0}  # where the car whose weight rises 
 TRAFFIC_WEIGHTS = (0.0, 0.5, 1.0, 1.5, 2.0)
 OTHERS_WEIGHT = 1.0  # of overtaking and of defending, of the other cars; and of the weight that does not rise
 TRAFFIC_STEPS = 600  # 60 s
-RACES = 32  # per weight, for each of `EvaluationSettings.episodes`
+RACES = 128  # per weight, for each of `EvaluationSettings.episodes`; 2 m of intervals are left
 _START = (Scenario("passing", 1.0, "passing", CARS),)
 
 
@@ -54,7 +54,7 @@ def race_in_traffic(domain: Domain, agent: LoadedPolicy, settings: EvaluationSet
     Args:
         domain: racing_resources, as the agent was trained in, among others.
         agent: the policy of all cars; acts deterministically.
-        settings: `episodes` times 32 races per weight, of `steps`, by default 600.
+        settings: `episodes` times 128 races per weight, of `steps`, by default 600.
 
     Returns:
         A row per weight: metres gained on cars ahead, and on cars behind (negative: lost), places gained, share of the

@@ -15,6 +15,7 @@ from coachable.envs.racing.driver import LineFollower
 from coachable.envs.racing.families import family_style
 from coachable.envs.racing.measures import whole_turns
 from coachable.envs.racing.parameters import load_car
+from coachable.evaluation import traffic
 from coachable.evaluation.drifts import evaluate_drift
 from coachable.evaluation.races import _count, _overtakes, _pair_results, evaluate_aggressiveness
 from coachable.evaluation.settings import EvaluationSettings
@@ -172,7 +173,8 @@ def test_races_of_the_scripted_driver(tmp_path):
     assert "races per row, 4 laps" in report and (tmp_path / "radar.png").exists()
 
 
-def test_traffic_of_the_scripted_driver():
+def test_traffic_of_the_scripted_driver(monkeypatch):
+    monkeypatch.setattr(traffic, "RACES", 32)
     domain, agent = scripted("resources", "x2019", cars=3)
     rows = race_in_traffic(domain, agent, EvaluationSettings(episodes=1, steps=20, progress=False))
     assert [(row["sweep"], row["weight"]) for row in rows[4:6]] == [("overtake", 2.0), ("defend", 0.0)]
