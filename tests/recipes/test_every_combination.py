@@ -79,7 +79,7 @@ def test_every_choice_composes(recipe, group):
 
 
 @pytest.mark.parametrize(
-    "preset, style_reward, new", [("cpu_traffic", {}, 33), ("cpu_late_traffic", {"gained": 4.0}, 0)]
+    "preset, style_reward, new", [("cpu_traffic", {}, 33), ("cpu_late_traffic", {"gained": 2.0, "defended": 8.0}, 0)]
 )
 def test_the_presets_of_traffic_are_of_the_tyre_and_fuel_family(preset, style_reward, new):
     config = compose_config("racing_qr_sac", [f"preset={preset}"])
