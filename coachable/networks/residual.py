@@ -226,9 +226,10 @@ def with_new_inputs(weights: Mapping[str, Tensor], seen: int, new: int) -> dict[
     moved = (units[:seen], units[inputs : inputs + new], units[seen:inputs], units[inputs + new :])
     order = torch.cat(moved).to(first.device)
     for name, value in wide.items():
-        if name.startswith("blocks."):
-            value = value.index_select(-2 if name.endswith("linear.weight") else -1, order)
-        if name.endswith("weight") and not name.startswith("blocks.0.") and "norm" not in name:
+        linear = name.endswith("linear.weight")
+        if name.startswith("blocks."):  # what gives units
+            value = value.index_select(-2 if linear else -1, order)
+        if name == "head.weight" or (linear and not name.startswith("blocks.0.")):  # what takes them
             value = value.index_select(-1, order)
         wide[name] = value
     return wide
