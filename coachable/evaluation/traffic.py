@@ -33,7 +33,7 @@ SLOTS = {"overtake": CARS - 1, "defend": 0}  # where the car whose weight rises 
 TRAFFIC_WEIGHTS = (0.0, 0.5, 1.0, 1.5, 2.0)
 OTHERS_WEIGHT = 1.0  # of overtaking and of defending, of the other cars; and of the weight that does not rise
 TRAFFIC_STEPS = 600  # 60 s
-RACES = 128  # per weight, for each of `EvaluationSettings.episodes`; with four of these metres are known to 1 or 2
+RACES = 128  # per weight, for each of `EvaluationSettings.episodes`; four leave intervals of 1 to 2 m
 _START = (Scenario("passing", 1.0, "passing", CARS),)
 
 

@@ -20,8 +20,6 @@ TINY += ["init_random_frames=8", "train.warmup_frames=8", "train.batch_size=12",
 TINY += ["train.total_frames=28", "train.utd_ratio=0.125", "impersonation.n=0"]
 POLICY_FIRST = {"qr_sac", "rac", "cat_rac", "sac_categorical"}  # paper, Appendix B
 
-WIDE = [f"network.{part}.widths=[256,256]" for part in ("actor", "critic")]  # than the input
-
 
 def _train(recipe, run_dir, *arguments):
     config = compose_config(recipe, [*TINY, f"run_dir={run_dir}", *arguments])
@@ -106,12 +104,23 @@ def test_the_presets_of_races_are_of_their_family(preset, margins, tmp_path):
         import_module("racing_qr_sac").build(config)
 
 
-def test_a_driver_who_drove_alone_still_can_when_there_are_others(tmp_path):
-    alone = _train("racing_qr_sac", tmp_path / "alone", "family=resources", *WIDE)
-    choice = ["family=resources", *WIDE, "+env.cars=3", "env.num_envs=3", f"init_from={tmp_path / 'alone'}"]
+def test_a_driver_who_drove_alone_starts_out_blind_to_others(tmp_path):
+    alone = _train("racing_qr_sac", tmp_path / "alone", "family=resources")
+    choice = ["family=resources", "+env.cars=3", "env.num_envs=3", f"init_from={tmp_path / 'alone'}"]
     with pytest.raises(RuntimeError, match=r"\(\d+, 141\) in the checkpoint, \(\d+, 174\) here"):
         _train("racing_qr_sac", tmp_path / "refused", *choice)
     among = _train("racing_qr_sac", tmp_path / "among", *choice, "init_new_observations=33", "train.utd_ratio=0")
+    seen, theta, others = torch.randn(5, 137), torch.randn(5, 4), torch.randn(5, 33)
+    action = alone.collector.policy(TensorDict({"observation": seen, "style": theta}, [5]))["loc"]
+    wider = TensorDict({"observation": torch.cat([seen, others], -1), "style": theta}, [5])
+    torch.testing.assert_close(among.collector.policy(wider)["loc"], action)
+
+
+def test_a_wide_network_that_drove_alone_still_can_while_nobody_is_near(tmp_path):
+    wide = ["family=resources", *(f"network.{part}.widths=[256,256]" for part in ("actor", "critic"))]
+    alone = _train("racing_qr_sac", tmp_path / "alone", *wide)
+    choice = ["+env.cars=3", "env.num_envs=3", f"init_from={tmp_path / 'alone'}", "init_new_observations=33"]
+    among = _train("racing_qr_sac", tmp_path / "among", *wide, *choice, "train.utd_ratio=0")
     seen, theta, action = torch.randn(5, 137), torch.randn(5, 4), torch.rand(5, 2)
     drive = TensorDict({"observation": seen, "style": theta, "action": action}, [5])
     nobody = drive.clone().set("observation", torch.cat([seen, torch.zeros(5, 33)], -1))
