@@ -47,6 +47,7 @@ VARIANTS: dict[str, list[str]] = {
     "uniform": ["replay=uniform"],
     "one_hot": ["sampler=one_hot"],
     "independent": ["sampler=independent"],
+    "clipped": ["learner.max_grad_norm=10"],
 }
 LABELS = {
     "sac": "categorical SAC",
@@ -57,11 +58,13 @@ LABELS = {
     "uniform": "uniform replay",
     "one_hot": "styles one-hot",
     "independent": "styles independent",
+    "clipped": "gradients clipped at 10",
 }
 PANELS = {
     "loss and its entropy samples": ("sac", "samples_1", "samples_1000"),
     "impersonation and replay": ("impersonation_0", "impersonation_2", "uniform"),
     "training styles": ("one_hot", "independent"),
+    "gradients": ("clipped",),
 }
 METRICS = {"eval/style_score": "style score", "eval/won": "fights won"}
 EVALUATIONS = 8  # during a training
