@@ -56,8 +56,8 @@ class Kernels:
 def load_kernels() -> dict[torch.dtype, Kernels]:
     """Compile (once per machine, about a second) and load the kernels.
 
-    The library is kept in `coachable` below `XDG_CACHE_HOME` or `~/.cache`, and only loaded from there if nobody else can
-    write to the folder or the file.
+    The library is kept in `coachable` below `XDG_CACHE_HOME` or `~/.cache`, and only loaded from there if nobody else
+    can write to the folder or the file.
 
     Returns:
         The kernels by dtype of the matrix products, or none without a working C compiler, or if `COACHABLE_NATIVE=0`
