@@ -15,6 +15,7 @@ MODULES = {
 
 # Layer of each part of the package; a module may import from its own layer and from those before it.
 LAYERS = {
+    "files": 0,
     "gl": 0,
     "keys": 0,
     "styles": 0,

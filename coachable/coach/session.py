@@ -20,9 +20,9 @@ from coachable.coach.grammar import StyleGrammar, Understanding
 from coachable.coach.recording import Recording
 from coachable.coach.report import MeasuredWindow, StyleReport
 from coachable.coach.timeline import Timeline
-from coachable.domain import Domain, load_domain
+from coachable.domain import Domain
 from coachable.styles import Choice, StyleSpace
-from coachable.training.weights import load_policy
+from coachable.training.weights import domain_of, load_policy
 
 
 class CoachSession:
@@ -102,7 +102,7 @@ class CoachSession:
             CheckpointError: if there is no such agent, or it is of another version.
         """
         agent = load_policy(source)
-        domain = load_domain(agent.metadata["domain"], agent.config)
+        domain = domain_of(agent)
         return cls(agent.actor, agent.space, domain, source=str(source), **settings)
 
     # -- requests --------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from coachable import __version__
-from coachable.domain import Domain, load_domain
+from coachable.domain import Domain
 from coachable.evaluation.figures import readable
 from coachable.evaluation.report_figures import draw_metrics, draw_requests, draw_switches, draw_tradeoffs
 from coachable.evaluation.report_page import Page, paragraph, picture, shown, table
@@ -27,7 +27,7 @@ from coachable.evaluation.runs import (
 from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.style_grid import acting, mean_of, training_counts, write_csv
 from coachable.styles import Setpoint
-from coachable.training.weights import LoadedPolicy, load_policy
+from coachable.training.weights import LoadedPolicy, domain_of, load_policy, widths_of
 
 __all__ = ["report", "write_report"]
 
@@ -51,11 +51,12 @@ def report(sources: Sequence[str | Path], out: Path, **settings: Any) -> str:
     agents = [load_policy(source) for source in sources]
     first = agents[0]
     for agent, source in zip(agents, sources, strict=True):
-        same = agent.metadata["domain"] == first.metadata["domain"] and first.space.encodes_like(agent.space)
-        if not same:
-            differences = " ".join(first.space.difference(agent.space)) or "they belong to different domains."
+        same = agent.metadata["domain"] == first.metadata["domain"] and widths_of(agent) == widths_of(first)
+        if not same or not first.space.encodes_like(agent.space):
+            others = "they belong to different domains, or differ in their observations."
+            differences = " ".join(first.space.difference(agent.space)) or others
             raise ValueError(f"{source} cannot share a report with {sources[0]}: {differences}")
-    domain = load_domain(first.metadata["domain"], first.config)
+    domain = domain_of(first)
     return write_report(domain, dict(zip(map(str, sources), agents, strict=True)), out, **settings)
 
 

@@ -15,11 +15,11 @@ from torch import Tensor
 from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
-from coachable.domain import Domain, load_domain
+from coachable.domain import Domain
 from coachable.keys import STYLE
 from coachable.styles import Choice, StyleSpace, Weight
 from coachable.training.rng import RandomStream
-from coachable.training.weights import load_policy
+from coachable.training.weights import domain_of, load_policy
 from coachable.transforms import coachable_env
 
 VIDEO_SUFFIXES = (".mp4", ".gif", ".png")
@@ -61,7 +61,7 @@ def render(
     if out.suffix == ".mp4":
         _import_av()
     agent = load_policy(source)
-    domain = load_domain(agent.metadata["domain"], agent.config)
+    domain = domain_of(agent)
     requests = default_tour(domain, agent.space) if styles is None else list(styles)
     period = max(1, round(seconds_per_style / domain.control_step))
     sheet = out.suffix == ".png"
