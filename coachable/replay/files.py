@@ -41,7 +41,7 @@ def write_records(storage: Any, folder: Path) -> None:
             np.lib.format.write_array_header_1_0(stream, header)
             for start in range(0, filled, _CHUNK):
                 chunk = _numpy(value[start : start + _CHUNK])
-                crc = zlib.crc32(chunk, crc)
+                crc = zlib.crc32(chunk.data, crc)
                 chunk.tofile(stream)
             stream.flush()
             os.fsync(stream.fileno())
@@ -85,7 +85,7 @@ def read_records(storage: Any, folder: Path) -> int:
             chunk = TensorDict({}, batch_size=[stop - start])
             for key, array in arrays.items():
                 values = np.array(array[start:stop], order="C")
-                found[key] = zlib.crc32(values, found[key])
+                found[key] = zlib.crc32(values.data, found[key])
                 chunk.set(key, torch.from_numpy(values))
             storage.set(torch.arange(start, stop), chunk)
     for entry in index["entries"]:

@@ -218,8 +218,8 @@ def test_a_failed_checkpoint_does_not_end_the_training(make_train, tmp_path, mon
     def fail(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("coachable.training.checkpoint._save_tensors", fail)
-    with pytest.warns(UserWarning, match=r"was not written .*No space left on device.*Training goes on"):
+    monkeypatch.setattr("coachable.training.checkpoint.save_state", fail)
+    with pytest.warns(UserWarning, match=r"was not written: .*No space left on device.*Training goes on"):
         train.run()
     assert train.frames == 120
     assert not [p for p in (tmp_path / "run" / "checkpoints").iterdir() if p.name != "LATEST"]
