@@ -19,7 +19,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
+from recipe_ranges import checked_numbers
 
+from coachable.finite import NonFiniteError
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
 from coachable.training.hardware import choose_preset, detect, estimate_update_seconds, pick_device
 from coachable.training.loop import Train
@@ -89,7 +91,10 @@ def run_recipe(config_name: str, build: Callable[[dict[str, Any]], Train]) -> No
             # The user's to solve: the sentence says how, a traceback would hide it.
             raise SystemExit(f"error: {error}") from None
         announce(config, train)
-        train.run()
+        try:
+            train.run()
+        except NonFiniteError as error:
+            raise SystemExit(f"error: {error}") from None
 
     main()
 
@@ -164,6 +169,9 @@ def plain_config(cfg: DictConfig, overrides: list[str]) -> dict[str, Any]:
 
     Returns:
         Plain containers, `run_dir` filled in.
+
+    Raises:
+        ValueError: naming a number that lies outside its range.
     """
     if cfg.resume:
         checkpoint = find_checkpoint(cfg.resume)
@@ -186,7 +194,7 @@ def plain_config(cfg: DictConfig, overrides: list[str]) -> dict[str, Any]:
     assert isinstance(config, dict)
     config.pop("hydra", None)
     config["run_dir"] = str(Path(config["run_dir"] or _new_run_dir(config["domain"])).expanduser().absolute())
-    return {str(key): value for key, value in config.items()}
+    return checked_numbers({str(key): value for key, value in config.items()})
 
 
 def announce(config: dict[str, Any], train: Train) -> None:
