@@ -20,8 +20,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
+from recipe_ranges import checked_numbers
 
 from coachable.files import CheckpointError, check_contained, refusing
+from coachable.finite import NonFiniteError
 from coachable.training.checkpoint import find_checkpoint, read_state
 from coachable.training.hardware import choose_preset, detect, estimate_update_seconds, pick_device
 from coachable.training.loop import Train
@@ -91,7 +93,10 @@ def run_recipe(config_name: str, build: Callable[[dict[str, Any]], Train]) -> No
             # The user's to solve: the sentence says how, a traceback would hide it.
             raise SystemExit(f"error: {error}") from None
         announce(config, train)
-        train.run()
+        try:
+            train.run()
+        except NonFiniteError as error:
+            raise SystemExit(f"error: {error}") from None
 
     main()
 
@@ -182,6 +187,7 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
 
     Raises:
         CheckpointError: if the configuration in a checkpoint names other functions, or refers to anything outside.
+        ValueError: naming a number that lies outside its range.
     """
     if cfg.resume:
         checkpoint = find_checkpoint(cfg.resume)
@@ -207,7 +213,7 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
     assert isinstance(config, dict)
     config.pop("hydra", None)
     config["run_dir"] = str(Path(config["run_dir"] or _new_run_dir(config["domain"])).expanduser().absolute())
-    return {str(key): value for key, value in config.items()}
+    return checked_numbers({str(key): value for key, value in config.items()})
 
 
 def check_saved_config(saved: Any, checkpoint: Path, config_name: str, said: Collection[str] = ()) -> None:
