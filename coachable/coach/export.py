@@ -15,6 +15,7 @@ from torch import Tensor
 
 from coachable import __version__
 from coachable.domain import domain_names, load_domain
+from coachable.extras import how_to_install
 from coachable.networks.plain import DeterministicAction
 from coachable.styles import StyleSpace
 from coachable.training.weights import LoadedPolicy, load_policy
@@ -159,5 +160,5 @@ def _import_onnx() -> Any:
         import onnxruntime  # noqa: F401
         import onnxscript  # noqa: F401
     except ImportError as error:
-        raise ImportError(f"{error.name} is missing: pip install 'coachable[export]'") from error
+        raise ImportError(f"{error.name} is missing: {how_to_install('export')}") from error
     return onnx
