@@ -44,6 +44,8 @@ _FIXED = (
     "init_new_observations",
 )
 
+_PATHS = ("run_dir", "resume", "init_from")
+
 # Options of Hydra that are followed by a value.
 _VALUED = (
     "--cfg",
@@ -132,7 +134,7 @@ def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
         SystemExit: naming what is misspelt or of a wrong type, and the valid choices.
     """
     try:
-        options, given = _options_apart(arguments)
+        options, given = _options_apart(_quoted_paths(arguments))
         overrides = OverridesParser.create().parse_overrides(given)
     except HydraException as error:
         raise SystemExit(f"error: {error}\nexpected KEY=VALUE, for example loss=sac or train.batch_size=256") from None
@@ -340,6 +342,20 @@ def _options_apart(arguments: list[str]) -> tuple[list[str], list[str]]:
     for before, argument in itertools.pairwise(["", *arguments]):
         (options if argument.startswith("-") or before in _VALUED else overrides).append(argument)
     return options, overrides
+
+
+def _quoted_paths(arguments: list[str]) -> list[str]:
+    """Puts paths into quotes, so that Hydra takes them as they are: a folder may be called `a=b` or `a, b`."""
+    if {"-m", "--multirun"} & set(arguments):
+        return arguments
+    quoted = []
+    for argument in arguments:
+        key, equals, value = argument.partition("=")
+        if equals and key in _PATHS and value not in ("", "null") and value[0] not in "'\"":
+            escaped = value.replace("'", "\\'")
+            argument = f"{key}='{escaped}'"
+        quoted.append(argument)
+    return quoted
 
 
 def _choices(given: str, valid: list[str]) -> str:

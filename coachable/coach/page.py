@@ -110,9 +110,9 @@ class CoachPage:
         self.loop.submit(lambda session: session.steer(**widget.take()))  # pyright: ignore[reportArgumentType]
 
     def _add_phrase_box(self) -> None:
-        gui = self.server.gui
+        gui, examples = self.server.gui, self.session.grammar.examples
         with gui.add_form("In words") as form:
-            self.phrase = gui.add_text("phrase", "", hint="such as: shorter steps, arms up; a bit more; 0.4 m")
+            self.phrase = gui.add_text("phrase", "", hint=f"such as: {'; '.join(examples)}; a bit more")
             self.say = gui.add_button("Apply")
             self.answer = gui.add_markdown("")
         self.say.on_click(lambda _: form.submit())
@@ -177,7 +177,8 @@ class CoachPage:
             self.preset_name = gui.add_text("new name", "")
             keep = gui.add_button("Save style as preset")
         with gui.add_folder("Schedule"):
-            gui.add_markdown("One `SECONDS: PHRASE` or `SECONDS: PRESET` per line, such as `3: arms up`.")
+            example = next(iter(self.session.grammar.examples), "default")
+            gui.add_markdown(f"One `SECONDS: PHRASE` or `SECONDS: PRESET` per line, such as `3: {example}`.")
             self.plan = gui.add_text("plan", "", multiline=True)
             self.run_plan = gui.add_button("Run schedule")
             cancel = gui.add_button("Stop schedule")

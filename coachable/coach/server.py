@@ -8,6 +8,8 @@ import io
 import socket
 from typing import TYPE_CHECKING
 
+from coachable.extras import how_to_install
+
 if TYPE_CHECKING:
     import viser
 
@@ -35,7 +37,7 @@ def make_server(host: str = "127.0.0.1", port: int = 8080) -> viser.ViserServer:
     try:
         import viser
     except ImportError as error:
-        raise ImportError('the page needs viser and mjviser: pip install "coachable[ui]"') from error
+        raise ImportError(f"the page needs viser and mjviser: {how_to_install('ui')}") from error
     from coachable.coach.guard import Guard
 
     class LocalServer(viser.ViserServer):

@@ -82,7 +82,9 @@ class CoachSession:
         self._controls = {control.parameter.name: control for control in self.coaching.controls}
         self._control_values = {name: cast(float, c.parameter.default) for name, c in self._controls.items()}
         self.grammar = StyleGrammar(
-            [*space.parameters, *(control.parameter for control in self.coaching.controls)], self.coaching.vocabulary
+            [*space.parameters, *(control.parameter for control in self.coaching.controls)],
+            self.coaching.vocabulary,
+            self.coaching.examples,
         )
         self._understood: Understanding | None = None
         self._recent = MeasuredWindow(domain.measures, round(window / domain.control_step))
