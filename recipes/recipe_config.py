@@ -20,8 +20,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
+from recipe_ranges import checked_numbers
 
 from coachable.files import CheckpointError, check_contained, refusing
+from coachable.finite import NonFiniteError
 from coachable.training.checkpoint import find_checkpoint, read_state
 from coachable.training.hardware import choose_preset, detect, estimate_update_seconds, pick_device
 from coachable.training.loop import Train
@@ -41,6 +43,8 @@ _FIXED = (
     "init_from",
     "init_new_observations",
 )
+
+_PATHS = ("run_dir", "resume", "init_from")
 
 # Options of Hydra that are followed by a value.
 _VALUED = (
@@ -91,7 +95,10 @@ def run_recipe(config_name: str, build: Callable[[dict[str, Any]], Train]) -> No
             # The user's to solve: the sentence says how, a traceback would hide it.
             raise SystemExit(f"error: {error}") from None
         announce(config, train)
-        train.run()
+        try:
+            train.run()
+        except NonFiniteError as error:
+            raise SystemExit(f"error: {error}") from None
 
     main()
 
@@ -127,7 +134,7 @@ def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
         SystemExit: naming what is misspelt or of a wrong type, and the valid choices.
     """
     try:
-        options, given = _options_apart(arguments)
+        options, given = _options_apart(_quoted_paths(arguments))
         overrides = OverridesParser.create().parse_overrides(given)
     except HydraException as error:
         raise SystemExit(f"error: {error}\nexpected KEY=VALUE, for example loss=sac or train.batch_size=256") from None
@@ -182,6 +189,7 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
 
     Raises:
         CheckpointError: if the configuration in a checkpoint names other functions, or refers to anything outside.
+        ValueError: naming a number that lies outside its range.
     """
     if cfg.resume:
         checkpoint = find_checkpoint(cfg.resume)
@@ -207,7 +215,7 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
     assert isinstance(config, dict)
     config.pop("hydra", None)
     config["run_dir"] = str(Path(config["run_dir"] or _new_run_dir(config["domain"])).expanduser().absolute())
-    return {str(key): value for key, value in config.items()}
+    return checked_numbers({str(key): value for key, value in config.items()})
 
 
 def check_saved_config(saved: Any, checkpoint: Path, config_name: str, said: Collection[str] = ()) -> None:
@@ -334,6 +342,20 @@ def _options_apart(arguments: list[str]) -> tuple[list[str], list[str]]:
     for before, argument in itertools.pairwise(["", *arguments]):
         (options if argument.startswith("-") or before in _VALUED else overrides).append(argument)
     return options, overrides
+
+
+def _quoted_paths(arguments: list[str]) -> list[str]:
+    """Puts paths into quotes, so that Hydra takes them as they are: a folder may be called `a=b` or `a, b`."""
+    if {"-m", "--multirun"} & set(arguments):
+        return arguments
+    quoted = []
+    for argument in arguments:
+        key, equals, value = argument.partition("=")
+        if equals and key in _PATHS and value not in ("", "null") and value[0] not in "'\"":
+            escaped = value.replace("'", "\\'")
+            argument = f"{key}='{escaped}'"
+        quoted.append(argument)
+    return quoted
 
 
 def _choices(given: str, valid: list[str]) -> str:

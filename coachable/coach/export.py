@@ -16,6 +16,7 @@ from torch import Tensor
 
 from coachable import __version__
 from coachable.domain import domain_names
+from coachable.extras import how_to_install
 from coachable.files import CheckpointError, space_named
 from coachable.networks.plain import DeterministicAction
 from coachable.styles import StyleSpace
@@ -169,5 +170,5 @@ def _import_onnx() -> Any:
         import onnxruntime  # noqa: F401
         import onnxscript  # noqa: F401
     except ImportError as error:
-        raise ImportError(f"{error.name} is missing: pip install 'coachable[export]'") from error
+        raise ImportError(f"{error.name} is missing: {how_to_install('export')}") from error
     return onnx

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from coachable.files import load_state, save_state
+from coachable.ranges import NOT_NEGATIVE, Range
 from coachable.replay.events import EventPredicate, Route, StyleEvents
 from coachable.replay.files import read_records, write_records
 from coachable.replay.n_step import NStep
@@ -113,7 +114,10 @@ class EventTableBuffer(TensorDictReplayBuffer):
                 raise ValueError(f"EventTableBuffer takes no {name}: it has its own sampler and writer, in one process")
         if n_steps != 1 and gamma is None:
             raise ValueError(f"n_steps is {n_steps} but gamma is missing: give the discount of the loss")
-        n_step = NStep(n_steps, gamma or 1.0, discounted_keys) if n_steps != 1 else None
+        Range("[0, 1]", optional=True).check("gamma", gamma)
+        n_step = None if n_steps == 1 or gamma is None else NStep(n_steps, gamma, discounted_keys)
+        NOT_NEGATIVE.check("priority_alpha", priority_alpha)
+        NOT_NEGATIVE.check("priority_beta", priority_beta)
         self.regions = regions
         super().__init__(
             storage=storage(regions.total),
@@ -146,8 +150,7 @@ class EventTableBuffer(TensorDictReplayBuffer):
         Raises:
             ValueError: If the share is not between 0 and 1.
         """
-        if not 0.0 < event_share < 1.0:
-            raise ValueError(f"event_share is {event_share}: expected a share of the batch, between 0 and 1")
+        Range("(0, 1)").check("event_share", event_share)
         capacities = {"default": capacity, **dict.fromkeys(events.names, event_capacity)}
         shares = {"default": 1.0 - event_share, **dict.fromkeys(events.names, event_share / len(events.names))}
         proportions = {"table_proportions": shares, **kwargs}

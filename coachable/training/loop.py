@@ -15,10 +15,11 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 
 from coachable.files import refusing
+from coachable.finite import NonFiniteError, require_finite
 from coachable.keys import EVENTS, STYLE, STYLE_FEATURES, TASK_REWARD
 from coachable.replay import EventTableBuffer
 from coachable.training.checkpoint import CheckpointStore, find_checkpoint, read_state
-from coachable.training.collection import collector_state, load_collector_state, require_finite
+from coachable.training.collection import collector_state, load_collector_state
 from coachable.training.episodes import EpisodeStatistics, Means
 from coachable.training.learner import Learner
 from coachable.training.logging import MetricsLog, Progress
@@ -122,7 +123,8 @@ class Train:
             The latest value of every metric.
 
         Raises:
-            ValueError: if an observation or a reward is not finite.
+            NonFiniteError: if a number of a transition, loss or gradient is not finite. It is not stored, it changes
+                no weight, and no checkpoint is written after it.
         """
         self.progress.start(self.frames, self.learner.updates)
         batches = iter(self.collector)
@@ -136,6 +138,11 @@ class Train:
                     self._log_if_due()
                     self._checkpoint_if_due()
                 self._finish(interrupted=stop.is_set())
+        except NonFiniteError as error:
+            error.args = (
+                f"{error} The training stopped at env-step {self.frames:,}; its checkpoints are from before.",
+            )
+            raise
         finally:
             self.progress.close()
             self.collector.shutdown()
@@ -152,13 +159,12 @@ class Train:
 
     def _store(self, data: TensorDictBase) -> None:
         with self._timed("store"):
-            data = data.contiguous().reshape(
-                -1
-            )  # flattening the lazy stack without contiguous() takes 25 times as long
-            require_finite(data)
-            self._episodes.add(data)
+            data = data.contiguous()  # flattening the lazy stack without it takes 25 times as long
+            stored = data.select(*self.replay_keys)
+            require_finite(stored)
+            self._episodes.add(data.reshape(-1))
             # Of one trajectory, earlier steps come first: all that an EventTableBuffer needs besides its number.
-            self.replay.extend(data.select(*self.replay_keys))
+            self.replay.extend(stored.reshape(-1))
 
     def _update(self, new_frames: int, stop: threading.Event) -> None:
         warming_up = self.frames - self._filled_from <= self.settings.warmup_frames

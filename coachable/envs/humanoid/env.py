@@ -24,6 +24,7 @@ from coachable.envs.humanoid.observation import (
 from coachable.envs.humanoid.rewards import move_reward
 from coachable.envs.humanoid.simulation import HumanoidSimulation, Kinematics
 from coachable.envs.humanoid.styles import STYLE_FEATURES_SIZE, pack_style_features
+from coachable.finite import require_finite_action
 from coachable.keys import STYLE_FEATURES, TASK_REWARD
 
 EPISODE_STEPS = 1000
@@ -134,9 +135,9 @@ class HumanoidEnv(EnvBase):
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        controls = np.clip(tensordict.get("action").detach().numpy().astype(np.float64), -1.0, 1.0)
-        if np.isnan(controls).any():
-            raise ValueError("action contains NaN: the policy has diverged")
+        action = tensordict.get("action").detach()
+        require_finite_action(action)
+        controls = np.clip(action.numpy().astype(np.float64), -1.0, 1.0)
         diverged = self.simulation.step(controls)
         self.divergences += int(diverged.sum())
         self.steps += 1
