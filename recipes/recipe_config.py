@@ -7,9 +7,8 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +20,13 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from recipe_ranges import checked_numbers
+from recipe_saved import CONFIGS, check_saved_config
 
 from coachable.files import CheckpointError, check_contained, refusing
 from coachable.finite import NonFiniteError
 from coachable.training.checkpoint import find_checkpoint, read_state
 from coachable.training.hardware import choose_preset, detect, estimate_update_seconds, pick_device
 from coachable.training.loop import Train
-
-CONFIGS = Path(__file__).resolve().parent / "configs"
 
 # What a checkpoint decides: its weights, its replay buffer and its generators belong to these values.
 _FIXED = (
@@ -97,7 +95,7 @@ def run_recipe(config_name: str, build: Callable[[dict[str, Any]], Train]) -> No
         announce(config, train)
         try:
             train.run()
-        except NonFiniteError as error:
+        except (NonFiniteError, CheckpointError) as error:
             raise SystemExit(f"error: {error}") from None
 
     main()
@@ -195,7 +193,7 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
         checkpoint = find_checkpoint(cfg.resume)
         saved = read_state(checkpoint).get("config")
         said = {key: OmegaConf.select(cfg, key) for key in _said(overrides)}
-        check_saved_config(saved, checkpoint, config_name, said)
+        check_saved_config(saved, checkpoint, config_name, said, OmegaConf.to_container(cfg, resolve=True))
         with refusing(checkpoint, "a configuration"):
             before = OmegaConf.create(saved)
             fixed = [key for key in said if key.split(".")[0] in _FIXED and said[key] != OmegaConf.select(before, key)]
@@ -215,69 +213,11 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
     assert isinstance(config, dict)
     config.pop("hydra", None)
     config["run_dir"] = str(Path(config["run_dir"] or _new_run_dir(config["domain"])).expanduser().absolute())
-    return checked_numbers({str(key): value for key, value in config.items()})
-
-
-def check_saved_config(saved: Any, checkpoint: Path, config_name: str, said: Collection[str] = ()) -> None:
-    """Refuses a configuration from a checkpoint that could run something else than this recipe.
-
-    Hydra calls whatever a configuration names as a `_target_`, and OmegaConf fills in `${...}` from the environment and
-    other places. A checkpoint may come from anybody: each `_target_` has to be one that the YAML files of the recipe
-    name at the same place, and nothing is filled in.
-
-    Args:
-        saved: from the checkpoint.
-        checkpoint: for the message.
-        config_name: file in recipes/configs, without its suffix.
-        said: keys that the command line replaces.
-
-    Raises:
-        CheckpointError: naming the place.
-    """
-    if not isinstance(saved, dict) or not str(saved.get("domain")).isidentifier():
-        raise CheckpointError(f"{checkpoint} holds no configuration of a training: it cannot be resumed")
-    known = known_targets(config_name)
-    replaced = [tuple(key.split(".")) for key in said]
-    for place, value in _leaves(saved):
-        if any(place[: len(key)] == key for key in replaced):
-            continue
-        where, name = ".".join(place), place[-1]
-        if name == "_target_" and (place, value) not in known:
-            here = sorted(target for known_place, target in known if known_place == place)
-            raise CheckpointError(
-                f"{checkpoint} names {value!r} as its {where}: expected {' or '.join(here) or 'none'}, as the "
-                f"configuration of {config_name} has it; say {where}={value} yourself if you trust it"
-            )
-        plain = value is None or isinstance(value, bool | int | float | str)
-        if not plain or "${" in str(value) or (name.startswith("_") and name != "_target_"):
-            raise CheckpointError(f"{checkpoint} has {value!r} as its {where}: expected a plain value")
-
-
-@cache
-def known_targets(config_name: str) -> set[tuple[tuple[str, ...], str]]:
-    """Where the YAML files of a recipe, its groups and its presets name which `_target_`: (place, target)."""
-    presets = CONFIGS / "preset" / config_name
-    groups = (folder for folder in CONFIGS.iterdir() if folder.is_dir() and folder.name != "preset")
-    files = [CONFIGS / f"{config_name}.yaml", CONFIGS / "training.yaml", *presets.glob("*.yaml")]
-    files += [file for group in groups for file in group.glob("*.yaml")]
-    leaves = []
-    for file in files:
-        content = OmegaConf.to_container(OmegaConf.load(file))
-        shared = file.parent in (CONFIGS, presets) or "# @package _global_" in file.read_text(encoding="utf-8")
-        leaves += _leaves(content if shared else {file.parent.name: content})
-    known = {(place, value) for place, value in leaves if place[-1] == "_target_"}
-    for place, value in leaves:  # what is filled in from elsewhere, such as replay.events
-        source = tuple(str(value)[2:-1].split(".")) if str(value).startswith("${") else ()
-        known |= {(place + where[len(source) :], t) for where, t in known if source and where[: len(source)] == source}
-    return known
-
-
-def _leaves(value: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    if isinstance(value, dict | list | tuple):
-        for key, entry in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from _leaves(entry, (*place, str(key)))
-    else:
-        yield place, value
+    config = {str(key): value for key, value in config.items()}
+    if not config["resume"]:
+        return checked_numbers(config)
+    with refusing(config["resume"], "a configuration"):
+        return checked_numbers(config)
 
 
 def announce(config: dict[str, Any], train: Train) -> None:

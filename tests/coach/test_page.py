@@ -112,7 +112,9 @@ def wire(page):
 
     address = f"127.0.0.1:{page.server.get_port()}"
     protocol = f"viser-v{viser.__version__}"
-    with websockets.connect(f"ws://{address}", subprotocols=[protocol], origin=f"http://{address}", max_size=None) as socket:
+    with websockets.connect(
+        f"ws://{address}", subprotocols=[protocol], origin=f"http://{address}", max_size=None
+    ) as socket:
 
         def send(message):
             socket.send(msgspec.msgpack.encode(message.as_serializable_dict()))

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from recipe_config import CONFIGS, build_checked, check_saved_config, compose_config, known_targets, run_recipe
+from recipe_config import build_checked, compose_config, run_recipe
+from recipe_saved import CONFIGS, check_saved_config, known_targets
 
 from coachable.cli import main
 from coachable.coach.export import export
@@ -217,12 +218,20 @@ def test_what_the_yaml_files_name_is_known_at_its_place_only():
         assert known_targets(file.stem), file
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning")  # its environment saves no state
-def test_a_whole_run_goes_on_with_targets_of_the_command_line(run):
-    target = "_target_=rare_targets.target_events"
-    config = compose_config(RECIPE, [f"resume={run}", f"events.{target}", f"replay.events.{target}"])
-    assert config["replay"]["events"] == {"_target_": "rare_targets.target_events"}
-    assert _resume(run).frames == 40
+def test_targets_of_the_command_line_go_on_when_they_are_given_again(run):
+    own = "coachable.replay.KeyEvents"
+
+    def change(state):
+        for place in ("events", "replay.events"):
+            _put(state["config"], place, {"_target_": own, "names": ["a"]})
+
+    _changed(find_checkpoint(run) / "state.pt", change)
+    with pytest.raises(
+        CheckpointError, match=f"names '{own}' as its events._target_: .* say events._target_={own} yourself"
+    ):
+        compose_config(RECIPE, [f"resume={run}"])
+    config = compose_config(RECIPE, [f"resume={run}", f"events._target_={own}"])
+    assert config["replay"]["events"] == config["events"] == {"_target_": own, "names": ["a"]}
 
 
 # -- pickles -----------------------------------------------------------------------------------------------------------
