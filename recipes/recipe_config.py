@@ -7,8 +7,9 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,9 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from recipe_ranges import checked_numbers
 
+from coachable.files import CheckpointError, check_contained, refusing
 from coachable.finite import NonFiniteError
-from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
+from coachable.training.checkpoint import find_checkpoint, read_state
 from coachable.training.hardware import choose_preset, detect, estimate_update_seconds, pick_device
 from coachable.training.loop import Train
 
@@ -41,6 +43,8 @@ _FIXED = (
     "init_from",
     "init_new_observations",
 )
+
+_PATHS = ("run_dir", "resume", "init_from")
 
 # Options of Hydra that are followed by a value.
 _VALUED = (
@@ -83,8 +87,8 @@ def run_recipe(config_name: str, build: Callable[[dict[str, Any]], Train]) -> No
     @hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name=config_name)
     def main(cfg: DictConfig) -> None:
         try:
-            config = plain_config(cfg, list(HydraConfig.get().overrides.task))
-            train = build(config)
+            config = plain_config(cfg, list(HydraConfig.get().overrides.task), config_name)
+            train = build_checked(build, config)
         except (CheckpointError, ValueError, ImportError) as error:
             if "HYDRA_FULL_ERROR" in os.environ:
                 raise
@@ -111,7 +115,7 @@ def compose_config(config_name: str, arguments: list[str]) -> dict[str, Any]:
     """
     arguments = checked_arguments(config_name, arguments)
     with _configs():
-        return plain_config(hydra.compose(config_name, arguments), arguments)
+        return plain_config(hydra.compose(config_name, arguments), arguments, config_name)
 
 
 def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
@@ -130,7 +134,7 @@ def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
         SystemExit: naming what is misspelt or of a wrong type, and the valid choices.
     """
     try:
-        options, given = _options_apart(arguments)
+        options, given = _options_apart(_quoted_paths(arguments))
         overrides = OverridesParser.create().parse_overrides(given)
     except HydraException as error:
         raise SystemExit(f"error: {error}\nexpected KEY=VALUE, for example loss=sac or train.batch_size=256") from None
@@ -160,41 +164,120 @@ def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
     return [*options, *(a for a in given if not a.startswith("preset=")), f"preset={','.join(presets)}"]
 
 
-def plain_config(cfg: DictConfig, overrides: list[str]) -> dict[str, Any]:
+def build_checked(build: Callable[[dict[str, Any]], Train], config: dict[str, Any]) -> Train:
+    """Builds a training; a saved configuration that makes none is refused with a sentence.
+
+    Raises:
+        CheckpointError: if a resumed run's configuration cannot be used.
+    """
+    if not config["resume"]:
+        return build(config)
+    with refusing(config["resume"], "a configuration"):
+        return build(config)
+
+
+def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dict[str, Any]:
     """Resolves a composed configuration; a resumed run's starts from the one in its checkpoint.
 
     Args:
         cfg: composed by Hydra.
         overrides: what the command line said.
+        config_name: file in recipes/configs, without its suffix; a checkpoint may name what it and its groups name.
 
     Returns:
         Plain containers, `run_dir` filled in.
 
     Raises:
+        CheckpointError: if the configuration in a checkpoint names other functions, or refers to anything outside.
         ValueError: naming a number that lies outside its range.
     """
     if cfg.resume:
         checkpoint = find_checkpoint(cfg.resume)
-        saved = read_state(checkpoint)["config"]
+        saved = read_state(checkpoint).get("config")
         said = {key: OmegaConf.select(cfg, key) for key in _said(overrides)}
-        fixed = [key for key in said if key.split(".")[0] in _FIXED]
+        check_saved_config(saved, checkpoint, config_name, said)
+        with refusing(checkpoint, "a configuration"):
+            before = OmegaConf.create(saved)
+            fixed = [key for key in said if key.split(".")[0] in _FIXED and said[key] != OmegaConf.select(before, key)]
         if fixed:
             raise SystemExit(
                 f"error: {', '.join(fixed)} cannot change in a resumed run: start a new one with init_from={cfg.resume}"
             )
-        cfg = OmegaConf.create(saved)
-        for key, value in {
-            "init_from": None,
-            "run_dir": _run_of(checkpoint),
-            **said,
-            "resume": str(checkpoint),
-        }.items():
-            OmegaConf.update(cfg, key, value, merge=False)
+        run = _run_of(checkpoint)
+        replaced = {"init_from": None, "run_dir": run, **said, "resume": str(checkpoint)}
+        if run is not None and replaced["run_dir"] == run:
+            check_contained(Path(run))  # the run's own files are written to
+        with refusing(checkpoint, "a configuration"):
+            for key, value in replaced.items():
+                OmegaConf.update(before, key, value, merge=False)
+            cfg = OmegaConf.create(OmegaConf.to_container(before, resolve=True, throw_on_missing=True))
     config = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
     assert isinstance(config, dict)
     config.pop("hydra", None)
     config["run_dir"] = str(Path(config["run_dir"] or _new_run_dir(config["domain"])).expanduser().absolute())
     return checked_numbers({str(key): value for key, value in config.items()})
+
+
+def check_saved_config(saved: Any, checkpoint: Path, config_name: str, said: Collection[str] = ()) -> None:
+    """Refuses a configuration from a checkpoint that could run something else than this recipe.
+
+    Hydra calls whatever a configuration names as a `_target_`, and OmegaConf fills in `${...}` from the environment and
+    other places. A checkpoint may come from anybody: each `_target_` has to be one that the YAML files of the recipe
+    name at the same place, and nothing is filled in.
+
+    Args:
+        saved: from the checkpoint.
+        checkpoint: for the message.
+        config_name: file in recipes/configs, without its suffix.
+        said: keys that the command line replaces.
+
+    Raises:
+        CheckpointError: naming the place.
+    """
+    if not isinstance(saved, dict) or not str(saved.get("domain")).isidentifier():
+        raise CheckpointError(f"{checkpoint} holds no configuration of a training: it cannot be resumed")
+    known = known_targets(config_name)
+    replaced = [tuple(key.split(".")) for key in said]
+    for place, value in _leaves(saved):
+        if any(place[: len(key)] == key for key in replaced):
+            continue
+        where, name = ".".join(place), place[-1]
+        if name == "_target_" and (place, value) not in known:
+            here = sorted(target for known_place, target in known if known_place == place)
+            raise CheckpointError(
+                f"{checkpoint} names {value!r} as its {where}: expected {' or '.join(here) or 'none'}, as the "
+                f"configuration of {config_name} has it; say {where}={value} yourself if you trust it"
+            )
+        plain = value is None or isinstance(value, bool | int | float | str)
+        if not plain or "${" in str(value) or (name.startswith("_") and name != "_target_"):
+            raise CheckpointError(f"{checkpoint} has {value!r} as its {where}: expected a plain value")
+
+
+@cache
+def known_targets(config_name: str) -> set[tuple[tuple[str, ...], str]]:
+    """Where the YAML files of a recipe, its groups and its presets name which `_target_`: (place, target)."""
+    presets = CONFIGS / "preset" / config_name
+    groups = (folder for folder in CONFIGS.iterdir() if folder.is_dir() and folder.name != "preset")
+    files = [CONFIGS / f"{config_name}.yaml", CONFIGS / "training.yaml", *presets.glob("*.yaml")]
+    files += [file for group in groups for file in group.glob("*.yaml")]
+    leaves = []
+    for file in files:
+        content = OmegaConf.to_container(OmegaConf.load(file))
+        shared = file.parent in (CONFIGS, presets) or "# @package _global_" in file.read_text(encoding="utf-8")
+        leaves += _leaves(content if shared else {file.parent.name: content})
+    known = {(place, value) for place, value in leaves if place[-1] == "_target_"}
+    for place, value in leaves:  # what is filled in from elsewhere, such as replay.events
+        source = tuple(str(value)[2:-1].split(".")) if str(value).startswith("${") else ()
+        known |= {(place + where[len(source) :], t) for where, t in known if source and where[: len(source)] == source}
+    return known
+
+
+def _leaves(value: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    if isinstance(value, dict | list | tuple):
+        for key, entry in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _leaves(entry, (*place, str(key)))
+    else:
+        yield place, value
 
 
 def announce(config: dict[str, Any], train: Train) -> None:
@@ -259,6 +342,20 @@ def _options_apart(arguments: list[str]) -> tuple[list[str], list[str]]:
     for before, argument in itertools.pairwise(["", *arguments]):
         (options if argument.startswith("-") or before in _VALUED else overrides).append(argument)
     return options, overrides
+
+
+def _quoted_paths(arguments: list[str]) -> list[str]:
+    """Puts paths into quotes, so that Hydra takes them as they are: a folder may be called `a=b` or `a, b`."""
+    if {"-m", "--multirun"} & set(arguments):
+        return arguments
+    quoted = []
+    for argument in arguments:
+        key, equals, value = argument.partition("=")
+        if equals and key in _PATHS and value not in ("", "null") and value[0] not in "'\"":
+            escaped = value.replace("'", "\\'")
+            argument = f"{key}='{escaped}'"
+        quoted.append(argument)
+    return quoted
 
 
 def _choices(given: str, valid: list[str]) -> str:

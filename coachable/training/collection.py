@@ -168,8 +168,8 @@ def load_collector_state(collector: BaseCollector, state: dict[str, Any]) -> boo
         warnings.warn("the collector's state was not saved or cannot be restored: episodes restart", stacklevel=2)
         return False
     env, base = collector.env, simulation_env(collector.env)
-    collector._frames = state["frames"]
-    collector._iter = state["iterations"]
+    collector._frames = int(state["frames"])
+    collector._iter = int(state["iterations"])
     if isinstance(env, TransformedEnv):
         env.load_state_dict(state["transforms"])
     if not state["carrier"] or not isinstance(base, ResumableEnv):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import math
 import os
@@ -20,6 +21,7 @@ from coachable.ranges import AMOUNT, NOT_NEGATIVE, POSITIVE, SHARE, Range
 from coachable.training.acceleration import Acceleration
 from coachable.training.adam import FlatAdam, place_moments
 from coachable.training.lean_sac import LeanSAC
+from coachable.training.parameters import Watch, adopt_actor, follow, loaded, share_actor, trained_parameters
 from coachable.training.precision import Precision, resolve_precision
 
 _LOG = logging.getLogger(__name__)
@@ -74,6 +76,9 @@ class Learner:
         check_every: On a GPU, ask every so many updates whether one was left out, which waits for the device; 0 leaves
             that to calls of :meth:`check_finite`. On a CPU every update is checked.
 
+    Between updates the loss and its policy may be moved to shared memory, cast to another dtype, loaded with
+    `assign=True` or given other `.data`; an update trains the parameters that they have then.
+
     Raises:
         ValueError: If an option is unknown or a number out of range.
     """
@@ -94,6 +99,7 @@ class Learner:
         compile: bool = False,
         check_every: int = 100,
     ) -> None:
+        self._options = {name: value for name, value in locals().items() if name not in ("self", "loss_module")}
         if update_order not in get_args(UpdateOrder):
             raise ValueError(f"update_order must be one of {get_args(UpdateOrder)}, got {update_order!r}")
         rates = {"actor": actor_lr, "critic": critic_lr, "alpha": alpha_lr}
@@ -110,7 +116,12 @@ class Learner:
         self.check_every = check_every
         self.updates = 0
         self.tau = tau
-        params = _parameter_groups(loss_module)
+        share_actor(loss_module)
+        self._watch = Watch(loss_module)
+        self._watch.forget_copies()
+        loss_module.register_load_state_dict_post_hook(loaded)
+        self._names = trained_parameters(loss_module)
+        self._params = params = self._present_parameters()
         device = params["actor"][0].device
         self.precision = resolve_precision(precision, device)
         self._device_type = device.type
@@ -121,7 +132,6 @@ class Learner:
             self._acceleration = Acceleration(loss_module, torch.bfloat16 if self.precision == "bf16" else None)
             if LeanSAC.supports(loss_module):
                 self._lean = LeanSAC(loss_module, self._acceleration)
-        self._params = params
         self.optimizers: dict[str, torch.optim.Adam] = {
             name: self._adam(name, group, rates[name], adam_eps) for name, group in params.items() if group
         }
@@ -132,7 +142,8 @@ class Learner:
         self._losses = _Losses(loss.forward, loss.actor_loss, _critic_loss_of(loss))
         if compile and self._acceleration is None and _can_compile(device):
             self._losses = _Losses(*map(torch.compile, self._losses))
-        self._watch = torch.zeros((), device=device)
+        self._left_out = torch.zeros((), device=device)
+        self._watch.look()
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Make one update.
@@ -150,6 +161,7 @@ class Learner:
             NonFiniteLossError: If a loss or a gradient is infinite or NaN (on a GPU: was, see `check_every`); no weight
                 has been changed by it.
         """
+        self._follow()
         losses = self._losses
         if self._lean is not None and self._lean.serves(batch):
             losses = _Losses(self._lean.forward, self._lean.actor_loss, self._lean.critic_loss)
@@ -184,8 +196,8 @@ class Learner:
 
     def check_finite(self) -> None:
         """Raise if an update since the last check was left out on a GPU (this reads one number from the device)."""
-        found = float(self._watch)
-        self._watch.zero_()
+        found = float(self._left_out)
+        self._left_out.zero_()
         if not math.isfinite(found):
             raise NonFiniteLossError(
                 f"a loss or a gradient was not finite at or before update {self.updates}. {_ADVICE}"
@@ -207,6 +219,7 @@ class Learner:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned; rates and a fixed entropy weight stay those of the constructor."""
+        self._follow()
         self.loss_module.load_state_dict(state["loss_module"])
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
@@ -215,7 +228,37 @@ class Learner:
         self.scale_learning_rates(1.0)
         self.scale_entropy_weight(1.0)
         self.updates = int(state["updates"])
-        self._watch.zero_()
+        self._left_out.zero_()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Learner:
+        """A learner of a copy of the loss, with a copy of the state."""
+        twin = type(self)(copy.deepcopy(self.loss_module, memo), **self._options)
+        twin.load_state_dict(copy.deepcopy(self.state_dict(), memo))
+        return twin
+
+    def _present_parameters(self) -> dict[str, list[nn.Parameter]]:
+        """The trained parameters that the loss has now."""
+        every = dict(self.loss_module.named_parameters())
+        return {kind: [every[name] for name in names] for kind, names in self._names.items()}
+
+    def _follow(self) -> None:
+        """Go on with the loss's parameters as they are now: others may be in their place, or other memory in theirs."""
+        adopt_actor(self.loss_module)
+        if not self._watch.changed():
+            return
+        self._watch.forget_copies()
+        self._params = self._present_parameters()
+        device = self._params["actor"][0].device
+        if device.type != self._device_type:
+            raise RuntimeError(
+                f"the loss was moved to {device} after its learner was made for {self._device_type}: make a learner of "
+                "the moved loss, and load this one's state_dict() into it"
+            )
+        if self._acceleration is not None:
+            self._acceleration.bind()
+        for name, optimizer in self.optimizers.items():
+            follow(optimizer, self._params[name])
+        self._watch.look()
 
     def _adam(self, name: str, params: list[nn.Parameter], lr: float, eps: float) -> torch.optim.Adam:
         acceleration = self._acceleration
@@ -274,7 +317,7 @@ class Learner:
                 )
             return
         total = torch.stack([value.detach().float() for value in values.values()]).sum()
-        self._watch.add_(total)  # a sum stays NaN or infinite once a part was
+        self._left_out.add_(total)  # a sum stays NaN or infinite once a part was
         for name in names:  # the fused Adam of a GPU then changes nothing, without waiting for the device
             cast(Any, self.optimizers[name]).found_inf = (~total.isfinite()).float()
 
@@ -325,21 +368,6 @@ def _critic_health(outputs: Any) -> dict[str, Tensor]:
     """Share of targets outside a categorical critic's support; empty for other critics."""
     clipped = outputs.get("clipped_fraction", None)
     return {} if clipped is None else {"clipped_fraction": clipped.mean()}
-
-
-def _parameter_groups(loss_module: LossModule) -> dict[str, list[nn.Parameter]]:
-    """Split the trainable parameters into the policy's, the critics' and the temperature."""
-    groups: dict[str, list[nn.Parameter]] = {"actor": [], "critic": [], "alpha": []}
-    for name, parameter in loss_module.named_parameters():
-        if parameter.requires_grad:
-            kind = "actor" if name.startswith("actor_network_params") else "alpha" if name == "log_alpha" else "critic"
-            groups[kind].append(parameter)
-    if not groups["actor"] or not groups["critic"]:
-        missing = "critics" if groups["actor"] else "a policy (actor_network_params)"
-        raise ValueError(
-            f"{type(loss_module).__name__} has no trainable parameters of {missing}: the learner needs both"
-        )
-    return groups
 
 
 def _check_loss(loss_module: LossModule) -> None:

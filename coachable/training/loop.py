@@ -14,6 +14,7 @@ from torchrl.collectors import BaseCollector, Collector
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 
+from coachable.files import refusing
 from coachable.finite import NonFiniteError, require_finite
 from coachable.keys import EVENTS, STYLE, STYLE_FEATURES, TASK_REWARD
 from coachable.replay import EventTableBuffer
@@ -274,13 +275,14 @@ class Train:
             The checkpoint.
 
         Raises:
-            CheckpointError: if there is none, or style space or network shapes differ.
+            CheckpointError: if there is none, it is damaged, or style space or network shapes differ.
         """
         path = find_checkpoint(path)
         state = read_state(path)
         require_same_agent(state, self.describe(), path)
-        self.log.rewind(state["loop"]["frames"])
-        self.load_state_dict(state, path / "replay" if (path / "replay").is_dir() else None)
+        with refusing(path, "the state of a training"):
+            self.load_state_dict(state, path / "replay" if (path / "replay").is_dir() else None)
+        self.log.rewind(self.frames)
         return path
 
     def load_state_dict(self, state: Mapping[str, Any], replay: Path | None = None) -> None:
@@ -291,10 +293,10 @@ class Train:
             replay: folder of the saved replay buffer; None starts with an empty one, and says so.
         """
         self.learner.load_state_dict(state["learner"])
-        self.frames = state["loop"]["frames"]
-        self.owed = state["loop"]["owed"]
-        self._evaluations = state["loop"]["evaluations"]
-        self._filled_from = state["loop"]["filled_from"]
+        self.frames = int(state["loop"]["frames"])
+        self.owed = float(state["loop"]["owed"])
+        self._evaluations = int(state["loop"]["evaluations"])
+        self._filled_from = int(state["loop"]["filled_from"])
         if replay is not None:
             read_replay(self.replay, replay)
         else:

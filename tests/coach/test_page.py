@@ -110,9 +110,11 @@ def wire(page):
     """A browser's connection without the browser: yields a function that sends a widget's new value."""
     from viser._messages import GuiUpdateMessage, ViewerCameraMessage
 
-    address = f"ws://127.0.0.1:{page.server.get_port()}"
+    address = f"127.0.0.1:{page.server.get_port()}"
     protocol = f"viser-v{viser.__version__}"
-    with websockets.connect(address, subprotocols=[protocol], origin=address, max_size=None) as socket:
+    with websockets.connect(
+        f"ws://{address}", subprotocols=[protocol], origin=f"http://{address}", max_size=None
+    ) as socket:
 
         def send(message):
             socket.send(msgspec.msgpack.encode(message.as_serializable_dict()))
@@ -264,6 +266,8 @@ def test_a_failing_view_leaves_the_read_outs(page, monkeypatch):
 
 
 def test_a_weight_and_what_it_brings_about_have_an_axis_each(page):
+    page._press("Step")
+    do(page)
     assert page.chart.choice.value == "target" and len(page.chart.plot.axes) == 2
     page.chart.choice.value = "fire"
     wait_for(lambda: len(page.chart.plot.axes) == 3)
@@ -305,7 +309,7 @@ def test_a_picture_is_drawn_only_while_somebody_looks(server, monkeypatch):
     view = views.make_view(server, session)
     drawn = []
     scene = SimpleNamespace(set_background_image=lambda picture, **_: drawn.append(picture.shape))
-    client = SimpleNamespace(scene=scene, camera=SimpleNamespace(aspect=2.0))
+    client = SimpleNamespace(scene=scene, camera=SimpleNamespace(aspect=2.0, image_width=1200))
     view.update()
     assert drawn == []
     monkeypatch.setattr(server, "get_clients", lambda: {0: client})

@@ -88,7 +88,7 @@ def test_measured_beside_requested(session):
     session.run(0.5)
     report = session.report()
     assert report.requested["target"] == 0.5
-    assert report.measured == {"task_reward": 0.0, "target": 0.5, "pace": 0.5}
+    assert report.measured == {"task_reward": 0.0, "target": 0.5, "pace": 0.5, "fire": 0.25}
     assert report.complied_after == pytest.approx(0.05)
     assert report.since_request == pytest.approx(0.5)
 
