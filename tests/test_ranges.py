@@ -9,6 +9,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from coachable.envs.humanoid import HumanoidEnv
+from coachable.envs.racing import RacingEnv
 from coachable.losses import CatRACLoss, QRSACLoss, RACLoss
 from coachable.networks import make_critic, make_gaussian_actor
 from coachable.ranges import Range
@@ -103,6 +105,8 @@ OUTSIDE = [
         ("priority_beta", math.nan),
     ]),
     *(("MirrorSymmetry", lambda **kw: MirrorSymmetry({}, **kw), "probability", value) for value in [1.1, math.nan]),
+    ("HumanoidEnv", HumanoidEnv, "episode_steps", 0),
+    ("RacingEnv", RacingEnv, "episode_steps", 0),
     ("CheckpointStore", lambda **kw: CheckpointStore("unused", **kw), "keep", 0),
     ("share_threads", share_threads, "simulator", 0),
     ("Throttle", Throttle, "rate", 0.0),

@@ -203,6 +203,12 @@ class Learner:
                 f"a loss or a gradient was not finite at or before update {self.updates}. {_ADVICE}"
             )
 
+    def check_weights(self) -> None:
+        """Raise if a trained parameter is not finite; updates keep those finite that are."""
+        for name, value in self.loss_module.named_parameters():
+            if not torch.isfinite(value).all():
+                raise NonFiniteError(f"{name} contains NaN or infinity: start from other weights.")
+
     def state_dict(self) -> dict[str, Any]:
         """Parameters, targets, optimiser moments and the update counter."""
         return {

@@ -124,11 +124,12 @@ class Train:
 
         Raises:
             NonFiniteError: if a number of a transition, loss or gradient is not finite. It is not stored, it changes
-                no weight, and no checkpoint is written after it.
+                no weight, and no checkpoint is written after it. Or if a weight was not finite from the start.
         """
         self.progress.start(self.frames, self.learner.updates)
         batches = iter(self.collector)
         try:
+            self.learner.check_weights()
             with stop_signals() as stop:
                 while self.frames < self.settings.total_frames and not stop.is_set():
                     data = self._collect(batches)
@@ -139,9 +140,7 @@ class Train:
                     self._checkpoint_if_due()
                 self._finish(interrupted=stop.is_set())
         except NonFiniteError as error:
-            error.args = (
-                f"{error} The training stopped at env-step {self.frames:,}; its checkpoints are from before.",
-            )
+            error.args = (f"{error} The training stopped at env-step {self.frames:,}, without another checkpoint.",)
             raise
         finally:
             self.progress.close()

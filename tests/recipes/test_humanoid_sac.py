@@ -143,6 +143,8 @@ def test_a_resumed_run_keeps_its_configuration(tmp_path):
     assert config["run_dir"] == str(tmp_path / "run")
     with pytest.raises(SystemExit, match=r"gamma cannot change in a resumed run: start a new one with init_from="):
         _compose(f"resume={tmp_path / 'run'}", "gamma=0.9")
+    with pytest.raises(ValueError, match=r"train.batch_size=0: expected a whole number of at least 1"):
+        _compose(f"resume={tmp_path / 'run'}", "train.batch_size=0")
     with pytest.raises(SystemExit, match="a resumed run keeps its preset"):
         _compose(f"resume={tmp_path / 'run'}", "preset=cpu")
     with pytest.raises(CheckpointError, match="no checkpoint at"):

@@ -42,9 +42,7 @@ def poisoned(train, values, after=BEFORE):
 def assert_stops(train, message, before=BEFORE, collected=BEFORE + 4):
     with pytest.raises(NonFiniteError, match=message) as stopped:
         train.run()
-    assert str(stopped.value).endswith(
-        f"The training stopped at env-step {collected}; its checkpoints are from before."
-    )
+    assert str(stopped.value).endswith(f"stopped at env-step {collected}, without another checkpoint.")
     assert len(train.replay) == before
     state = read_state(find_checkpoint(train.checkpoints.directory.parent))
     assert state["loop"]["frames"] == before, "nothing was saved after the number appeared"
@@ -73,6 +71,13 @@ def test_what_a_style_term_returns(training, monkeypatch, bad):
     assert_stops(train, rf"^next/reward is {words(bad)} in environment 1")
 
 
+def test_features_whose_infinity_no_reward_shows(training, monkeypatch):
+    monkeypatch.setattr(
+        echo, "_distance", lambda features, style: 1 / (1 + features[..., 0] ** 2) + 0 * style["target"]
+    )
+    assert_stops(poisoned(training(), {"style_features": math.inf}), "^next/style_features is inf in environment 1")
+
+
 @pytest.mark.parametrize("bad", BAD)
 def test_a_style(training, bad):
     train = training()
@@ -83,23 +88,35 @@ def test_a_style(training, bad):
     assert len(train.replay) == 0 and not train.checkpoints.directory.exists()
 
 
-def test_actions_of_a_policy_whose_weights_are_not_finite(training):
-    train = training()
-    train.checkpoints = None
+def spoil_weights(train, after):
+    """Makes the policy's weights NaN behind the learner's back, after so many env-steps."""
     weights = next(iter(train.learner.loss_module.actor_network_params.values(True, True)))
-    step = train.collector.env.base_env._step
+    simulation = train.collector.env.base_env
+    steps, step = iter(range(1, 1000)), simulation._step
 
     def spoil(tensordict):
-        out = step(tensordict)
-        if train.collector.env.base_env.steps == RANDOM // 4:
+        if 4 * next(steps) == after:
             weights.data.fill_(math.nan)
-        return out
+        return step(tensordict)
 
-    train.collector.env.base_env._step = spoil
+    simulation._step = spoil
     train._update = lambda *_: None  # which would notice it first
+    train.checkpoints = None
+    return train
+
+
+def test_actions_of_a_policy_whose_weights_are_not_finite(training):
+    train = spoil_weights(training(), RANDOM)
     with pytest.raises(NonFiniteError, match=r"action is nan.* in environment 0, step 1 of 1"):
         train.run()
     assert len(train.replay) == RANDOM
+
+
+def test_weights_that_are_not_finite_from_the_start(training):
+    train = training()
+    next(iter(train.learner.loss_module.actor_network_params.values(True, True))).data.fill_(math.nan)
+    with pytest.raises(NonFiniteError, match=r"actor_network_params\S+ contains NaN or infinity"):
+        train.run()
 
 
 class Faulty(gymnasium.Env):
@@ -141,11 +158,8 @@ def test_what_a_gymnasium_environment_returns(training, fault):
 
 
 def test_an_environment_that_refuses_nan_actions_names_its_row(training):
-    train = training(make_env=make_faulty_env("none"))
-    train.checkpoints = None
-    next(iter(train.learner.loss_module.actor_network_params.values(True, True))).data.fill_(math.nan)
-    train._update = lambda *_: None
-    message = r"action contains NaN in environment 0: the policy has diverged\. The training stopped at env-step 40;"
+    train = spoil_weights(training(make_env=make_faulty_env("none")), RANDOM)
+    message = r"action contains NaN in environment 0: the policy has diverged\. .* stopped at env-step 40,"
     with pytest.raises(NonFiniteError, match=message):
         train.run()
 

@@ -28,6 +28,7 @@ from coachable.envs.racing.task import TaskWeights
 from coachable.envs.racing.track import Course, Track
 from coachable.finite import require_finite_action
 from coachable.keys import STYLE_FEATURES, TASK_REWARD
+from coachable.ranges import COUNT
 
 EPISODE_STEPS = 1500  # 150 s
 SCENARIO = "scenario"
@@ -115,6 +116,7 @@ class RacingEnv(EnvBase):
             raise ValueError(
                 f"num_envs is {num_envs}: expected a positive multiple of the {controlled} controlled cars"
             )
+        COUNT.check("episode_steps", episode_steps)
         if controlled < cars and driver is None:
             raise ValueError(f"{cars - controlled} cars of each race have no driver: pass driver=")
         if copies < 1 or (num_envs // controlled) % copies:
