@@ -1,7 +1,9 @@
 """Collecting: TorchRL's collector with a state that a training can be resumed from, and a short evaluation."""
 
 import multiprocessing
+import os
 import signal
+import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterable
@@ -100,14 +102,35 @@ def make_collector(
         return collector
     if backend in ("process", "ray"):
         factories = [_SeededFactory(make_env, seed + i) for i in range(num_collectors)]
+        common |= plain if backend == "process" else _ray_options(num_collectors, plain)
+        collector = Collector(factories, policy, backend=backend, num_collectors=num_collectors, sync=sync, **common)
         if backend == "ray":
-            if find_spec("ray") is None:
-                raise ImportError("collector=ray needs Ray: pip install ray, or choose collector=process")
-            common["collector_kwargs"] = plain
-        else:
-            common |= plain
-        return Collector(factories, policy, backend=backend, num_collectors=num_collectors, sync=sync, **common)
+            collector.update_policy_weights_(policy)  # RayCollector wants that before the first batch
+        return collector
     raise ValueError(f"collector backend must be direct, process or ray, got {backend!r}")
+
+
+def _ray_options(num_collectors: int, plain: dict[str, Any]) -> dict[str, Any]:
+    if find_spec("ray") is None:
+        raise ImportError("collector=ray needs Ray: pip install 'coachable[cluster]', or choose collector=process")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray reports its use over the network otherwise
+    return {
+        "total_frames": sys.maxsize,  # RayCollector has no number for "until it is shut down"
+        "collector_kwargs": [plain | {"postproc": _OwnTrajectories(i, num_collectors)} for i in range(num_collectors)],
+        "ray_init_config": {"include_dashboard": False, "log_to_driver": False, "logging_level": "warning"},
+    }
+
+
+class _OwnTrajectories:
+    """Numbers the trajectories of a worker apart from those of the others: each counts from 0."""
+
+    def __init__(self, worker: int, workers: int) -> None:
+        self.worker = worker
+        self.workers = workers
+
+    def __call__(self, data: TensorDictBase) -> TensorDictBase:
+        key = ("collector", "traj_ids")
+        return data.set(key, data.get(key) * self.workers + self.worker)
 
 
 class _SeededFactory:
