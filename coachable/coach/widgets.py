@@ -133,9 +133,7 @@ class Chart:
         redraw: called in viser's threads after the user chose another parameter; `add` is to follow.
     """
 
-    def __init__(
-        self, server: viser.ViserServer, folder: Any, space: StyleSpace, redraw: Callable[[], None]
-    ) -> None:
+    def __init__(self, server: viser.ViserServer, folder: Any, space: StyleSpace, redraw: Callable[[], None]) -> None:
         self._server, self._folder, self._space = server, folder, space
         self._history: deque[tuple[float, StyleReport]] = deque(maxlen=_HISTORY)
         self._names = {_words(name): name for name in space.names}
