@@ -91,8 +91,8 @@ def _above_the_panel(client: viser.ClientHandle) -> None:
     if camera.image_width <= _PHONE:
         with contextlib.suppress(ValueError):  # the browser told of a camera that cannot be
             camera.up_direction = (0.0, 0.0, 1.0)
-            camera.position = (2.3, -2.3, 1.3)
-            camera.look_at = (0.0, 0.0, -0.64)
+            camera.position = (3.0, -3.0, 1.3)
+            camera.look_at = (0.0, 0.0, -0.9)
 
 
 class PictureView:
