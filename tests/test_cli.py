@@ -100,7 +100,8 @@ def test_another_file_is_no_agent(capsys, monkeypatch, tmp_path):
     (tmp_path / "README.md").write_text("# Not an agent\n")
     for command in (["export", "README.md"], ["weights", "README.md", "w.pt"], ["report", "README.md"]):
         assert main(command) == 2
-        assert "README.md" in capsys.readouterr().err
+        error = capsys.readouterr().err
+        assert "README.md" in error and error.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["README.md"]
 
 
@@ -146,6 +147,11 @@ def test_the_version_is_printed(capsys):
         main(["--version"])
     assert stop.value.code == 0
     assert capsys.readouterr().out == f"coachable {__version__}\n"
+
+
+def test_weights_of_a_weights_file(capsys, tmp_path):
+    assert main(["weights", "humanoid", str(tmp_path / "weights.pt")]) == 2
+    assert "is a small weights file already: expected a run's folder or a checkpoint" in capsys.readouterr().err
 
 
 def test_weights_of_a_run(make_train, tmp_path, capsys):
