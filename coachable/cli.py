@@ -240,10 +240,10 @@ def _require_agent(source: str) -> None:
         ValueError: saying which agents there are.
     """
     shipped = Path(__file__).parent / "pretrained"
-    if (shipped / source / "weights.pt").is_file() or Path(source).is_dir():
+    if source and ((shipped / source / "weights.pt").is_file() or Path(source).is_dir()):
         return
     names = ", ".join(sorted(path.parent.name for path in shipped.glob("*/weights.pt")))
-    if not Path(source).exists():
+    if not source or not Path(source).exists():
         raise ValueError(f"there is no agent {source!r}: expected {_SOURCE_HELP} ({names})")
     if not zipfile.is_zipfile(source):
         raise ValueError(f"{source} is no weights file: expected {_SOURCE_HELP} ({names})")

@@ -14,7 +14,7 @@ __all__ = ["Check", "examine"]
 
 Verdict = Literal["ok", "note", "problem"]
 _SHOWN = ("torch", "torchrl", "tensordict", "mujoco", "dm_control", "numpy", "hydra-core", "wandb")
-_PYTHON = ((3, 11), (3, 12))  # first and last version that all dependencies have files for
+PYTHON = ((3, 11), (3, 12))  # first and last version that all dependencies have files for
 _REINSTALL = "pip install coachable (in a clone: pip install -e .) in a fresh environment"
 
 
@@ -58,10 +58,10 @@ def python_version() -> tuple[int, int]:
 
 def _python() -> Check:
     found = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
-    first, last = (".".join(map(str, version)) for version in _PYTHON)
-    if python_version() < _PYTHON[0]:
+    first, last = (".".join(map(str, version)) for version in PYTHON)
+    if python_version() < PYTHON[0]:
         return Check("python", "problem", f"{found}: expected Python {first} or {last}")
-    if python_version() > _PYTHON[1]:
+    if python_version() > PYTHON[1]:
         reason = "labmaze, which dm-control needs, has no files for it"
         return Check("python", "problem", f"{found}: expected Python {first} or {last}, because {reason}")
     return Check("python", "ok", found)

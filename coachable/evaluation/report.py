@@ -121,7 +121,7 @@ def write_report(
         _tradeoffs(page, styles, runs, formats, folder)
         if domain.evaluation is not None:
             settings = EvaluationSettings(episodes, switch_episodes, steps, seed, num_threads, progress, runs[0].sweeps)
-            _own(page, domain, agent, out, settings)
+            _own(page, domain, agent, folder, settings)
         command = [f"coachable report {' '.join(agents)} --seed {seed} --episodes {episodes}"]
         command += [f"--switch-episodes {switch_episodes} --sweep-points {sweep_points}"]
         command += [f"--seeds {seeds}"] if len(agents) == 1 else []

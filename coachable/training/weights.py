@@ -170,6 +170,8 @@ def export_weights(checkpoint: Path | str, out: Path | str) -> Path:
     """
     source = _locate(checkpoint)
     state = _read_agent(source)
+    if "loop" not in state and "counters" in state:
+        raise CheckpointError(f"{source} is a small weights file already: expected a run's folder or a checkpoint")
     agent = {name: state[name] for name in _AGENT}
     # Tensors are copied, because a slice or a shared parameter would drag its whole storage into the file.
     with refusing(source, "weights"):

@@ -53,6 +53,14 @@ def test_every_choice_composes(group, choice):
     assert config["preset"] in ("cpu", "gpu", "paper", "smoke"), "auto was replaced by what it chose"
 
 
+@pytest.mark.parametrize("name", ["a=b", "a, b", "it's {here}", "1.5", "x=y=[z]"])
+def test_any_name_of_a_folder_can_be_written_to_and_resumed(tmp_path, name):
+    assert _compose(f"run_dir={tmp_path / name}")["run_dir"] == str(tmp_path / name)
+    assert _compose(f"run_dir='{tmp_path / 'quoted'}'")["run_dir"] == str(tmp_path / "quoted")
+    assert _compose(f"init_from={tmp_path / name}")["init_from"] == str(tmp_path / name)
+    assert _compose("init_from=null")["init_from"] is None
+
+
 def test_the_paper_preset_is_the_papers():
     config = _compose("preset=paper")
     assert config["gamma"] == 0.99 and config["replay_capacity"] == 750_000
