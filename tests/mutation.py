@@ -90,11 +90,9 @@ def operators() -> list[str]:
     chosen = []
     for name in operator_names():
         kind, _, swap = name.partition("Operator_")
-        if ("Binary" in kind or "Comparison" in kind) and swap in SWAPS:
-            chosen.append(name)
-        elif not swap and any(part in name for part in OTHERS):
-            chosen.append(name)
-        elif "Unary" in kind and "Delete" in name:
+        swapped = ("Binary" in kind or "Comparison" in kind) and swap in SWAPS
+        other = not swap and any(part in name for part in OTHERS)
+        if swapped or other or ("Unary" in kind and "Delete" in name):
             chosen.append(name)
     return chosen
 
@@ -102,14 +100,17 @@ def operators() -> list[str]:
 def untouched(tree: ast.AST) -> Iterator[ast.AST]:
     """Find the nodes whose changes nothing can notice: annotations, `__all__`, texts of errors."""
     for node in ast.walk(tree):
-        if isinstance(node, ast.arg | ast.AnnAssign) and node.annotation:
-            yield node.annotation
-        elif isinstance(node, ast.FunctionDef) and node.returns:
-            yield node.returns
-        elif isinstance(node, ast.JoinedStr) or (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)):
-            yield node
-        elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
-            yield node
+        match node:
+            case ast.arg() | ast.AnnAssign() if node.annotation:
+                yield node.annotation
+            case ast.FunctionDef() if node.returns:
+                yield node.returns
+            case ast.JoinedStr():
+                yield node
+            case ast.Assign() if ast.unparse(node.targets[0]) == "__all__":
+                yield node
+            case ast.If() if "TYPE_CHECKING" in ast.dump(node.test):
+                yield node
 
 
 def mutants(path: str) -> list[Mutant]:
@@ -210,11 +211,15 @@ def run_tests(mutant: Mutant | None, files: list[str]) -> int:
         loader = Loader(mutant)
         sys.meta_path.insert(0, loader)  # pyright: ignore
 
-    def skip(*_: object, **__: object) -> None:
-        pytest.skip("another process would not see the mutant")
+    class InOneProcess:
+        """Skips tests where they start another process, which would not see the mutant."""
 
-    subprocess.Popen.__init__ = skip
-    return int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", *files]))
+        @pytest.fixture(autouse=True)
+        def _no_subprocess(self, monkeypatch: pytest.MonkeyPatch) -> None:
+            monkeypatch.setattr(subprocess.Popen, "__init__", lambda *_, **__: pytest.skip("not the mutant"))
+
+    quick = ["-x", "-q", "-p", "no:cacheprovider", "-p", "no:benchmark"]
+    return int(pytest.main([*quick, *files], plugins=[InOneProcess()]))
 
 
 def fork(mutant: Mutant | None, files: list[str], limit: float, log: Path) -> int | None:

@@ -89,7 +89,7 @@ def test_update_equals_the_written_out_update(order):
 @pytest.mark.parametrize("fused", [True, False])
 @pytest.mark.parametrize("order", ["simultaneous", "policy_first"])
 def test_the_logged_entropy_is_that_of_the_policy(order, fused):
-    """Per axis, a normal of location 0 squashed by tanh has the entropy log(2 pi e s^2) / 2 + E[log(1 - tanh(s z)^2)]."""
+    """A squashed normal of location 0 has log(2 pi e s^2) / 2 + E[log(1 - tanh(s z)^2)] per axis."""
     loss = make_loss(width=4)
     with torch.no_grad():
         for parameter in loss.actor_network_params.values(True, True):

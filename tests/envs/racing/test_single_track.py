@@ -3,7 +3,6 @@
 import copy
 
 import numpy as np
-import pytest
 import torch
 from scipy.integrate import solve_ivp
 from vehiclemodels.parameters_vehicle2 import parameters_vehicle2
