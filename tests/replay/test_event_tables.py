@@ -191,7 +191,7 @@ def make_buffer(routed: int, events: int, horizon: int, base: int, fed: int, n: 
     return buffer, Reference(capacities, routed, horizon, n, gamma or 1.0)
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 2**31),
     workers=st.integers(1, 3),

@@ -6,7 +6,7 @@ import torch
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from coachable.training import Learner, NonFiniteLossError, resolve_precision
-from tests.sac_problem import make_batch, make_loss
+from tests.sac_problem import ACT, make_batch, make_loss
 
 
 def params_of(loss):
@@ -84,6 +84,25 @@ def test_update_equals_the_written_out_update(order):
     reference_update(theirs, make_batch(32), 1e-3, 1e-7, order)
     for (name, a), (_, b) in zip(ours.named_parameters(), theirs.named_parameters(), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5, msg=lambda m, name=name: f"{name}: {m}")
+
+
+@pytest.mark.parametrize("fused", [True, False])
+@pytest.mark.parametrize("order", ["simultaneous", "policy_first"])
+def test_the_logged_entropy_is_that_of_the_policy(order, fused):
+    """A squashed normal of location 0 has log(2 pi e s^2) / 2 + E[log(1 - tanh(s z)^2)] per axis."""
+    loss = make_loss(width=4)
+    with torch.no_grad():
+        for parameter in loss.actor_network_params.values(True, True):
+            parameter.zero_()  # the same location and scale for every state
+    batch = make_batch(4096)
+    with torch.no_grad(), loss.actor_network_params.to_module(loss.actor_network):
+        scale = loss.actor_network.get_dist(batch[:1].clone()).scale[0, 0].double()
+    metrics = Learner(loss, update_order=order, precision="fp32", fused=fused).update(batch)
+    z = torch.linspace(-12.0, 12.0, 20_001, dtype=torch.float64)
+    density = torch.exp(-z.square() / 2) / (2 * torch.pi) ** 0.5
+    shrunk = 2.0 * (math.log(2.0) - scale * z - torch.nn.functional.softplus(-2.0 * scale * z))
+    per_axis = 0.5 * torch.log(2.0 * torch.pi * math.e * scale**2) + torch.trapezoid(density * shrunk, z)
+    assert metrics["entropy"].item() == pytest.approx(ACT * per_axis.item(), abs=5 * 1.2 * (ACT / 4096) ** 0.5)
 
 
 def test_orders_see_different_parameters():

@@ -104,11 +104,11 @@ def test_the_entropy_weight_falls_with_the_learning_rates(make_train, tmp_path):
     assert again.learner.loss_module.log_alpha.exp() == pytest.approx(before)
 
 
-@pytest.mark.parametrize("utd_ratio, updates", [(0.0, 0), (0.125, 45), (0.3, 108), (1.0, 360)])
+@pytest.mark.parametrize("utd_ratio, updates", [(0.0, 0), (0.125, 15), (0.3, 36), (1.0, 120)])
 def test_updates_per_step(make_train, utd_ratio, updates):
-    train = make_train(total_frames=400, utd_ratio=utd_ratio)
+    train = make_train(total_frames=160, utd_ratio=utd_ratio)
     train.run()
-    assert abs(train.learner.updates - updates) <= 1  # 400 frames, the first 40 are warm-up; 0.3 is not exact in binary
+    assert abs(train.learner.updates - updates) <= 1  # 160 frames, the first 40 are warm-up; 0.3 is not exact in binary
 
 
 def test_without_a_ratio_the_learner_fills_the_throttled_time(make_train):
