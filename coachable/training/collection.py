@@ -26,7 +26,6 @@ __all__ = [
     "evaluate_policy",
     "load_collector_state",
     "make_collector",
-    "require_finite",
     "simulation_env",
 ]
 
@@ -192,8 +191,8 @@ def load_collector_state(collector: BaseCollector, state: dict[str, Any]) -> boo
         warnings.warn("the collector's state was not saved or cannot be restored: episodes restart", stacklevel=2)
         return False
     env, base = collector.env, simulation_env(collector.env)
-    collector._frames = state["frames"]
-    collector._iter = state["iterations"]
+    collector._frames = int(state["frames"])
+    collector._iter = int(state["iterations"])
     if isinstance(env, TransformedEnv):
         env.load_state_dict(state["transforms"])
     if not state["carrier"] or not isinstance(base, ResumableEnv):
@@ -271,24 +270,3 @@ def _plain(td: TensorDictBase) -> dict[str, Any]:
         str(key): _plain(value) if isinstance(value, TensorDictBase) else value.detach().clone().cpu()
         for key, value in td.items()
     }
-
-
-def require_finite(data: TensorDictBase) -> None:
-    """Refuses transitions that would poison the replay buffer.
-
-    Args:
-        data: flat `[B]`.
-
-    Raises:
-        ValueError: if an observation or a reward is NaN or infinite.
-    """
-    for key in ("observation", ("next", "observation"), ("next", "reward")):
-        value = data.get(key)
-        # The sum is finite only if every entry is; that an overflow may look alike, the second look sorts out.
-        if not torch.isfinite(value.sum()) and not torch.isfinite(value).all():
-            rows = (~torch.isfinite(value)).flatten(1).any(1).nonzero().flatten().tolist()
-            raise ValueError(
-                f"{key!r} is not finite in {len(rows)} of {len(value)} collected transitions (first: row {rows[0]}): "
-                "none was stored. The environment has to end an episode whose physics explode, and rewards have to "
-                "be finite for every style: look at its step function and at the style terms."
-            )

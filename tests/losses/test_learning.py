@@ -33,7 +33,14 @@ LOSSES: dict[str, tuple[Callable[..., LossModule], Callable[..., Any], dict[str,
     "cat_rac": (CatRACLoss, make_hl_gauss_critic, {"entropy_samples": 50, "alpha": 0.2, **BINS}, "policy_first"),
     "sac_categorical": (CategoricalSACLoss, make_hl_gauss_critic, {"alpha": 0.2, **BINS}, "policy_first"),
 }
-SERVED = [(loss, kind) for loss in LOSSES for kind in HEADS if kind == "continuous" or loss not in ("sac", "qr_sac")]
+ONLY_AXES = ("sac", "qr_sac")
+# Mixed actions have both kinds of component: where a loss serves them, actions of one kind are left to the slow tests.
+SERVED = [
+    pytest.param(loss, kind, marks=() if loss in ONLY_AXES or kind == "mixed" else pytest.mark.slow)
+    for loss in LOSSES
+    for kind in HEADS
+    if kind == "continuous" or loss not in ONLY_AXES
+]
 # Mean |a - style| of the deterministic policy over styles in [-1, 1]: always 0 errs by 0.5, the nearest of the three
 # levels by 0.25.
 THRESHOLD = {"level": 0.32, "axis": 0.15}

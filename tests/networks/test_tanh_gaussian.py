@@ -134,7 +134,7 @@ def test_score_at_saturation_is_exact() -> None:
     np.testing.assert_allclose(log_cosh(torch.tensor([-1e4, 0.0, 1e4])), [1e4 - np.log(2), 0, 1e4 - np.log(2)])
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.floats(-1e4, 1e4), st.floats(1e-6, 1e4), st.integers(0, 2**31))
 def test_no_nan(loc: float, scale: float, seed: int) -> None:
     torch.manual_seed(seed)

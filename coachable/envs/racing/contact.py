@@ -147,7 +147,7 @@ def _pair(a: Bodies, b: Bodies, same: Tensor, share: float) -> tuple[Push, Push,
     closing = torch.clamp(-(ux * o.nx + uy * o.ny), min=0.0)
     normal = torch.where(touching, share * (1.0 + RESTITUTION) * closing / effective(o.nx, o.ny), 0.0)
     tx, ty = -o.ny, o.nx
-    sliding = -(ux * tx + uy * ty) / effective(tx, ty)
+    sliding = -share * (ux * tx + uy * ty) / effective(tx, ty)
     limit = FRICTION * normal
     sliding = torch.minimum(torch.maximum(sliding, -limit), limit)
     fx, fy = normal * o.nx + sliding * tx, normal * o.ny + sliding * ty

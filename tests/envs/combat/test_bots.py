@@ -48,6 +48,19 @@ def test_acting_leaves_the_fight_alone():
         assert getattr(env.state, name) is value
 
 
+def test_the_spear_costs_health_and_spikes_deal_more():
+    """A cheap part of the balance below: two small machines."""
+    machines = ["Scrounger", "Burrower"]
+    names = ("Advanced Explosive Spike", "Light Arrow", "Spear")
+    strong, bow, spear = (fight_all(BOTS[name], machines, fights=6, steps=300) for name in names)
+    for report in (strong, bow, spear):
+        assert list(report) == machines
+        assert all(result["won"] > 0.8 and 0 < result["seconds"] < 60 for result in report.values())
+    assert sum(r["dealt"] for r in strong.values()) > 1.5 * sum(r["dealt"] for r in bow.values())
+    assert sum(r["taken"] for r in spear.values()) > 1.5 * sum(r["taken"] for r in strong.values())
+
+
+@pytest.mark.slow
 def test_the_balance_of_three_bots():
     """The strongest weapon beats everything; weak ones and the spear fail only at the top; the spear costs health."""
     names = ("Advanced Explosive Spike", "Light Arrow", "Spear")

@@ -84,6 +84,17 @@ def test_time_out_is_flagged_in_every_step_beyond_step_max():
     assert tracker.observe()[0, -1] == 2.0  # clipped
 
 
+@pytest.mark.parametrize("expected", [0, 1])
+def test_an_episode_starts_with_the_foot_to_strike_relative_to_the_other(expected):
+    tracker = GaitTracker.create(2, 1.0)
+    feet = np.array([[[0.3, -0.1], [-0.2, 0.15]], [[1.0, -0.3], [0.5, 0.1]]])
+    tracker.reset(np.array([0, 1]), np.full(2, expected), feet, np.zeros((2, 2)))
+    right_from_left = np.array([[0.5, -0.25], [0.5, -0.4]])
+    wanted = right_from_left if expected == 0 else -right_from_left
+    np.testing.assert_allclose(tracker.observe()[:, 6:8], wanted)
+    np.testing.assert_allclose(tracker.observe()[:, 8:10], wanted)
+
+
 def test_reset_touches_only_the_given_rows():
     tracker = GaitTracker.create(3, 1.0)
     feet = np.zeros((3, 2, 2))

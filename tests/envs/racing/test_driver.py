@@ -24,9 +24,9 @@ def drive(env, driver, steps):
 
 def test_it_keeps_to_the_road_of_an_oval():
     env = RacingEnv(8, track="oval", seed=0, scenarios=ALONE)
-    seen = drive(env, LineFollower(env.track, env.garage.typical), 150)
+    seen = drive(env, LineFollower(env.track, env.garage.typical), 60)
     assert seen[..., T["off"]].sum() == 0
-    assert (seen[-1, :, T["distance"]] > 150 * 0.1 * 30.0).all()
+    assert (seen[-1, :, T["distance"]] > 60 * 0.1 * 30.0).all()
 
 
 @pytest.mark.slow

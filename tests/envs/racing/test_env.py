@@ -296,7 +296,7 @@ def test_wrong_way_and_standing_end_an_episode():
     env.state[ROW["vx"]] = torch.tensor([20.0, 0.0])
     env.state[6:10] = env.state[ROW["vx"]] / 0.335
     ends, rewards = [], []
-    for _ in range(102):
+    for _ in range(33):
         after = env.step(start.set("action", torch.tensor([[0.0, 0.0], [0.0, -1.0]])))["next"]
         ends.append(after["terminated"].flatten())
         rewards.append(after["task_reward"].flatten())

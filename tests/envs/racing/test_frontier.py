@@ -14,29 +14,29 @@ from coachable.envs.racing.profile import Envelope, lap_time, speed_profile
 
 @pytest.fixture(scope="module", params=["gt3", "x2019"])
 def lakeside(request):
-    """Name of a car, and its programme on the centre line."""
+    """Name of a car, its programme on the centre line, and the lap that pays for nothing."""
     track = load_track("lakeside")
     line = np.zeros(len(track.table))
-    return request.param, LapProgramme(track, load_car(request.param), Resources(1.0, 1.0), line=line)
+    programme = LapProgramme(track, load_car(request.param), Resources(1.0, 1.0), line=line)
+    [free] = programme.laps("fuel", [0.0])
+    return request.param, programme, free
 
 
 def test_centre_line_laps_are_those_of_the_specification(lakeside):
     """racing.md, 4: quasi-steady state on the centre line 113.9 s and 88.8 s."""
-    name, programme = lakeside
+    name, _, free = lakeside
     expected = {"gt3": 113.9, "x2019": 88.8}[name]
     track = load_track("lakeside")
     curvature, spacing = line_geometry(track, None)
     assert lap_time(speed_profile(Envelope(load_car(name)), curvature, spacing), spacing) == pytest.approx(
         expected, rel=0.01
     )
-    [free] = programme.laps("fuel", [0.0])
     assert free.time == pytest.approx(expected, rel=0.01)
 
 
-@pytest.mark.parametrize("resource", ["tyre", "fuel"])
+@pytest.mark.parametrize("lakeside, resource", [("gt3", "tyre"), ("x2019", "fuel")], indirect=["lakeside"])
 def test_a_higher_price_saves_more_and_costs_more(lakeside, resource):
-    _, programme = lakeside
-    [free] = programme.laps(resource, [0.0])
+    _, programme, free = lakeside
     scale = {"tyre": free.wear, "fuel": free.fuel}[resource]
     laps = programme.laps(resource, [0.0, 2.0 / scale, 8.0 / scale, 30.0 / scale])
     times = [lap.time for lap in laps]

@@ -26,7 +26,7 @@ def test_stranded_cars_are_put_back_where_they_were(cars):
     action = torch.tensor([0.0, 0.2]).repeat(2 * cars, 1)
     action[0, 1] = -1.0
     seen = []
-    for _ in range(40):
+    for _ in range(33):
         seen.append(env.step(start.set("action", action))["next"].clone())
     assert not torch.stack(seen)["done"].any()
     telemetry = torch.stack(seen)["telemetry"][:, 0]
@@ -38,7 +38,7 @@ def test_stranded_cars_are_put_back_where_they_were(cars):
     metres = CONTROL_STEP * RESCUE_SPEED
     torch.testing.assert_close(telemetry[back, T["distance"]], torch.tensor(metres), atol=0.1, rtol=0)
     assert telemetry[back, T["fuel"]] <= telemetry[back - 1, T["fuel"]] and telemetry[back, T["fuel"]] > 29.0
-    assert (env._steps == 40).all()
+    assert (env._steps == 33).all()
 
 
 def test_a_stranded_car_waits_for_others_to_pass():

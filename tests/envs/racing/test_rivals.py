@@ -86,9 +86,26 @@ def test_copies_have_styles_of_the_space():
 def test_scripted_drivers_differ_in_pace():
     env, _ = races(races=50)
     env.reset()
-    step(env, 60)
+    step(env, 20)
     speed = env.state[3, env.num_envs :]
     assert speed.std() > 0.5
+
+
+def test_a_rivals_grip_lies_between_the_slowest_share_and_one():
+    class Recorder:
+        def __call__(self, env, observation, grip):
+            self.grip = grip
+            return torch.zeros(len(observation), 2)
+
+    env, _ = races(races=100)
+    recorder = Recorder()
+    rivals = Rivals(recorder, aggressiveness_style_space(), slowest=0.6)
+    env.reset()
+    rivals(env, env._observation[env.num_envs :])
+    grip = recorder.grip.reshape(env.cars, -1)
+    assert grip.min() >= 0.6 and grip.max() <= 1.0
+    assert abs(grip.mean() - 0.8) < 5 * 0.4 / 12**0.5 / grip.numel() ** 0.5  # uniform
+    assert len(grip.unique()) > 0.9 * grip.numel(), "each car has its own"
 
 
 def test_the_state_continues_exactly():

@@ -1,0 +1,76 @@
+"""The policy as the losses read it, against the distribution that the actor itself builds."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import NormalParamExtractor, TensorDictModule
+from torch import nn
+from torchrl.data import Bounded, OneHot, Unbounded
+from torchrl.modules import ProbabilisticActor, TanhNormal
+
+from coachable.losses.policy import PolicyReader
+from coachable.networks.action_heads import ActionHeads, MixedActionSpec
+from coachable.networks.mixed import make_mixed_actor
+
+
+def tanh_normal_actor(**bounds):
+    """One of TorchRL's own policies: three axes."""
+    torch.manual_seed(0)
+    body = nn.Sequential(nn.Linear(4, 6), NormalParamExtractor())
+    return ProbabilisticActor(
+        TensorDictModule(body, in_keys=["observation"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=TanhNormal,
+        distribution_kwargs=bounds,
+    )
+
+
+BOUNDS = [
+    {},
+    {"low": -1.0, "high": torch.ones(3)},
+    {"low": torch.tensor([-1.0, -1.0, -2.0]), "high": torch.tensor([1.0, 3.0, 2.0])},  # only the first entry is ±1
+    {"low": torch.tensor([-2.0, -1.0, -1.0]), "high": torch.tensor([3.0, 1.0, 1.0])},  # only the first entry is not
+    {"low": -2.0, "high": 2.0},
+]
+
+
+@pytest.mark.parametrize("bounds", BOUNDS, ids=["default", "ones", "first", "others", "equal"])
+def test_a_tanh_normal_has_the_same_density_and_mode_within_any_bounds(bounds):
+    actor = tanh_normal_actor(**bounds)
+    data = TensorDict({"observation": torch.randn(64, 4)}, [64])
+    theirs = actor.get_dist(data.clone())
+    ours = PolicyReader(actor, "test", continuous_only=True).read(data)
+    low, high = (torch.as_tensor(bounds.get(name, sign)) for name, sign in (("low", -1.0), ("high", 1.0)))
+    action = low + (high - low) * (0.05 + 0.9 * torch.rand(64, 3))
+    torch.testing.assert_close(ours.log_prob(action), theirs.log_prob(action), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(ours.deterministic_sample, theirs.deterministic_sample, rtol=1e-4, atol=1e-5)
+    assert list(data.keys()) == ["observation"]
+
+
+def test_actors_that_the_losses_cannot_serve_are_refused():
+    with pytest.raises(ValueError, match="needs a ProbabilisticActor, got Linear"):
+        PolicyReader(nn.Linear(2, 2), "Loss", continuous_only=False)
+    with pytest.raises(ValueError, match=r"without tanh_loc\), not TanhNormal"):
+        PolicyReader(tanh_normal_actor(tanh_loc=True), "Loss", continuous_only=False)
+    PolicyReader(tanh_normal_actor(tanh_loc=False), "Loss", continuous_only=True)
+    buttons = make_mixed_actor(4, ActionHeads((3, 2)), None, widths=(8,))
+    PolicyReader(buttons, "Loss", continuous_only=False)
+    with pytest.raises(ValueError, match=r"Loss serves continuous actions only.*\(3, 2\)"):
+        PolicyReader(buttons, "Loss", continuous_only=True)
+
+
+def test_specs_must_be_those_of_the_actor():
+    axes, buttons = tanh_normal_actor(), make_mixed_actor(4, ActionHeads((3, 2)), None, widths=(8,))
+
+    def read(actor, spec):
+        PolicyReader(actor, "Loss", continuous_only=False, action_spec=spec)
+
+    for spec in (None, Bounded(-1.0, 1.0, (3,)), Unbounded((3,))):
+        read(axes, spec)
+    read(buttons, MixedActionSpec(ActionHeads((3, 2))))
+    for actor, spec in ((buttons, Bounded(-1.0, 1.0, (5,))), (axes, OneHot(3)), (buttons, OneHot(5))):
+        with pytest.raises(ValueError, match="cannot serve the action spec"):
+            read(actor, spec)
+    for actor in (axes, buttons):
+        with pytest.raises(ValueError, match="the environment's action is"):
+            read(actor, MixedActionSpec(ActionHeads((2, 3))))
