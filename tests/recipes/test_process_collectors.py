@@ -11,7 +11,6 @@ from recipe_config import compose_config
 from tensordict import TensorDict
 
 from coachable.training.collection import _ray_options, make_collector
-
 from tests.recipes.test_every_combination import RECIPES, TINY
 
 
