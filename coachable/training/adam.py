@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+import itertools
 from typing import Any
 
 import torch
@@ -88,19 +88,13 @@ def _table(
     flat: FlatBuffers, target: FlatBuffers | None, first: list[Tensor], second: list[Tensor], steps: list[Tensor]
 ) -> Any:
     """Sizes and addresses for one call of the kernel, see `Parameter` in kernels.c."""
-    none = [None] * len(steps)
-    columns: list[Sequence[Tensor | None]] = [
-        flat.tensors,
-        first,
-        second,
-        flat.grads,
-        flat.low if flat.rounds else none,
-    ]
-    columns += [none, none] if target is None else [target.tensors, target.low if target.rounds else none]
+    columns = [flat.tensors, first, second, flat.grads, flat.low if flat.rounds else []]
+    columns += [[], []] if target is None else [target.tensors, target.low if target.rounds else []]
     columns += [steps]
-    rows = [[0 if t is None else t.data_ptr() for t in row] for row in zip(*columns, strict=True)]
-    numbers = [number for t, row in zip(flat.tensors, rows, strict=True) for number in (t.numel(), *row)]
-    return (ctypes.c_int64 * len(numbers))(*numbers)
+    nothing = [0] * len(steps)
+    addresses = [[tensor.data_ptr() for tensor in column] or nothing for column in columns]
+    rows = zip([tensor.numel() for tensor in flat.tensors], *addresses, strict=True)
+    return (ctypes.c_int64 * (len(steps) * (1 + len(columns))))(*itertools.chain.from_iterable(rows))
 
 
 def place_moments(optimizer: torch.optim.Adam) -> None:

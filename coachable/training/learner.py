@@ -243,9 +243,9 @@ class Learner:
 
     def _follow(self) -> None:
         """Go on with the loss's parameters as they are now: others may be in their place, or other memory in theirs."""
-        adopt_actor(self.loss_module)
         if not self._watch.changed():
             return
+        adopt_actor(self.loss_module)
         self._watch.forget_copies()
         self._params = self._present_parameters()
         device = self._params["actor"][0].device

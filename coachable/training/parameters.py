@@ -34,7 +34,7 @@ def trained_parameters(loss_module: LossModule) -> dict[str, list[str]]:
 
 
 class Watch:
-    """Notices when a loss has other parameters, or the same ones with other memory or of another dtype.
+    """Notices when a loss or its policy has other parameters, or the same ones with other memory or of another dtype.
 
     Memory that moves with everybody who uses it, as in `share_memory_()`, counts as the same. Memory that is exchanged,
     as in `tensor.data = other`, `.to(dtype)` or `load_state_dict(assign=True)`, does not.
@@ -45,18 +45,22 @@ class Watch:
 
     def __init__(self, loss_module: LossModule) -> None:
         self._loss = loss_module
-        self._seen: list[tuple[Tensor, Tensor]] = []
+        self._seen: list[tuple[dict[str, Any], str, Any]] = []
+        self._memory: list[tuple[Tensor, Tensor]] = []
 
     def look(self) -> None:
-        """Take note of the parameters as they are now."""
-        self._seen = [(tensor, tensor.detach()) for tensor in self._tensors()]
+        """Take note of the parameters as they are now, and of where modules keep them."""
+        loss: Any = self._loss
+        places = [*loss.modules(), *_policy(loss).modules()]
+        kept = [module._parameters for module in places] + [params._buffers for params in _sets(loss)]
+        self._seen = [(owner, name, value) for owner in (loss._modules, *kept) for name, value in owner.items()]
+        tensors = {id(value): value for _, _, value in self._seen if isinstance(value, Tensor)}
+        self._memory = [(tensor, tensor.detach()) for tensor in tensors.values()]
 
     def changed(self) -> bool:
-        """Whether the parameters are others than at the last look."""
-        tensors = self._tensors()
-        return len(tensors) != len(self._seen) or not all(
-            tensor is seen and tensor.is_set_to(alias)
-            for tensor, (seen, alias) in zip(tensors, self._seen, strict=True)
+        """Whether anything is other than at the last look."""
+        return any(owner.get(name) is not value for owner, name, value in self._seen) or not all(
+            tensor.is_set_to(alias) for tensor, alias in self._memory
         )
 
     def forget_copies(self) -> None:
@@ -65,10 +69,6 @@ class Watch:
         loss._erase_cache()
         for params in _sets(loss):
             _erase_caches(params)
-
-    def _tensors(self) -> list[Tensor]:
-        sets = _sets(self._loss)
-        return [*self._loss.parameters(), *(tensor for params in sets for tensor in params.buffers())]
 
 
 def _sets(loss_module: LossModule) -> list[TensorDictParams]:
@@ -126,8 +126,11 @@ def follow(optimizer: torch.optim.Optimizer, params: list[nn.Parameter]) -> None
 def _apart(loss_module: LossModule) -> bool:
     """Whether the loss's policy has other parameters than those that the loss trains."""
     loss: Any = loss_module
-    actor = getattr(loss, "actor_network", None)
-    if not isinstance(actor, nn.Module):
-        return False
-    own, trained = dict(actor.named_parameters()), dict(loss.actor_network_params.named_parameters())
+    own, trained = dict(_policy(loss).named_parameters()), dict(loss.actor_network_params.named_parameters())
     return own.keys() == trained.keys() and any(own[name] is not trained[name] for name in own)
+
+
+def _policy(loss_module: LossModule) -> nn.Module:
+    """The policy's own module, or an empty one."""
+    actor = getattr(loss_module, "actor_network", None)
+    return actor if isinstance(actor, nn.Module) else nn.Module()
