@@ -22,7 +22,7 @@ import tempfile
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -44,6 +44,8 @@ TINY += ["init_random_frames=48", "train.warmup_frames=48", "train.batch_size=32
 TINY += ["train.eval_interval=80"]
 INTERVALS = {"log_interval": 0.1, "checkpoint_interval": 0.1}  # [s]
 
+_FOREVER = float("inf")
+
 Make = Callable[[Path | None], Train]
 """Makes a training, resumed from a folder where one is given."""
 
@@ -63,23 +65,29 @@ class Course:
     problems: list[str] = field(default_factory=list)
 
 
-def run_with_kills(make: Make, run_dir: Path, delays: list[float]) -> Course:
-    """Runs a training to its end, though it is killed after each of `delays` in turn, [s] from the start or resumption.
+def run_with_kills(make: Make, run_dir: Path, *, delays: Sequence[float] = (), calls: Sequence[int] = ()) -> Course:
+    """Runs a training to its end, though it is killed and resumed again and again.
+
+    Args:
+        make: makes the training.
+        run_dir: its folder.
+        delays: [s] from a start or resumption to a kill, one after the other.
+        calls: Python and C functions called until then, instead; the moment is the same on every machine.
 
     Raises:
         RuntimeError: if it fails of its own accord.
     """
     course = Course()
-    for delay in [*delays, float("inf")]:
-        killed_in, seconds = _run_once(make, run_dir, delay)
+    for delay, call in [*((delay, 0) for delay in delays), *((_FOREVER, call) for call in calls), (_FOREVER, 0)]:
+        killed_in, lost = _run_once(make, run_dir, delay, call)
         if killed_in is None:
             break
         course.kills.append(killed_in)
-        course.lost.append(seconds)
+        course.lost.append(lost)
     return course
 
 
-def _run_once(make: Make, run_dir: Path, delay: float) -> tuple[str | None, float]:
+def _run_once(make: Make, run_dir: Path, delay: float, call: int) -> tuple[str | None, float]:
     """Runs or resumes a training in a process of its own; returns where it was killed, and what that cost."""
     try:
         resume = find_checkpoint(run_dir)
@@ -88,23 +96,25 @@ def _run_once(make: Make, run_dir: Path, delay: float) -> tuple[str | None, floa
     part = mmap.mmap(-1, 1)  # shared with the child
     log = run_dir.with_suffix(".log")
     started = time.time()
+
+    def run() -> None:
+        if call:
+            _die_at(call)
+        _publish_part(make(resume), part).run()
+
     child = os.fork()
     if child == 0:
-        _child(lambda: _publish_part(make(resume), part).run(), log)
+        _be_child(run, log)
     status = _wait(child, delay)
-    if status is None:
-        os.kill(child, signal.SIGKILL)
-        _, status = os.waitpid(child, 0)
     if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL:
-        with_state = [*run_dir.glob("checkpoints/frames_*/metadata.json")]
-        last = max([started, *(file.stat().st_mtime for file in with_state)])
-        return PARTS[part[0]], time.time() - last
+        complete = [file.stat().st_mtime for file in run_dir.glob("checkpoints/frames_*/metadata.json")]
+        return PARTS[part[0]], time.time() - max([started, *complete])
     if status != 0:
         raise RuntimeError(f"the training in {run_dir} failed:\n{log.read_text()[-3000:]}")
     return None, 0.0
 
 
-def _child(run: Callable[[], Any], log: Path) -> None:
+def _be_child(run: Callable[[], None], log: Path) -> None:
     """Runs and ends this process, without a return to the caller's."""
     descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     os.dup2(descriptor, 1)
@@ -117,17 +127,29 @@ def _child(run: Callable[[], Any], log: Path) -> None:
         os._exit(1)
 
 
-def _wait(child: int, delay: float) -> int | None:
-    """Status of a process that ends within `delay` [s], otherwise None."""
-    if delay == float("inf"):
-        return os.waitpid(child, 0)[1]
+def _die_at(call: int) -> None:
+    """Ends this process at one of the next function calls as a kill from outside does."""
+    left = call
+
+    def count(*_: Any) -> None:
+        nonlocal left
+        left -= 1
+        if left == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    sys.setprofile(count)
+
+
+def _wait(child: int, delay: float) -> int:
+    """Status of a process that ends within `delay` [s], or is killed then."""
     end = time.monotonic() + delay
     while time.monotonic() < end:
         ended, status = os.waitpid(child, os.WNOHANG)
         if ended:
             return status
-        time.sleep(min(0.002, max(0.0, end - time.monotonic())))
-    return None
+        time.sleep(min(0.005, max(0.0, end - time.monotonic())))
+    os.kill(child, signal.SIGKILL)
+    return os.waitpid(child, 0)[1]
 
 
 def _publish_part(train: Train, part: mmap.mmap) -> Train:
@@ -135,7 +157,7 @@ def _publish_part(train: Train, part: mmap.mmap) -> Train:
     timed = train._timed
 
     @contextmanager
-    def watched(name: str) -> Any:
+    def watched(name: str) -> Iterator[None]:
         part[0] = PARTS.index(name)
         with timed(name):
             yield
@@ -212,14 +234,14 @@ def kill_recipe(
     reference = folder / f"{recipe}_reference"
     reference.parent.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
-    run_with_kills(partial(make_recipe, recipe, reference, arguments), reference, [])
+    run_with_kills(partial(make_recipe, recipe, reference, arguments), reference)
     span = time.monotonic() - started
     total, exact, runs = Course(), 0, 0
     while len(total.kills) < kills:
         runs += 1
         run = folder / f"{recipe}_{runs}"
         delays = [rng.uniform(0.0, span) for _ in range(min(per_run, kills - len(total.kills)))]
-        course = run_with_kills(partial(make_recipe, recipe, run, arguments), run, delays)
+        course = run_with_kills(partial(make_recipe, recipe, run, arguments), run, delays=delays)
         problems = differences(run, reference)
         exact += not problems
         total.kills += course.kills
