@@ -2,22 +2,20 @@
 
 import os
 import platform
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import metadata
 from typing import Literal
 
+from coachable.extras import EXTRAS, how_to_install
+
 __all__ = ["Check", "examine"]
 
 Verdict = Literal["ok", "note", "problem"]
 _SHOWN = ("torch", "torchrl", "tensordict", "mujoco", "dm_control", "numpy", "hydra-core", "wandb")
-_EXTRAS = {
-    "ui": ("viser", "mjviser"),
-    "video": ("av",),
-    "export": ("onnx", "onnxruntime", "onnxscript"),
-    "explain": ("captum",),
-    "gym": ("gymnasium",),
-}
+PYTHON = ((3, 11), (3, 12))  # first and last version that all dependencies have files for
+_REINSTALL = "pip install coachable (in a clone: pip install -e .) in a fresh environment"
 
 
 @dataclass(frozen=True)
@@ -53,13 +51,27 @@ def installed(name: str) -> str | None:
         return None
 
 
+def python_version() -> tuple[int, int]:
+    """Major and minor version of the interpreter."""
+    return sys.version_info[:2]
+
+
+def _python() -> Check:
+    found = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
+    first, last = (".".join(map(str, version)) for version in PYTHON)
+    if python_version() < PYTHON[0]:
+        return Check("python", "problem", f"{found}: expected Python {first} or {last}")
+    if python_version() > PYTHON[1]:
+        reason = "labmaze, which dm-control needs, has no files for it"
+        return Check("python", "problem", f"{found}: expected Python {first} or {last}, because {reason}")
+    return Check("python", "ok", found)
+
+
 def _versions() -> list[Check]:
-    checks = [Check("python", "ok", f"{platform.python_version()} on {platform.system()} {platform.machine()}")]
+    checks = [_python()]
     for name in _SHOWN:
         version = installed(name)
-        verdict, finding = (
-            ("ok", version) if version else ("problem", "missing: pip install -e . in a fresh environment")
-        )
+        verdict, finding = ("ok", version) if version else ("problem", f"missing: {_REINSTALL}")
         checks.append(Check(name, verdict, finding))
     return checks
 
@@ -114,9 +126,9 @@ def _hardware() -> list[Check]:
 
 def _extras() -> list[Check]:
     checks = []
-    for extra, names in _EXTRAS.items():
+    for extra, names in EXTRAS.items():
         missing = [name for name in names if installed(name) is None]
-        finding = f"not installed ({', '.join(missing)}): pip install -e '.[{extra}]'" if missing else "installed"
+        finding = f"not installed ({', '.join(missing)}): {how_to_install(extra)}" if missing else "installed"
         checks.append(Check(f"[{extra}]", "note" if missing else "ok", finding))
     return checks
 

@@ -6,6 +6,12 @@ import ctypes.util
 import os
 
 NO_BACKEND = "disable"
+
+
+class RenderingError(RuntimeError):
+    """Pictures cannot be drawn on this machine as it is."""
+
+
 INSTALL_HINT = (
     "no OpenGL library was found for headless rendering; install one, e.g. on Debian `apt-get install libosmesa6` "
     "(software) or `apt-get install libegl1` (EGL), or set MUJOCO_GL to glfw, egl or osmesa"

@@ -19,12 +19,14 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
+from recipe_ranges import checked_numbers
+from recipe_saved import CONFIGS, check_saved_config
 
-from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
+from coachable.files import CheckpointError, check_contained, refusing
+from coachable.finite import NonFiniteError
+from coachable.training.checkpoint import find_checkpoint, read_state
 from coachable.training.hardware import choose_preset, detect, estimate_update_seconds, pick_device
 from coachable.training.loop import Train
-
-CONFIGS = Path(__file__).resolve().parent / "configs"
 
 # What a checkpoint decides: its weights, its replay buffer and its generators belong to these values.
 _FIXED = (
@@ -39,6 +41,8 @@ _FIXED = (
     "init_from",
     "init_new_observations",
 )
+
+_PATHS = ("run_dir", "resume", "init_from")
 
 # Options of Hydra that are followed by a value.
 _VALUED = (
@@ -81,15 +85,18 @@ def run_recipe(config_name: str, build: Callable[[dict[str, Any]], Train]) -> No
     @hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name=config_name)
     def main(cfg: DictConfig) -> None:
         try:
-            config = plain_config(cfg, list(HydraConfig.get().overrides.task))
-            train = build(config)
+            config = plain_config(cfg, list(HydraConfig.get().overrides.task), config_name)
+            train = build_checked(build, config)
         except (CheckpointError, ValueError, ImportError) as error:
             if "HYDRA_FULL_ERROR" in os.environ:
                 raise
             # The user's to solve: the sentence says how, a traceback would hide it.
             raise SystemExit(f"error: {error}") from None
         announce(config, train)
-        train.run()
+        try:
+            train.run()
+        except (NonFiniteError, CheckpointError) as error:
+            raise SystemExit(f"error: {error}") from None
 
     main()
 
@@ -106,7 +113,7 @@ def compose_config(config_name: str, arguments: list[str]) -> dict[str, Any]:
     """
     arguments = checked_arguments(config_name, arguments)
     with _configs():
-        return plain_config(hydra.compose(config_name, arguments), arguments)
+        return plain_config(hydra.compose(config_name, arguments), arguments, config_name)
 
 
 def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
@@ -125,7 +132,7 @@ def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
         SystemExit: naming what is misspelt or of a wrong type, and the valid choices.
     """
     try:
-        options, given = _options_apart(arguments)
+        options, given = _options_apart(_quoted_paths(arguments))
         overrides = OverridesParser.create().parse_overrides(given)
     except HydraException as error:
         raise SystemExit(f"error: {error}\nexpected KEY=VALUE, for example loss=sac or train.batch_size=256") from None
@@ -155,38 +162,62 @@ def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
     return [*options, *(a for a in given if not a.startswith("preset=")), f"preset={','.join(presets)}"]
 
 
-def plain_config(cfg: DictConfig, overrides: list[str]) -> dict[str, Any]:
+def build_checked(build: Callable[[dict[str, Any]], Train], config: dict[str, Any]) -> Train:
+    """Builds a training; a saved configuration that makes none is refused with a sentence.
+
+    Raises:
+        CheckpointError: if a resumed run's configuration cannot be used.
+    """
+    if not config["resume"]:
+        return build(config)
+    with refusing(config["resume"], "a configuration"):
+        return build(config)
+
+
+def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dict[str, Any]:
     """Resolves a composed configuration; a resumed run's starts from the one in its checkpoint.
 
     Args:
         cfg: composed by Hydra.
         overrides: what the command line said.
+        config_name: file in recipes/configs, without its suffix; a checkpoint may name what it and its groups name.
 
     Returns:
         Plain containers, `run_dir` filled in.
+
+    Raises:
+        CheckpointError: if the configuration in a checkpoint names other functions, or refers to anything outside.
+        ValueError: naming a number that lies outside its range.
     """
     if cfg.resume:
         checkpoint = find_checkpoint(cfg.resume)
-        saved = read_state(checkpoint)["config"]
+        saved = read_state(checkpoint).get("config")
         said = {key: OmegaConf.select(cfg, key) for key in _said(overrides)}
-        fixed = [key for key in said if key.split(".")[0] in _FIXED]
+        check_saved_config(saved, checkpoint, config_name, said, OmegaConf.to_container(cfg, resolve=True))
+        with refusing(checkpoint, "a configuration"):
+            before = OmegaConf.create(saved)
+            fixed = [key for key in said if key.split(".")[0] in _FIXED and said[key] != OmegaConf.select(before, key)]
         if fixed:
             raise SystemExit(
                 f"error: {', '.join(fixed)} cannot change in a resumed run: start a new one with init_from={cfg.resume}"
             )
-        cfg = OmegaConf.create(saved)
-        for key, value in {
-            "init_from": None,
-            "run_dir": _run_of(checkpoint),
-            **said,
-            "resume": str(checkpoint),
-        }.items():
-            OmegaConf.update(cfg, key, value, merge=False)
+        run = _run_of(checkpoint)
+        replaced = {"init_from": None, "run_dir": run, **said, "resume": str(checkpoint)}
+        if run is not None and replaced["run_dir"] == run:
+            check_contained(Path(run))  # the run's own files are written to
+        with refusing(checkpoint, "a configuration"):
+            for key, value in replaced.items():
+                OmegaConf.update(before, key, value, merge=False)
+            cfg = OmegaConf.create(OmegaConf.to_container(before, resolve=True, throw_on_missing=True))
     config = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
     assert isinstance(config, dict)
     config.pop("hydra", None)
     config["run_dir"] = str(Path(config["run_dir"] or _new_run_dir(config["domain"])).expanduser().absolute())
-    return {str(key): value for key, value in config.items()}
+    config = {str(key): value for key, value in config.items()}
+    if not config["resume"]:
+        return checked_numbers(config)
+    with refusing(config["resume"], "a configuration"):
+        return checked_numbers(config)
 
 
 def announce(config: dict[str, Any], train: Train) -> None:
@@ -251,6 +282,20 @@ def _options_apart(arguments: list[str]) -> tuple[list[str], list[str]]:
     for before, argument in itertools.pairwise(["", *arguments]):
         (options if argument.startswith("-") or before in _VALUED else overrides).append(argument)
     return options, overrides
+
+
+def _quoted_paths(arguments: list[str]) -> list[str]:
+    """Puts paths into quotes, so that Hydra takes them as they are: a folder may be called `a=b` or `a, b`."""
+    if {"-m", "--multirun"} & set(arguments):
+        return arguments
+    quoted = []
+    for argument in arguments:
+        key, equals, value = argument.partition("=")
+        if equals and key in _PATHS and value not in ("", "null") and value[0] not in "'\"":
+            escaped = value.replace("'", "\\'")
+            argument = f"{key}='{escaped}'"
+        quoted.append(argument)
+    return quoted
 
 
 def _choices(given: str, valid: list[str]) -> str:

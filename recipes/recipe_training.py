@@ -40,22 +40,23 @@ def build_training(
         make_style_reward: `(space, **config["style_reward"]) -> StyleReward`.
         mirror_maps: how transitions are mirrored, for `config["mirror"]`.
     """
-    run_dir = Path(config["run_dir"])
-    check_writable(run_dir)
-    save_config(config, run_dir)
     make = partial(instantiate, _convert_="all", _partial_=True)
+
+    # Settings and styles: what contradicts itself is refused before anything is written or allocated
+    train_settings = make(config["train"])()
+    space = space.with_sampler(make(config["sampler"])(space))
+    known = set(signature(make_style_reward).parameters) - {"space"}
+    if unknown := set(config["style_reward"]) - known:
+        expected = ", ".join(sorted(known)) or "none"
+        raise ValueError(f"style_reward has {', '.join(sorted(unknown))}: {config['domain']} takes {expected}")
+    style_reward = make_style_reward(space, **config["style_reward"])
+    check_relabelling(config, style_reward)
+
+    # Environment
     threads = share_threads(**config["threads"])
     torch.set_num_threads(threads.learner)
     seed_everything(config["seed"])
     device = pick_device(config["device"])
-
-    # Styles and environment
-    space = space.with_sampler(make(config["sampler"])(space))
-    settings = set(signature(make_style_reward).parameters) - {"space"}
-    if unknown := set(config["style_reward"]) - settings:
-        expected = ", ".join(sorted(settings)) or "none"
-        raise ValueError(f"style_reward has {', '.join(sorted(unknown))}: {config['domain']} takes {expected}")
-    style_reward = make_style_reward(space, **config["style_reward"])
     workers = config["collector"]["num_collectors"]
 
     def make_env(seed: int, **settings: Any) -> CoachableEnv:
@@ -64,8 +65,31 @@ def build_training(
             settings["num_threads"] = max(1, threads.simulator // workers)
         return coachable_env(simulation(seed=seed, **settings), space, style_reward, EpisodeSums(), seed=seed)
 
-    # Actor and critics; a list of critics, because a single one would be re-initialised by the loss
     probe = make_env(config["seed"], num_envs=1)
+
+    # Replay, which takes memory when it is first written to
+    relabelled_sums = config["impersonation"]["n"] and config["n_steps"] > 1
+    replay = make(config["replay"])(**({"discounted_keys": [("next", STYLE_FEATURES)]} if relabelled_sums else {}))
+    tables = len(replay.names) if isinstance(replay, EventTableBuffer) else 0
+    if config["train"]["batch_size"] < tables:
+        raise ValueError(
+            f"train.batch_size={config['train']['batch_size']}: every batch holds at least one transition of each of "
+            f"the {tables} tables ({', '.join(replay.names)})"
+        )
+    if config["mirror"]:
+        if mirror_maps is None:
+            raise ValueError(f"mirror={config['mirror']}: {config['domain']} has no mirror images, expected mirror=0")
+        replay.append_transform(MirrorSymmetry(mirror_maps, config["mirror"], seed=config["seed"]))
+    if config["impersonation"]["n"]:
+        replay.append_transform(TaskImpersonation(style_reward, seed=config["seed"], **config["impersonation"]))
+    keys = replay_keys(probe, tables=bool(tables))
+    run_dir = Path(config["run_dir"])
+    check_writable(run_dir)
+    if config["checkpoint"]["replay"]:  # two at a time: the old one is removed when the new one is complete
+        check_writable(run_dir, required_bytes=2 * replay_bytes(probe, keys, config["replay_capacity"]))
+    save_config(config, run_dir)
+
+    # Actor and critics; a list of critics, because a single one would be re-initialised by the loss
     obs_dim, action_dim = probe.observation_spec["observation"].shape[-1], probe.action_spec.shape[-1]
     network = {part: {**config["network"][part], "obs_dim": obs_dim} for part in ("actor", "critic")}
     for part in network.values():
@@ -84,25 +108,7 @@ def build_training(
         initialise_from(config["init_from"], actor, loss_module, space, config["init_new_observations"])
     learner = make(config["learner"])(loss_module)
 
-    # Replay and collector
-    check_relabelling(config, style_reward)
-    relabelled_sums = config["impersonation"]["n"] and config["n_steps"] > 1
-    replay = make(config["replay"])(**({"discounted_keys": [("next", STYLE_FEATURES)]} if relabelled_sums else {}))
-    tables = len(replay.names) if isinstance(replay, EventTableBuffer) else 0
-    if config["train"]["batch_size"] < tables:
-        raise ValueError(
-            f"train.batch_size={config['train']['batch_size']}: every batch holds at least one transition of each of "
-            f"the {tables} tables ({', '.join(replay.names)})"
-        )
-    if config["mirror"]:
-        if mirror_maps is None:
-            raise ValueError(f"mirror={config['mirror']}: {config['domain']} has no mirror images, expected mirror=0")
-        replay.append_transform(MirrorSymmetry(mirror_maps, config["mirror"], seed=config["seed"]))
-    if config["impersonation"]["n"]:
-        replay.append_transform(TaskImpersonation(style_reward, seed=config["seed"], **config["impersonation"]))
-    keys = replay_keys(probe, tables=bool(tables))
-    if config["checkpoint"]["replay"]:  # two at a time: the old one is removed when the new one is complete
-        check_writable(run_dir, required_bytes=2 * replay_bytes(probe, keys, config["replay_capacity"]))
+    # Collector
     collector = make(config["collector"])(
         make_env,
         actor,
@@ -132,7 +138,7 @@ def build_training(
         collector=collector,
         replay=replay,
         learner=learner,
-        settings=make(config["train"])(),
+        settings=train_settings,
         log=MetricsLog(run_dir, wandb_logger(config["domain"], run_dir, **config["wandb"])),
         progress=Progress(config["train"]["total_frames"]),
         checkpoints=CheckpointStore(run_dir / "checkpoints", **config["checkpoint"]),

@@ -1,5 +1,6 @@
 """A tiny batched environment with one style parameter, and a small training on it."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,9 @@ class StyleEchoEnv(EnvBase):
         self.position = torch.zeros(num_envs, 1)
         self.age = torch.zeros(num_envs, 1, dtype=torch.long)
         self.generator = torch.Generator()
-        self.poison: float | None = None  # written into the first observation of the next step
+        self.poison: dict[str, float] = {}  # written into row 1 of these entries, from step `poisoned_from` on
+        self.poisoned_from = 0
+        self.steps = 0
         if resumable:
             self.simulator_state = self._simulator_state
             self.load_simulator_state = self._load_simulator_state
@@ -69,16 +72,17 @@ class StyleEchoEnv(EnvBase):
         noise = torch.randn(self.position.shape, generator=self.generator)
         self.position = self.position + action + 0.3 * noise
         self.age = self.age + 1
-        return self._package(action, reset=False)
+        self.steps += 1
+        out = self._package(action, reset=False)
+        for key, value in self.poison.items() if self.steps >= self.poisoned_from else ():
+            out[key][1, -1] = value
+        return out
 
     def _package(self, action: torch.Tensor, *, reset: bool) -> TensorDictBase:
         terminated = (self.position.abs() > 3) & (not reset)
         truncated = (self.age >= 20) & ~terminated
-        observation = self._observation()
-        if self.poison is not None and not reset:
-            observation[0, 0] = self.poison
         out = {
-            "observation": observation,
+            "observation": self._observation(),
             TASK_REWARD: torch.zeros_like(self.position),
             STYLE_FEATURES: action.clone(),
             "terminated": terminated,
@@ -126,6 +130,7 @@ def make_train(
     num_envs: int = 4,
     checkpoints: CheckpointStore | None = None,
     actor_lr: float = 1e-3,
+    make_env: Callable[..., Any] = make_echo_env,
     **settings: Any,
 ) -> Train:
     """Makes a small training on one thread; `settings` are those of `TrainSettings`."""
@@ -143,7 +148,7 @@ def make_train(
     defaults = {"batch_size": 16, "warmup_frames": 40, "utd_ratio": 0.25, "checkpoint_interval": 1e9}
     return Train(
         collector=make_collector(
-            lambda s: make_echo_env(s, num_envs, resumable=resumable),
+            lambda s: make_env(s, num_envs, resumable=resumable),
             actor,
             frames_per_batch=num_envs,
             init_random_frames=40,

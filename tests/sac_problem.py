@@ -1,12 +1,17 @@
-"""A small SAC loss with style, and batches for it."""
+"""Small losses with style, and batches for them."""
 
 import torch
 from tensordict import TensorDict
 from torchrl.objectives import SACLoss
 
+from coachable.losses import CatRACLoss, QRSACLoss
 from coachable.networks import make_critic, make_gaussian_actor
+from coachable.networks.action_heads import ActionHeads
+from coachable.networks.hl_gauss_critic import make_hl_gauss_critic
+from coachable.networks.mixed import make_mixed_actor
 
 OBS, ACT = 7, 3
+WIDTHS = (64, 48)
 
 
 class ScaledStyle:
@@ -31,6 +36,18 @@ def make_loss(seed=0, width=32, fixed_alpha=True, loss_function="l2", **kwargs):
     )
     loss.make_value_estimator(gamma=0.99)
     return loss
+
+
+def qr_sac():
+    actor = make_gaussian_actor(OBS, ACT, ScaledStyle(), WIDTHS)
+    critics = [make_critic(OBS, ACT, ScaledStyle(), WIDTHS, num_outputs=8) for _ in range(2)]
+    return QRSACLoss(actor, critics, num_quantiles=8)
+
+
+def cat_rac():
+    heads = ActionHeads(axes=ACT)
+    critics = [make_hl_gauss_critic(OBS, ACT, ScaledStyle(), WIDTHS) for _ in range(2)]
+    return CatRACLoss(make_mixed_actor(OBS, heads, ScaledStyle(), WIDTHS), critics, entropy_samples=10)
 
 
 def make_batch(*shape, seed=1):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from coachable import doctor
+from coachable import __version__, doctor
 from coachable.cli import main
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -38,15 +38,120 @@ def test_a_missing_agent_is_named_without_a_traceback(arguments, capsys, tmp_pat
     assert f"coachable {arguments[0]}: no checkpoint at nowhere" in capsys.readouterr().err
 
 
-def test_wrong_arguments_are_named(capsys):
-    for arguments, message in [
-        (["render", "x", "--style", "pose"], "'pose' is no NAME=VALUE"),
-        (["render", "x", "--size", "big"], "'big' is no WIDTHxHEIGHT"),
-        (["dance"], "invalid choice: 'dance'"),
-    ]:
-        with pytest.raises(SystemExit):
-            main(arguments)
-        assert message in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("render x --style pose", "'pose' is no NAME=VALUE"),
+        ("render x --size big", "'big' is no WIDTHxHEIGHT"),
+        ("render x --seconds 0", "'0' is no number of seconds above 0"),
+        ("render x --seconds nan", "'nan' is no number of seconds above 0"),
+        ("render x --seconds inf", "'inf' is no number of seconds above 0"),
+        ("evaluate x --episodes 0", "--episodes: '0' is no whole number of at least 1"),
+        ("evaluate x --switch-episodes -1", "--switch-episodes: '-1' is no whole number of at least 1"),
+        ("evaluate x --steps 0", "--steps: '0' is no whole number of at least 1"),
+        ("evaluate x --threads 0", "--threads: '0' is no whole number of at least 1"),
+        ("evaluate x --seed -1", "--seed: '-1' is no whole number of at least 0"),
+        ("evaluate x --seed 9999999999", "--seed: 9999999999 is too large"),
+        ("evaluate x --episodes many", "'many' is no whole number"),
+        ("report x --seeds 0", "--seeds: '0' is no whole number of at least 1"),
+        ("report x --sweep-points 1", "--sweep-points: '1' is no whole number of at least 2"),
+        ("explain x --episodes 1", "--episodes: '1' is no whole number of at least 2"),
+        ("explain x --states 0", "--states: '0' is no whole number of at least 1"),
+        ("curves a=nowhere* --smooth 0", "--smooth: '0' is no whole number of at least 1"),
+        ("dance", "invalid choice: 'dance'"),
+        ("", "required: COMMAND"),
+    ],
+)
+def test_wrong_arguments_are_named(arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "nowhere_1").mkdir()
+    (tmp_path / "nowhere_1" / "metrics.csv").touch()
+    with pytest.raises(SystemExit) as stop:
+        main(arguments.split())
+    assert stop.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("source", ["walker", "README.md", ""])
+def test_no_page_is_announced_for_what_is_no_agent(source, capsys, monkeypatch, tmp_path):
+    def announced(*_, **__):
+        raise AssertionError("the page was announced")
+
+    monkeypatch.setattr("coachable.coach.command.serve", announced)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "README.md").write_text("# Not an agent\n")
+    assert main(["coach", source]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "humanoid" in error and (source or "there is no agent") in error
+
+
+@pytest.mark.parametrize("source", ["humanoid", "."])
+def test_the_page_is_opened_for_an_agent(source, monkeypatch, tmp_path):
+    opened = []
+    monkeypatch.setattr("coachable.coach.command.serve", lambda **settings: opened.append(settings["source"]))
+    monkeypatch.chdir(tmp_path)
+    assert main(["coach", source]) == 0
+    assert opened == [source]
+
+
+def test_another_file_is_no_agent(capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "README.md").write_text("# Not an agent\n")
+    for command in (["export", "README.md"], ["weights", "README.md", "w.pt"], ["report", "README.md"]):
+        assert main(command) == 2
+        error = capsys.readouterr().err
+        assert "README.md" in error and error.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["README.md"]
+
+
+@pytest.mark.parametrize("command", ["evaluate", "report", "explain"])
+def test_a_file_in_the_place_of_the_output_is_named(command, capsys, tmp_path):
+    (tmp_path / "taken").write_text("mine")
+    assert main([command, "humanoid", "--out", str(tmp_path / "taken")]) == 2
+    assert "taken is a file: expected a folder" in capsys.readouterr().err
+    assert (tmp_path / "taken").read_text() == "mine"
+
+
+def test_an_interrupted_report_leaves_nothing_behind(capsys, monkeypatch, tmp_path):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("coachable.evaluation.report.evaluate_run", interrupted)
+    assert main(["report", "humanoid", "--out", str(tmp_path / "report")]) == 130
+    assert capsys.readouterr().err.endswith("coachable report: interrupted, nothing was written\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_machine_that_cannot_draw_is_told_what_to_install(capsys, monkeypatch, tmp_path):
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    assert main(["render", "humanoid", "--seconds", "0.1", "--out", str(tmp_path / "film.gif")]) == 2
+    assert "no OpenGL library was found" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_agents_of_other_domains_cannot_share_a_report(capsys, tmp_path):
+    assert main(["report", "humanoid", "racing_drift", "--out", str(tmp_path / "report")]) == 2
+    assert "the one belongs to racing_drift, the other to humanoid" in capsys.readouterr().err
+
+
+def test_curves_are_drawn_as_pictures_only(capsys, tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "metrics.csv").write_text("updates,episode/return\n1,2\n")
+    assert main(["curves", f"a={tmp_path / 'run'}", "--out", str(tmp_path / "curves.txt")]) == 2
+    assert "cannot draw curves.txt: expected a file ending in one of .png" in capsys.readouterr().err
+
+
+def test_the_version_is_printed(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["--version"])
+    assert stop.value.code == 0
+    assert capsys.readouterr().out == f"coachable {__version__}\n"
+
+
+def test_weights_of_a_weights_file(capsys, tmp_path):
+    assert main(["weights", "humanoid", str(tmp_path / "weights.pt")]) == 2
+    assert "is a small weights file already: expected a run's folder or a checkpoint" in capsys.readouterr().err
 
 
 def test_weights_of_a_run(make_train, tmp_path, capsys):
@@ -83,7 +188,16 @@ def test_the_doctor_finds_what_is_missing(monkeypatch, capsys):
     assert main(["doctor"]) == 1
     text = capsys.readouterr().out
     assert re.search(r"^problem\s+torch\s+missing", text, re.MULTILINE)
-    assert "pip install -e '.[ui]'" in text
+    assert "pip install 'coachable[ui]' (in a clone: pip install -e '.[ui]')" in text
+
+
+@pytest.mark.parametrize("version, reason", [((3, 10), ""), ((3, 13), "labmaze, which dm-control needs")])
+def test_the_doctor_finds_a_python_that_dependencies_do_not_support(monkeypatch, capsys, version, reason):
+    monkeypatch.setattr(doctor, "python_version", lambda: version)
+    assert main(["doctor"]) == 1
+    assert re.search(
+        rf"^problem python .*expected Python 3.11 or 3.12.*{reason}", capsys.readouterr().out, re.MULTILINE
+    )
 
 
 def test_the_readme_has_the_two_set_up_commands():

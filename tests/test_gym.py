@@ -100,6 +100,31 @@ def test_the_observation_is_a_dict_or_one_vector(env):
     assert vector.dtype == np.float32 and vector.shape == flat.observation_space.shape == (5,)
 
 
+class Seeing(Walk):
+    """A walk whose observation is of any kind."""
+
+    def __init__(self, space):
+        self.observation_space = space
+
+    def _observation(self):
+        return self.observation_space.sample()
+
+
+@pytest.mark.parametrize("space", [spaces.Dict(a=spaces.Box(-1.0, 1.0, (2,))), spaces.Tuple([spaces.Discrete(3)])])
+def test_a_dict_observation_has_to_be_flattened(space):
+    with pytest.raises(ValueError, match=r"the observation is a (Dict|Tuple), .* pass flat=True for one vector"):
+        StyleWrapper(Seeing(space), style_reward(), moved)
+    env = StyleWrapper(Seeing(space), style_reward(), moved, flat=True)
+    observation, _ = env.reset(seed=0)
+    assert env.observation_space.contains(observation)
+
+
+def test_an_observation_without_a_fixed_size_cannot_be_flattened():
+    space = spaces.Dict(a=spaces.Sequence(spaces.Box(-1.0, 1.0, (2,))))
+    with pytest.raises(ValueError, match="has no fixed size, so flat=True cannot make one vector of it"):
+        StyleWrapper(Seeing(space), style_reward(), moved, flat=True)
+
+
 def test_the_reward_is_of_the_style_that_was_shown(env):
     env.set_style({"stride": 0.5, "hat": "blue"})
     env.reset(seed=0)

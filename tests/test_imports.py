@@ -16,8 +16,12 @@ MODULES = {
 
 # Layer of each part of the package; a module may import from its own layer and from those before it.
 LAYERS = {
+    "extras": 0,
+    "files": 0,
+    "finite": 0,
     "gl": 0,
     "keys": 0,
+    "ranges": 0,
     "styles": 0,
     "losses": 1,
     "networks": 1,

@@ -8,36 +8,45 @@ from coachable.coach.segments import Segment
 from coachable.coach.vocabulary import ANY, PERCENT, PLAINLY, SLIGHTLY, STRONGLY, TURNS, UNITS, stem
 from coachable.styles import Choice, Setpoint, Weight
 
+Last = tuple[tuple[str, ...], float]  # parameters and direction of a change
 
-def amount(p: Weight | Setpoint, segment: Segment, now: float, last: tuple[str, float] | None) -> float | str:
+_QUALITY = 0.85  # share of the range that an adjective such as "careful" asks for
+
+
+def amount(p: Weight | Setpoint, segment: Segment, now: float, last: Last | None, spent: bool = False) -> float | str:
     """The value that a request asks for.
 
     Args:
         p: the parameter it is about.
         segment: the request.
         now: value in force.
-        last: parameter and direction of the last change, to which "a bit more" refers.
+        last: the last change, to which "a bit more" refers.
+        spent: whether the parameter rewards saving what it is named after: "less fuel" asks for more of it.
 
     Returns:
         The value, possibly outside the range where a number was given; or, as text, what is missing.
     """
-    sign = _sign(segment, p, last)
+    compared = segment.direction is not None or segment.level is not None
+    sense = segment.sense or (-1 if spent and compared else 0)
+    sign = _sign(segment, p, last, sense)
     if segment.number is not None:
-        return _given(p, segment, now, sign)
+        return _given(p, segment, now, sign, sense)
     if segment.keep and sign is None and segment.only_degree:
         return now
     if segment.negated and segment.direction is not None:
         return now  # "not longer" asks for no change
     if segment.factor is not None:
-        return now * segment.factor
+        return now / segment.factor if sense < 0 else now * segment.factor
     if sign is not None:
         return _moved(p, segment, now, sign)
     if segment.level is not None:
-        return _level(p, segment.level, segment.degree)
+        return _level(p, 1.0 - segment.level if sense < 0 else segment.level, segment.degree)
     if segment.default:
         return default_of(p)
     if isinstance(p, Weight):
-        return _weight(p, segment)
+        return _weight(p, segment, spent)
+    if sense:
+        return _level(p, _QUALITY if (sense > 0) != segment.negated else 1.0 - _QUALITY, segment.degree)
     return f"how much? {p.name.replace('_', ' ')} goes from {p.low:g} to {p.high:g} {p.unit}".rstrip()
 
 
@@ -62,16 +71,20 @@ def _is_circle(p: Weight | Setpoint | Choice) -> bool:
     return p.unit == "deg" and p.high - p.low == 360.0
 
 
-def _sign(segment: Segment, p: Weight | Setpoint, last: tuple[str, float] | None) -> float | None:
+def _sign(segment: Segment, p: Weight | Setpoint, last: Last | None, sense: int) -> float | None:
     """+1 or -1 for a change relative to the value in force."""
-    same = last is not None and last[0] == p.name
+    same = last is not None and p.name in last[0]
+    turn = -1.0 if sense < 0 and segment.dimension == ANY else 1.0  # "closer" is closer, also of "careful"
     if segment.direction is not None:
         dimension, sign = segment.direction
         if last is not None and same and segment.repeated and dimension == ANY and not segment.mentions:
             return sign * last[1]  # "a bit more" of what was asked before
-        return sign
-    if segment.level is not None and (segment.too or segment.negated) and segment.level != 0.5:
-        return -1.0 if segment.level > 0.5 else 1.0
+        return sign * turn
+    if segment.level is not None:
+        relative = (segment.too or segment.negated) and segment.level != 0.5
+        return (-turn if segment.level > 0.5 else turn) if relative else None
+    if segment.mentions and segment.only_degree and (segment.too or (segment.negated and "so" in segment.words)):
+        return -turn  # "too much fire", "not so careful"
     return last[1] if last is not None and same and segment.repeated else None
 
 
@@ -91,14 +104,16 @@ def _level(p: Weight | Setpoint, share: float, degree: float) -> float:
     return share * p.high if isinstance(p, Weight) else p.low + share * (p.high - p.low)
 
 
-def _weight(p: Weight, segment: Segment) -> float:
-    """Of a mere mention: "fire", "a bit of fire", "avoid fire"."""
-    if segment.negated:
+def _weight(p: Weight, segment: Segment, spent: bool) -> float:
+    """Of a mere mention: "fire", "a bit of fire", "avoid fire"; "save fuel", "do not save fuel", "use fuel"."""
+    if segment.negated and not segment.sense and not spent:
         return p.low
+    if segment.negated != (segment.sense < 0):
+        return 0.0
     return p.high / 4 if segment.degree == SLIGHTLY else p.high
 
 
-def _given(p: Weight | Setpoint, segment: Segment, now: float, sign: float | None) -> float | str:
+def _given(p: Weight | Setpoint, segment: Segment, now: float, sign: float | None, sense: int) -> float | str:
     """Of a number that was said."""
     assert segment.number is not None
     number, unit = segment.number
@@ -107,7 +122,8 @@ def _given(p: Weight | Setpoint, segment: Segment, now: float, sign: float | Non
     if unit in PERCENT:
         if sign is not None and not segment.absolute:
             return now * (1 + sign * number / 100)
-        return p.low + (p.high - p.low) * number / 100
+        share = number / 100
+        return p.low + (p.high - p.low) * (1.0 - share if sense < 0 else share)
     if unit:
         if dimension_of(p) != UNITS[unit][0]:
             return f"{p.name.replace('_', ' ')} is no {UNITS[unit][0]}" + (f", it is in {p.unit}" if p.unit else "")

@@ -9,6 +9,7 @@ from typing import Any
 
 from torchrl.envs import EnvBase
 
+from coachable.coach.grammar import read_meaning
 from coachable.styles import Choice, Setpoint, StyleSpace
 
 
@@ -48,12 +49,14 @@ class Coaching:
         controls: live controls, such as the humanoid's course.
         vocabulary: further words of the phrase box; see `StyleGrammar`.
         presets: named styles.
+        examples: phrases that the phrase box suggests.
         terminated: what a terminated episode means here, in the past tense.
     """
 
     controls: Sequence[Control] = ()
     vocabulary: Mapping[str, Sequence[str]] = field(default_factory=dict)
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    examples: Sequence[str] = ()
     terminated: str = "ended"
 
     def fitting(self, space: StyleSpace) -> Coaching:
@@ -64,9 +67,11 @@ class Coaching:
         def known(name: str, value: Any) -> bool:
             return name in names and (name not in options or value in ("", *options[name]))
 
-        vocabulary = {
-            meaning: words for meaning, words in self.vocabulary.items() if known(*meaning.partition("=")[::2])
-        }
+        def means(meaning: str) -> bool:
+            named, _, value = read_meaning(meaning)
+            return all(known(name, value) for name in named)
+
+        vocabulary = {meaning: words for meaning, words in self.vocabulary.items() if means(meaning)}
         presets = {name: style for name, style in self.presets.items() if all(known(*item) for item in style.items())}
         return replace(self, vocabulary=vocabulary, presets=presets)
 
@@ -110,6 +115,7 @@ _COACHING = {
             "sleepwalker": {"pose": "arms_in_front", "step_length": 0.40},
             "victory lap": {"pose": "arms_up", "step_length": 0.60},
         },
+        examples=("shorter steps", "arms up", "0.4 m"),
         terminated="fell",
     ),
     "combat": Coaching(
@@ -125,6 +131,7 @@ _COACHING = {
             "shock": ("stun", "electrify"),
             "fire": ("burn", "ignite", "set on fire"),
             "adhesive": ("glue", "slow it", "slow down"),
+            "carjas_bane sunscourge": ("bow",),
         },
         presets={
             "spear fighter": {"melee": 1.1},
@@ -133,6 +140,7 @@ _COACHING = {
             "arsonist": {"fire": 0.9},
             "scavenger": {"part_weapon": 1.0, "part_canister": 1.0, "part_shield": 1.0},
         },
+        examples=("use acid", "no traps", "more melee", "use the warrior bow"),
         terminated="ended the fight",
     ),
     "racing_drift": Coaching(
@@ -153,14 +161,25 @@ _COACHING = {
             },
             "grip": {"slip_angle_front": -0.4, "slip_angle_rear": -0.4},
         },
+        examples=("drift more", "no wheelspin", "grip"),
         terminated="retired",
     ),
     "racing_resources": Coaching(
         vocabulary={
-            "tire": ("tyre", "rubber", "save tyre", "tyre saving", "spare tyre", "nurse tyre"),
-            "fuel": ("petrol", "gas", "save fuel", "fuel saving", "lift and coast"),
-            "tire=0": ("burn tyre", "waste tyre", "ignore tyre"),
-            "fuel=0": ("burn fuel", "waste fuel", "ignore fuel"),
+            "tire": ("tyre", "rubber"),
+            "fuel": ("petrol", "gas"),
+            "+tire +fuel": (
+                *("save", "saving", "spare", "sparing", "nurse", "protect", "preserve", "conserve", "look after"),
+                *("economical", "economically", "economise", "save everything"),
+            ),
+            "-tire -fuel": ("consumption", "use of"),
+            "+fuel": ("lift and coast",),
+            "-fuel": ("use fuel", "fuel use", "use petrol", "use gas"),
+            "-tire": ("use tyre", "tyre use", "wear", "tyre wear"),
+            "tire=0": ("burn tyre", "waste tyre", "ignore tyre", "never mind tyre"),
+            "fuel=0": ("burn fuel", "waste fuel", "ignore fuel", "never mind fuel"),
+            "tire fuel=0": ("flat out", "push"),
+            "": ("burn", "burning", "consume", "consuming", "spend", "spending", "wear out"),
             "overtake": ("attack", "pass"),
             "defend": ("block",),
         },
@@ -170,17 +189,28 @@ _COACHING = {
             "save fuel": {"fuel": 105.0},
             "attack": {"overtake": 2.0, "tire": 0.0, "fuel": 0.0},
         },
+        examples=("save fuel", "save more tyres", "overtake more"),
         terminated="retired",
     ),
     "racing_aggressiveness": Coaching(
         vocabulary={
             "longitudinal": ("following distance", "distance behind", "distance ahead"),
-            "lateral": ("distance beside", "distance at side", "elbow room"),
+            "lateral": ("distance beside", "distance at side", "elbow room", "side", "sideway"),
+            "longitudinal lateral": ("margin", "distance", "gap", "room", "space", "clearance"),
+            "-longitudinal -lateral": (
+                *("aggressive", "aggressively", "aggressiveness", "aggression", "bold", "boldly", "attack", "reckless"),
+                *("pushy", "risky", "risk", "daring"),
+            ),
+            "+longitudinal +lateral": (
+                *("careful", "carefully", "cautious", "cautiously", "caution", "defensive", "defensively", "polite"),
+                *("timid", "safe", "safely", "calm", "patient", "gentle", "keep distance", "give room", "leave room"),
+            ),
         },
         presets={
             "door to door": {"longitudinal": 0.0, "lateral": 0.0},
             "room to breathe": {"longitudinal": 2.0, "lateral": 1.0},
         },
+        examples=("be aggressive", "give more room", "0.3 m beside"),
         terminated="retired",
     ),
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import os
 import warnings
 from collections.abc import Sequence
@@ -14,10 +15,12 @@ import torch
 from torch import Tensor
 
 from coachable import __version__
-from coachable.domain import domain_names, load_domain
+from coachable.domain import domain_names
+from coachable.extras import how_to_install
+from coachable.files import CheckpointError, space_named
 from coachable.networks.plain import DeterministicAction
 from coachable.styles import StyleSpace
-from coachable.training.weights import LoadedPolicy, load_policy
+from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
 __all__ = ["SCHEMA_VERSION", "TOLERANCE", "export", "largest_difference", "metadata_of"]
 
@@ -46,7 +49,9 @@ def export(source: str | Path, out: Path) -> float:
     Raises:
         ImportError: without the extra `export`.
         ValueError: if the policy is of a kind that cannot be exported.
-        RuntimeError: if file and torch differ by more than `TOLERANCE`; nothing is left behind.
+        CheckpointError: if the source does not hold a usable policy, or file and torch differ by more than
+            `TOLERANCE`; nothing is left behind.
+        OSError: if writing fails, saying how much space is needed.
     """
     onnx = _import_onnx()
     agent = load_policy(source)
@@ -56,12 +61,18 @@ def export(source: str | Path, out: Path) -> float:
     onnx.checker.check_model(model)
     out.parent.mkdir(parents=True, exist_ok=True)
     partial = out.with_name(out.name + ".partial")
-    partial.write_bytes(model.SerializeToString())
-    difference = largest_difference(partial, plain, agent.space)
-    if not difference <= TOLERANCE:
-        partial.unlink()
-        raise RuntimeError(f"the exported policy differs from torch by {difference:.2g}: expected at most {TOLERANCE}")
-    os.replace(partial, out)
+    content = model.SerializeToString()
+    try:
+        with space_named(out, len(content)):
+            partial.write_bytes(content)
+        difference = largest_difference(partial, plain, agent.space)
+        if not difference <= TOLERANCE:
+            raise CheckpointError(
+                f"the exported policy of {source} differs from torch by {difference:.2g}: expected at most {TOLERANCE}"
+            )
+        os.replace(partial, out)
+    finally:
+        partial.unlink(missing_ok=True)
     return difference
 
 
@@ -82,7 +93,7 @@ def metadata_of(agent: LoadedPolicy, plain: DeterministicAction) -> dict[str, st
         "updates": agent.metadata["updates"],
     }
     if domain in domain_names():
-        declaration = load_domain(domain, agent.config)
+        declaration = domain_of(agent)
         known["control_step"] = declaration.control_step  # [s]
         known["observation_groups"] = json.dumps(list(declaration.observation_groups))
     if plain.choice_sizes:
@@ -101,7 +112,7 @@ def largest_difference(file: Path, plain: DeterministicAction, space: StyleSpace
 
     Returns:
         Largest absolute difference of actions, axes and probabilities; for choices, how much less likely than the best
-        one the file's is.
+        one the file's is. Infinite where one of them is not finite.
     """
     import onnxruntime
 
@@ -120,7 +131,7 @@ def largest_difference(file: Path, plain: DeterministicAction, space: StyleSpace
                     worst = _shortfall(expected["probabilities"].split(plain.choice_sizes, -1), value)
                 else:
                     worst = (value - expected[name]).abs().max().item()
-                largest = max(largest, worst)
+                largest = max(largest, worst if math.isfinite(worst) else math.inf)
     return largest
 
 
@@ -159,5 +170,5 @@ def _import_onnx() -> Any:
         import onnxruntime  # noqa: F401
         import onnxscript  # noqa: F401
     except ImportError as error:
-        raise ImportError(f"{error.name} is missing: pip install 'coachable[export]'") from error
+        raise ImportError(f"{error.name} is missing: {how_to_install('export')}") from error
     return onnx

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -10,6 +12,66 @@ import numpy as np
 from coachable.coach.recording import Recording
 from coachable.coach.session import CoachSession
 from coachable.evaluation.video import CAPTION, caption, write_video
+
+_LONGEST_SESSION = 600.0  # [s]; all of it is run again for its last seconds
+
+
+class FilmStudio:
+    """Films sessions beside the thread that steps them, one at a time.
+
+    Args:
+        session: whose policy and domain to use; it is not touched.
+        note: called with what there is to say.
+    """
+
+    def __init__(self, session: CoachSession, note: Callable[[str], None]) -> None:
+        self._session, self._note = session, note
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def shoot(self, recording: Recording, last: float, deliver: Callable[[bytes], None]) -> None:
+        """Begins to draw the last seconds of a recording; returns at once.
+
+        Args:
+            recording: what to show.
+            last: seconds.
+            deliver: called with the mp4 file's content when it is finished.
+
+        Raises:
+            ValueError: while another film is drawn, or if the recording is too long.
+        """
+        if self._thread is not None and self._thread.is_alive():
+            raise ValueError("a film is being drawn already: wait until it is finished")
+        seconds = recording.steps * self._session.domain.control_step
+        if seconds > _LONGEST_SESSION:
+            raise ValueError(
+                f"the session has lasted {seconds:.0f} s, and a film runs it again from the start: at most "
+                f"{_LONGEST_SESSION:.0f} s are filmed here. Start over with a seed, or film the downloaded recording "
+                "with coachable.coach.film"
+            )
+        self._thread = threading.Thread(target=self._draw, args=(recording, last, deliver), name="filming", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Ends the film that is being drawn, if any."""
+        self._closing.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _draw(self, recording: Recording, last: float, deliver: Callable[[bytes], None]) -> None:
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                out = Path(folder) / "film.mp4"
+                deliver(film(recording, self._session, out, last=last, on_progress=self._progress).read_bytes())
+            self._note("drawn")
+        except Exception as error:  # this thread has nobody else to tell
+            if not self._closing.is_set():
+                self._note(f"Problem: {error}")
+
+    def _progress(self, share: float) -> None:
+        if self._closing.is_set():
+            raise RuntimeError("the page is closing")
+        self._note(f"drawing: {share:.0%}, the agent goes on meanwhile")
 
 
 def film(

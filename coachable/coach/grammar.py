@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import cast
 
 from coachable.coach import segments
-from coachable.coach.amounts import amount, dimension_of, wrapped
+from coachable.coach.amounts import Last, amount, dimension_of, wrapped
 from coachable.coach.segments import Mention, Segment
 from coachable.coach.vocabulary import (
     DEFAULTS,
@@ -28,10 +28,13 @@ from coachable.coach.vocabulary import (
     stem,
     tokenise,
 )
-from coachable.styles import Choice, Parameter, StyleSpace
+from coachable.styles import Choice, Parameter, StyleSpace, Weight
 
 Value = float | str
+MAX_PHRASE = 2000  # characters
 _ENDS = {"low": 0.0, "high": 1.0}
+_SIGNS = {"+": 1, "-": -1}
+_EXAMPLES = 3
 
 
 @dataclass(frozen=True)
@@ -43,17 +46,20 @@ class Understanding:
         changes: value by parameter name, to be handed to `CoachSession.set`; it may lie outside the trained range.
         said: one sentence per request that was understood.
         failed: one sentence per piece that was not.
-        last: parameter and direction of the last change, for "a bit more".
+        last: parameters and direction of the last change, for "a bit more".
+        examples: phrases that would be understood, if a word was not known.
     """
 
     phrase: str
     changes: dict[str, Value]
     said: tuple[str, ...]
     failed: tuple[str, ...]
-    last: tuple[str, float] | None = None
+    last: Last | None = None
+    examples: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        return "; ".join([*self.said, *(f"not understood: {text}" for text in self.failed)])
+        hint = [f"try: {', '.join(self.examples)}"] if self.examples else []
+        return "; ".join([*self.said, *(f"not understood: {text}" for text in self.failed), *hint])
 
 
 @dataclass
@@ -65,7 +71,7 @@ class _Reading:
     said: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
     excluded: dict[str, str] = field(default_factory=dict)  # by parameter: an option was ruled out, none was named
-    last: tuple[str, float] | None = None
+    last: Last | None = None
 
 
 class StyleGrammar:
@@ -74,7 +80,14 @@ class StyleGrammar:
     Args:
         parameters: what can be asked for; a `StyleSpace` or any list of declarations.
         vocabulary: further words and phrases by meaning: "name" for a parameter, "name=option" for an option,
-            "name=low", "name=high" or "name=0.4" for a value. Singular forms suffice.
+            "name=low", "name=high" or "name=0.4" for a value, "+name" or "-name" for what asks for more or less of it,
+            such as "careful" or "aggressive" for a distance. Several names, separated by spaces, are meant together.
+            A weight with "-" words is named after what it saves, so that "less fuel" asks for more of it. Words under
+            "" ask for nothing. Singular forms suffice.
+        examples: phrases to suggest where a word is not known; those that are not understood are left out.
+
+    Attributes:
+        examples: phrases that are understood here.
 
     Raises:
         ValueError: if the vocabulary names something that does not exist.
@@ -85,11 +98,14 @@ class StyleGrammar:
         >>> print(grammar.read("a bit more gap", {"gap": 1.0}))
         gap 1 → 1.2 m
         >>> print(grammar.read("sing louder", {"gap": 1.0}))
-        not understood: 'sing louder' (unknown: sing, louder)
+        not understood: 'sing louder' (unknown: sing, louder); try: more gap
     """
 
     def __init__(
-        self, parameters: StyleSpace | Sequence[Parameter], vocabulary: Mapping[str, Sequence[str]] | None = None
+        self,
+        parameters: StyleSpace | Sequence[Parameter],
+        vocabulary: Mapping[str, Sequence[str]] | None = None,
+        examples: Sequence[str] = (),
     ) -> None:
         declared = parameters.parameters if isinstance(parameters, StyleSpace) else tuple(parameters)
         self.parameters: dict[str, Parameter] = {p.name: p for p in declared}
@@ -97,30 +113,45 @@ class StyleGrammar:
         self._context = {p.name: {stem(w) for w in tokenise(f"{p.help} {p.name}")} for p in declared}
         self._add_help()
         self._add_names()
+        self._ignored: set[str] = set()
         for meaning, phrases in (vocabulary or {}).items():
+            if not meaning:
+                self._ignored.update(phrases)
+                continue
             mention = self._mention(meaning)
             for phrase in phrases:
                 self._add(phrase, mention)
+        opposed = {name for mention in self.lexicon.values() if mention.sign < 0 for name in mention.names}
+        self._spent = {name for name in opposed if isinstance(self.parameters[name], Weight)}
+        self.examples = self._working(examples) or self._working(
+            [_words(p.options[-1]) if isinstance(p, Choice) else f"more {_words(p.name)}" for p in declared]
+        )
 
     def read(self, phrase: str, current: Mapping[str, Value], previous: Understanding | None = None) -> Understanding:
         """Understands a phrase, relative to the style in force.
 
         Args:
-            phrase: what the coach said.
+            phrase: what the coach said, at most 2,000 characters.
             current: value of every parameter.
             previous: what was understood before, to which "a bit more" refers.
         """
         reading = _Reading(dict(current), last=previous.last if previous is not None else None)
+        if len(phrase) > MAX_PHRASE:
+            problem = f"the phrase has {len(phrase):,} characters, at most {MAX_PHRASE:,} are read"
+            return Understanding(phrase[:MAX_PHRASE], {}, (), (problem,), reading.last)
         split = segments.split(tokenise(phrase), self.lexicon)
         if not split:
             reading.failed.append(f"'{phrase.strip()}'" if phrase.strip() else "an empty phrase")
         for segment in split:
+            segment.unknown = [word for word in segment.unknown if word not in self._ignored]
             if segment.default and not segment.unknown and not segment.mentions:
                 self._reset(reading)
             else:
                 self._interpret(segment, reading)
         reading.failed += [text for name, text in reading.excluded.items() if name not in reading.changes]
-        return Understanding(phrase, reading.changes, tuple(reading.said), tuple(reading.failed), reading.last)
+        unknown = not split or any(segment.unknown for segment in split)
+        hint = self.examples if reading.failed and unknown else ()
+        return Understanding(phrase, reading.changes, tuple(reading.said), tuple(reading.failed), reading.last, hint)
 
     # -- lexicon ---------------------------------------------------------------------------------------------------
 
@@ -136,8 +167,8 @@ class StyleGrammar:
                 singles.update(set(tokenise(name)))
         for p in self.parameters.values():
             for name, mention in [
-                (p.name, Mention(p.name)),
-                *((option, Mention(p.name, option)) for option in (p.options if isinstance(p, Choice) else ())),
+                (p.name, Mention((p.name,))),
+                *((option, Mention((p.name,), option)) for option in (p.options if isinstance(p, Choice) else ())),
             ]:
                 for word in tokenise(name):
                     if singles[word] == 1 and self._is_free(word):
@@ -151,7 +182,7 @@ class StyleGrammar:
         for name, found in words.items():
             for word in found:
                 if counts[word] == 1:
-                    self._add(word, Mention(name))
+                    self._add(word, Mention((name,)))
 
     @staticmethod
     def _is_free(word: str) -> bool:
@@ -160,25 +191,35 @@ class StyleGrammar:
         return word.isalpha() and len(word) > 1 and not any(word in table for table in taken)
 
     def _mention(self, meaning: str) -> Mention:
-        name, _, value = meaning.partition("=")
-        parameter = self.parameters.get(name)
-        if parameter is None:
-            raise ValueError(f"the vocabulary has words for {name!r}: expected one of {list(self.parameters)}")
+        signed, sign, value = read_meaning(meaning)
+        unknown = [name for name in signed if name not in self.parameters]
+        if unknown or not signed:
+            given = " ".join(unknown or signed)
+            raise ValueError(f"the vocabulary has words for {given!r}: expected one of {list(self.parameters)}")
+        declared = [self.parameters[name] for name in signed]
         if not value:
-            return Mention(name)
-        if isinstance(parameter, Choice):
-            if value not in parameter.options:
-                raise ValueError(f"the vocabulary has words for {meaning!r}: options are {list(parameter.options)}")
-            return Mention(name, value)
+            return Mention(signed, sign=sign)
+        for p in declared:
+            if isinstance(p, Choice) and value not in p.options:
+                raise ValueError(f"the vocabulary has words for {meaning!r}: options are {list(p.options)}")
+        p = declared[0]
+        if isinstance(p, Choice):
+            return Mention(signed, value)
         if value in _ENDS:
-            return Mention(name, parameter.low + _ENDS[value] * (parameter.high - parameter.low))
-        return Mention(name, float(value))
+            return Mention(signed, p.low + _ENDS[value] * (p.high - p.low))
+        return Mention(signed, float(value))
+
+    def _working(self, phrases: Sequence[str]) -> tuple[str, ...]:
+        """The first few phrases that are understood."""
+        self.examples: tuple[str, ...] = ()
+        now = {name: cast(Value, parameter.default) for name, parameter in self.parameters.items()}
+        return tuple(phrase for phrase in phrases if not self.read(phrase, now).failed)[:_EXAMPLES]
 
     # -- meaning ---------------------------------------------------------------------------------------------------
 
     def _interpret(self, segment: Segment, reading: _Reading) -> None:
-        for mention in segment.mentions:  # "the warrior bow": one word names it, the other describes it
-            segment.unknown = [word for word in segment.unknown if stem(word) not in self._context[mention.name]]
+        for name in segment.names:  # "the warrior bow": one word names it, the other describes it
+            segment.unknown = [word for word in segment.unknown if stem(word) not in self._context[name]]
         if segment.negated and segment.unknown:  # what is denied is not known
             reading.failed.append(f"'{segment.text}' (unknown: {', '.join(segment.unknown)})")
             return
@@ -186,24 +227,37 @@ class StyleGrammar:
         if values:
             self._take_values(segment, values, reading)
             return
-        name, problem = self._target(segment, reading)
-        if name is None:
+        names, problem = self._target(segment, reading)
+        if not names:
             reading.failed.append(f"'{segment.text}'{problem}")
             return
-        parameter = self.parameters[name]
+        parameter = self.parameters[names[0]]
         if isinstance(parameter, Choice):
-            if segment.keep or segment.default:
-                self._change(reading, name, cast(Value, parameter.default) if segment.default else reading.values[name])
-            else:
-                unknown = f"unknown: {', '.join(segment.unknown)}; " if segment.unknown else ""
-                reading.failed.append(f"'{segment.text}' ({unknown}{_words(name)} can be {_listed(parameter.options)})")
+            self._choose(parameter, segment, reading)
             return
-        value = amount(parameter, segment, float(reading.values[name]), reading.last)
-        if isinstance(value, str):
-            reading.failed.append(f"'{segment.text}' ({value})")
+        numeric = [p for p in map(self.parameters.__getitem__, names) if not isinstance(p, Choice)]
+        asked = [
+            amount(p, segment, float(reading.values[p.name]), reading.last, p.name in self._spent) for p in numeric
+        ]
+        problems = [value for value in asked if isinstance(value, str)]
+        if problems:
+            reading.failed.append(f"'{segment.text}' ({problems[0]})")
             return
         self._note_unknown(segment, reading)
-        self._change(reading, name, value)
+        explained = any(mention.sign for mention in segment.mentions) or not self._spent.isdisjoint(names)
+        for p, value in zip(numeric, asked, strict=True):
+            self._change(reading, p.name, value, f" ({p.help})" if explained and p.help else "")
+        if reading.last is not None and reading.last[0][0] in names:
+            reading.last = (names, reading.last[1])
+
+    def _choose(self, parameter: Choice, segment: Segment, reading: _Reading) -> None:
+        """A choice without an option that was named."""
+        name = parameter.name
+        if segment.keep or segment.default:
+            self._change(reading, name, cast(Value, parameter.default) if segment.default else reading.values[name])
+            return
+        unknown = f"unknown: {', '.join(segment.unknown)}; " if segment.unknown else ""
+        reading.failed.append(f"'{segment.text}' ({unknown}{_words(name)} can be {_listed(parameter.options)})")
 
     def _take_values(self, segment: Segment, values: list[Mention], reading: _Reading) -> None:
         """Options of choices, and values that the vocabulary gives a name."""
@@ -211,39 +265,48 @@ class StyleGrammar:
             assert mention.value is not None
             if not segment.negated:
                 self._note_unknown(segment, reading)
-                self._change(reading, mention.name, mention.value)
-                continue
-            parameter = self.parameters[mention.name]
-            others = [o for o in parameter.options if o != mention.value] if isinstance(parameter, Choice) else []
-            if isinstance(parameter, Choice) and reading.values[mention.name] != mention.value:
-                reading.said.append(f"{_words(mention.name)} stays {_shown(parameter, reading.values[mention.name])}")
-            elif len(others) == 1:
-                self._change(reading, mention.name, others[0])
-            else:
-                instead = f"say what instead: {_listed(others)}" if others else "say how much instead"
-                reading.excluded[mention.name] = f"'{segment.text}' ({instead})"
+            for name in mention.names:
+                if segment.negated:
+                    self._deny(name, mention.value, segment, reading)
+                else:
+                    self._change(reading, name, mention.value)
 
-    def _target(self, segment: Segment, reading: _Reading) -> tuple[str | None, str]:
-        """The parameter that a segment is about, or why there is none."""
+    def _deny(self, name: str, value: Value, segment: Segment, reading: _Reading) -> None:
+        """Any value but this one."""
+        parameter = self.parameters[name]
+        others = [option for option in parameter.options if option != value] if isinstance(parameter, Choice) else []
+        if isinstance(parameter, Choice) and reading.values[name] != value:
+            reading.said.append(f"{_words(name)} stays {_shown(parameter, reading.values[name])}")
+        elif isinstance(parameter, Weight) and value == 0.0:
+            self._change(reading, name, parameter.high)  # "do not waste fuel"
+        elif len(others) == 1:
+            self._change(reading, name, others[0])
+        else:
+            instead = f"say what instead: {_listed(others)}" if others else "say how much instead"
+            reading.excluded[name] = f"'{segment.text}' ({instead})"
+
+    def _target(self, segment: Segment, reading: _Reading) -> tuple[tuple[str, ...], str]:
+        """The parameters that a segment is about, or why there is none."""
         if segment.mentions:
-            return segment.mentions[0].name, ""
+            return segment.names, ""
         if segment.unknown:
-            return None, f" (unknown: {', '.join(segment.unknown)})"
+            return (), f" (unknown: {', '.join(segment.unknown)})"
         if not segment.has_head:
-            return None, ""
+            return (), ""
         dimension = segment.dimension
         numeric = [n for n, p in self.parameters.items() if not isinstance(p, Choice)]
         if dimension:
             fitting = [n for n in numeric if dimension_of(self.parameters[n]) == dimension]
             if not fitting:
-                return None, f" (nothing here has a {dimension})"
+                return (), f" (nothing here has a {dimension})"
         else:
             fitting = [n for n in numeric if dimension_of(self.parameters[n]) != "angle"]
-        if reading.last is not None and (reading.last[0] in fitting or not dimension):
+        if reading.last is not None and (reading.last[0][0] in fitting or not dimension):
             return reading.last[0], ""
-        if len(fitting) == 1:
-            return fitting[0], ""
-        return None, f" (of what: {_listed(fitting)}?)"
+        together = any(mention.names == tuple(fitting) for mention in self.lexicon.values())
+        if len(fitting) == 1 or together:
+            return tuple(fitting), ""
+        return (), f" (of what: {_listed(fitting)}?)"
 
     def _reset(self, reading: _Reading) -> None:
         defaults = {name: cast(Value, parameter.default) for name, parameter in self.parameters.items()}
@@ -255,7 +318,7 @@ class StyleGrammar:
 
     # -- echo ------------------------------------------------------------------------------------------------------
 
-    def _change(self, reading: _Reading, name: str, value: Value) -> None:
+    def _change(self, reading: _Reading, name: str, value: Value, note: str = "") -> None:
         parameter, before = self.parameters[name], reading.values[name]
         if isinstance(value, float) and isinstance(before, float):
             value = float(f"{value:.6g}")
@@ -264,7 +327,7 @@ class StyleGrammar:
                 ends = not parameter.low < value < parameter.high
                 reading.said.append(f"{_words(name)} stays {_shown(parameter, before)}" + (f", {at}" if ends else ""))
                 return
-            reading.last = (name, 1.0 if value > before else -1.0)
+            reading.last = ((name,), 1.0 if value > before else -1.0)
             value = wrapped(parameter, value)
         if value == before:
             reading.said.append(f"{_words(name)} stays {_shown(parameter, value)}")
@@ -272,13 +335,20 @@ class StyleGrammar:
         was = readable_number(before) if isinstance(before, float) else _shown(parameter, before)
         outside = isinstance(before, float) and not parameter.low <= float(value) <= parameter.high
         trained = f", outside the trained range {parameter.low:g} to {parameter.high:g}" if outside else ""
-        reading.said.append(f"{_words(name)} {was} → {_shown(parameter, value)}{trained}")
+        reading.said.append(f"{_words(name)} {was} → {_shown(parameter, value)}{note}{trained}")
         reading.values[name] = reading.changes[name] = value
 
     @staticmethod
     def _note_unknown(segment: Segment, reading: _Reading) -> None:
         if segment.unknown:
             reading.failed.append(f"{', '.join(repr(word) for word in segment.unknown)} in '{segment.text}'")
+
+
+def read_meaning(meaning: str) -> tuple[tuple[str, ...], int, str]:
+    """Names, sign and value of a meaning of the vocabulary, such as "-longitudinal -lateral" or "pose=arms_up"."""
+    names, _, value = meaning.partition("=")
+    signs = {_SIGNS.get(name[0], 0) for name in names.split()}
+    return tuple(name.lstrip("+-") for name in names.split()), signs.pop() if signs else 0, value
 
 
 def _words(name: str) -> str:

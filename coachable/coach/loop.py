@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import queue
 import threading
 import time
@@ -13,6 +14,7 @@ from coachable.coach.session import CoachSession
 
 _LATE = 0.25  # [s], a delay beyond this is not made up for
 _IDLE = 0.05  # [s], between looks at the queue while paused
+_WAITING = 256  # changes, beyond which further ones are refused
 
 
 class LiveLoop:
@@ -28,7 +30,7 @@ class LiveLoop:
         pause_at_end: how long an ended episode stays on view before the next begins [s].
 
     Attributes:
-        speed: simulated seconds per second.
+        speed: simulated seconds per second, a finite number above 0.
         paused: no steps except single ones.
         problem: text of the last exception, empty if there was none since the last change.
     """
@@ -37,13 +39,29 @@ class LiveLoop:
         self, session: CoachSession, on_step: Callable[[], None] = lambda: None, pause_at_end: float = 1.0
     ) -> None:
         self.session, self.on_step, self.pause_at_end = session, on_step, pause_at_end
-        self.speed = 1.0
+        self._speed = 1.0
         self.paused = False
         self.problem = ""
-        self._changes: queue.SimpleQueue[Callable[[CoachSession], Any]] = queue.SimpleQueue()
+        self._changes: queue.Queue[Callable[[CoachSession], Any]] = queue.Queue(_WAITING)
         self._stopping = threading.Event()
+        self._stale = threading.Event()
         self._thread = threading.Thread(target=self._run, name="coaching", daemon=True)
         self._steps: deque[float] = deque(maxlen=max(2, round(1.0 / session.domain.control_step)))
+
+    @property
+    def speed(self) -> float:
+        """See above.
+
+        Raises:
+            ValueError: if it is set to anything else.
+        """
+        return self._speed
+
+    @speed.setter
+    def speed(self, speed: float) -> None:
+        if not 0.0 < speed < math.inf:
+            raise ValueError(f"speed = {speed}: expected a finite number above 0")
+        self._speed = speed
 
     def start(self) -> None:
         """Begins to step."""
@@ -56,8 +74,26 @@ class LiveLoop:
             self._thread.join()
 
     def submit(self, change: Callable[[CoachSession], Any]) -> None:
-        """Has something done to the session before its next step; returns at once."""
-        self._changes.put(change)
+        """Has something done to the session before its next step; returns at once.
+
+        What exceeds the steps that the session can take meanwhile is left out: see `problem`.
+        """
+        try:
+            self._changes.put_nowait(change)
+        except queue.Full:
+            self.problem = "more was asked for than can be carried out; some of it was left out"
+
+    def refuse(self, reason: str) -> None:
+        """Says why something that was asked for is not carried out, as if it had been tried."""
+
+        def complain(_session: CoachSession) -> None:
+            raise ValueError(reason)
+
+        self.submit(complain)
+
+    def show(self) -> None:
+        """Has what is shown brought up to date, even while paused; returns at once."""
+        self._stale.set()
 
     def single_step(self) -> None:
         """Pauses, and takes one step."""
@@ -75,7 +111,8 @@ class LiveLoop:
     def _run(self) -> None:
         due = time.perf_counter()
         while not self._stopping.is_set():
-            changed = self._drain()
+            changed = self._drain() or self._stale.is_set()
+            self._stale.clear()
             now = time.perf_counter()
             if self.paused:
                 due = now
@@ -98,12 +135,11 @@ class LiveLoop:
         return due if due > now - _LATE else now
 
     def _drain(self) -> bool:
-        changed = False
-        while not self._changes.empty():
+        waiting = self._changes.qsize()  # what comes meanwhile waits for the next step
+        for _ in range(waiting):
             self.problem = ""
             self._attempt(self._changes.get_nowait(), pause=False)
-            changed = True
-        return changed
+        return waiting > 0
 
     def _attempt(self, change: Callable[[CoachSession], Any], pause: bool = True) -> None:
         """A refused change leaves the agent acting, a failed step pauses it."""

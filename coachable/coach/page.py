@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import tempfile
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from coachable.coach.film import film
-from coachable.coach.grammar import readable_number
+from coachable.coach.film import FilmStudio
+from coachable.coach.grammar import Understanding, readable_number
 from coachable.coach.loop import LiveLoop
 from coachable.coach.plan import read_plan
 from coachable.coach.recording import Recording
@@ -26,6 +26,10 @@ if TYPE_CHECKING:
 _FRAMES_PER_SECOND = 30.0
 _REPORTS_PER_SECOND = 5.0
 _FILM_SECONDS = 10.0
+_SPEEDS = (0.1, 4.0)
+_LONGEST_PHRASE, _LONGEST_PLAN, _LONGEST_NAME = 200, 2000, 40  # characters
+_PRESETS = 50
+_T = TypeVar("_T")
 _PAUSE, _RESUME, _STEP, _RESET = "Pause", "Resume", "Step", "Reset"
 
 
@@ -48,6 +52,8 @@ class CoachPage:
         self.server, self.session = server, session
         self.loop = LiveLoop(session, self._on_step)
         self._view: View | None = None
+        self._reading = threading.Lock()
+        self._studio = FilmStudio(session, lambda note: write(self.film_note, escaped(note)))
         self._frame_due = self._report_due = 0.0
         self.widgets: dict[str, ParameterWidget] = {}
         self.measured: dict[str, MeasuredText] = {}
@@ -69,6 +75,7 @@ class CoachPage:
     def stop(self) -> None:
         """Ends the loop; the session stays open."""
         self.loop.stop()
+        self._studio.close()
         if self._view is not None:
             self._view.close()
 
@@ -85,36 +92,63 @@ class CoachPage:
                 for control in self.session.coaching.controls:
                     name = control.parameter.name
                     self._add_widget(control.parameter, self.session.controls[name], self._steer)
-        with self.server.gui.add_folder("Requested and measured"):
-            self.chart = Chart(self.server, self.session.space)
+        folder = self.server.gui.add_folder("Requested and measured")
+        self.chart = Chart(self.server, folder, self.session.space, self.loop.show)
 
     def _add_widget(self, parameter: Parameter, value: float | str, request: Callable[[ParameterWidget], None]) -> None:
         name = parameter.name
         self.widgets[name] = ParameterWidget(self.server, parameter, value, lambda: request(self.widgets[name]))
 
     def _set(self, widget: ParameterWidget) -> None:
-        self.loop.submit(lambda session: session.set(**widget.take()))
+        self.loop.submit(lambda session: self._carry_out(session, widget))
+
+    def _carry_out(self, session: CoachSession, widget: ParameterWidget) -> None:
+        self.chart.follow(widget.parameter.name)
+        session.set(**widget.take())
 
     def _steer(self, widget: ParameterWidget) -> None:
         self.loop.submit(lambda session: session.steer(**widget.take()))  # pyright: ignore[reportArgumentType]
 
     def _add_phrase_box(self) -> None:
-        gui = self.server.gui
+        gui, examples = self.server.gui, self.session.grammar.examples
         with gui.add_form("In words") as form:
-            self.phrase = gui.add_text("phrase", "", hint="such as: shorter steps, arms up; a bit more; 0.4 m")
+            self.phrase = gui.add_text("phrase", "", hint=f"such as: {'; '.join(examples)}; a bit more")
             self.say = gui.add_button("Apply")
             self.answer = gui.add_markdown("")
         self.say.on_click(lambda _: form.submit())
+        form.on_submit(lambda _: self._aside("phrase", self.phrase.value, _LONGEST_PHRASE, self._understand, self._say))
 
-        @form.on_submit
-        def _(_: Any) -> None:
-            phrase = self.phrase.value
-            self.loop.submit(lambda session: write(self.answer, _escaped(str(session.say(phrase)))))
+    def _understand(self, phrase: str) -> Understanding:
+        return self.session.understand(phrase)
+
+    def _say(self, session: CoachSession, understood: Understanding) -> None:
+        session.follow(understood)
+        write(self.answer, escaped(str(understood)))
+        asked = next((name for name in understood.changes if name in session.space), None)
+        if asked is not None:
+            self.chart.follow(asked)
+
+    def _aside(
+        self, what: str, text: str, longest: int, read: Callable[[str], _T], then: Callable[[CoachSession, _T], None]
+    ) -> None:
+        """Reads what was typed in viser's thread, so that the agent does not wait; the loop gets what it means."""
+        if len(text) > longest:
+            self.loop.refuse(f"the {what} has {len(text):,} characters: at most {longest:,} are read")
+        elif not self._reading.acquire(blocking=False):
+            self.loop.refuse("what was typed before is still being read")
+        else:
+            try:
+                meant = read(text)
+                self.loop.submit(lambda session: then(session, meant))
+            except Exception as error:  # this thread has nobody else to tell
+                self.loop.refuse(str(error))
+            finally:
+                self._reading.release()
 
     def _add_run(self) -> None:
         gui = self.server.gui
         self.run = gui.add_button_group("run", (_PAUSE, _STEP, _RESET))
-        self.speed = gui.add_slider("speed", 0.1, 4.0, 0.1, 1.0, hint="simulated seconds per second; 1 is real time")
+        self.speed = gui.add_slider("speed", *_SPEEDS, 0.1, 1.0, hint="simulated seconds per second; 1 is real time")
         self.run.on_click(lambda _: self._press(self.run.value))
         self.speed.on_update(lambda _: self._change_speed())
 
@@ -123,13 +157,17 @@ class CoachPage:
             self.loop.single_step()
         elif button == _RESET:
             self.loop.submit(lambda session: session.reset())
-        else:
+        elif button in (_PAUSE, _RESUME):
             self.loop.paused = button == _PAUSE
             self.loop.submit(lambda _: None)  # shows the state
 
     def _change_speed(self) -> None:
-        if self.speed.value > 0:  # false for NaN
+        low, high = _SPEEDS
+        if low <= self.speed.value <= high:  # false for NaN
             self.loop.speed = float(self.speed.value)
+        else:
+            self.loop.refuse(f"speed = {self.speed.value}: expected a number from {low:g} to {high:g}")
+            self.speed.value = self.loop.speed
 
     def _add_presets(self) -> None:
         gui = self.server.gui
@@ -139,7 +177,8 @@ class CoachPage:
             self.preset_name = gui.add_text("new name", "")
             keep = gui.add_button("Save style as preset")
         with gui.add_folder("Schedule"):
-            gui.add_markdown("One `SECONDS: PHRASE` or `SECONDS: PRESET` per line, such as `3: arms up`.")
+            example = next(iter(self.session.grammar.examples), "default")
+            gui.add_markdown(f"One `SECONDS: PHRASE` or `SECONDS: PRESET` per line, such as `3: {example}`.")
             self.plan = gui.add_text("plan", "", multiline=True)
             self.run_plan = gui.add_button("Run schedule")
             cancel = gui.add_button("Stop schedule")
@@ -147,14 +186,21 @@ class CoachPage:
         apply.on_click(lambda _: self.loop.submit(lambda session: session.apply(self.preset.value)))
         keep.on_click(lambda _: self.loop.submit(self._save_preset))
         self.run_plan.on_click(
-            lambda _: self.loop.submit(lambda session: session.schedule(read_plan(self.plan.value, session)))
+            lambda _: self._aside("plan", self.plan.value, _LONGEST_PLAN, self._read_plan, CoachSession.schedule)
         )
         cancel.on_click(lambda _: self.loop.submit(lambda session: session.cancel()))
+
+    def _read_plan(self, text: str) -> dict[float, dict[str, Any]]:
+        return read_plan(text, self.session)
 
     def _save_preset(self, session: CoachSession) -> None:
         name = self.preset_name.value.strip()
         if not name:
             raise ValueError("give the preset a name first")
+        if len(name) > _LONGEST_NAME or len(session.presets) >= _PRESETS:
+            raise ValueError(
+                f"a preset's name has at most {_LONGEST_NAME} characters, and there are at most {_PRESETS}"
+            )
         session.presets[name] = session.style
         self.preset.options = tuple(session.presets)
         self.preset.value = name
@@ -177,35 +223,25 @@ class CoachPage:
 
         self.hold.on_update(lambda _: self.loop.submit(lambda session: setattr(session, "hold", self.hold.value)))
         reseed.on_click(lambda _: self.loop.submit(lambda session: session.reset(int(self.seed.value))))
-        save.on_click(lambda _: self.loop.submit(self._send_recording))
+        save.on_click(lambda event: self.loop.submit(lambda session: self._send_recording(session, event.client)))
         again.on_click(lambda _: self.loop.submit(lambda session: session.replay(session.recording())))
         load.on_upload(lambda _: self.loop.submit(lambda session: session.replay(_read(load.value.content))))
         stop.on_click(lambda _: self.loop.submit(lambda session: session.cancel()))
-        shoot.on_click(lambda _: self.loop.submit(self._shoot))
+        shoot.on_click(lambda event: self.loop.submit(lambda session: self._shoot(session, event.client)))
 
-    def _send_recording(self, session: CoachSession) -> None:
-        self.server.send_file_download(f"{session.domain.name}.json", session.recording().to_json().encode())
-
-    def _shoot(self, session: CoachSession) -> None:
+    def _send_recording(self, session: CoachSession, client: viser.ClientHandle | None) -> None:
+        """To the browser that asks for it, without the path by which this machine knows the agent."""
         recording = session.recording()
-        threading.Thread(target=self._film, args=(recording,), name="filming", daemon=True).start()
+        recording = replace(recording, source=Path(recording.source).name)
+        (client or self.server).send_file_download(f"{recording.domain}.json", recording.to_json().encode())
 
-    def _film(self, recording: Recording) -> None:
-        try:
-            with tempfile.TemporaryDirectory() as folder:
-                file = film(
-                    recording,
-                    self.session,
-                    Path(folder) / "film.mp4",
-                    last=_FILM_SECONDS,
-                    on_progress=lambda share: write(
-                        self.film_note, f"drawing: {share:.0%}, the agent goes on meanwhile"
-                    ),
-                )
-                self.server.send_file_download(f"{recording.domain}.mp4", file.read_bytes())
-            self.film_note.content = "drawn"
-        except Exception as error:  # this thread has nobody else to tell
-            self.film_note.content = f"**Problem:** {_escaped(str(error))}"
+    def _shoot(self, session: CoachSession, client: viser.ClientHandle | None) -> None:
+        name = f"{session.domain.name}.mp4"
+        self._studio.shoot(
+            session.recording(),
+            _FILM_SECONDS,
+            lambda content: (client or self.server).send_file_download(name, content),
+        )
 
     # -- read-outs, in the loop's thread ---------------------------------------------------------------------------
 
@@ -229,22 +265,21 @@ class CoachPage:
             buttons = (_RESUME if self.loop.paused else _PAUSE, _STEP, _RESET)
             if self.run.options != buttons:
                 self.run.options = buttons
-            groups = measures_by_parameter(self.session.space, report.measured)
+            groups = measures_by_parameter(self.session.space, [*report.measured, *report.unmeasured])
             for name, text in self.measured.items():
                 text.update(report, groups[name])
-            others = ", ".join(f"{m.replace('_', ' ')} **{readable_number(report.measured[m])}**" for m in groups[""])
+            rest = [m for m in groups[""] if m in report.measured]
+            others = ", ".join(f"{m.replace('_', ' ')} **{readable_number(report.measured[m])}**" for m in rest)
             write(self.others, f"also measured: {others}" if others else "")
             self.chart.add(self.session.step_count * self.session.domain.control_step, report)
 
     def _status(self, report: StyleReport) -> str:
         if self.loop.problem:
-            first = f"**Problem:** {_escaped(self.loop.problem)}"
+            first = f"**Problem:** {escaped(self.loop.problem)}"
         elif report.ended is not None:
             first = f"**The agent {report.ended}** after {report.episode_time:.1f} s; a new episode begins."
-        elif report.complied_after is not None:
-            first = f"**Request met**, after {report.complied_after:.1f} s."
         else:
-            first = f"Request not yet met, after {report.since_request:.1f} s."
+            first = verdict(report)
         running = "between episodes" if report.ended is not None else f"{self.loop.factor:.2f} of real time"
         state = "**paused**" if self.loop.paused else running
         if self.session.replaying:
@@ -262,6 +297,21 @@ def _read(content: bytes) -> Recording:
         raise ValueError("this is no recording: expected JSON written by a coaching session") from None
 
 
-def _escaped(text: str) -> str:
+def verdict(report: StyleReport) -> str:
+    """Whether the agent does what was asked, as far as that can be told from what was measured."""
+    if not report.asks:
+        return "Nothing is asked for: every weight is 0."
+    if report.complied_after is None:
+        if report.complying is None:
+            return f"Request not judged yet, after {report.since_request:.1f} s: that takes {report.needs}."
+        return f"Request not yet met, after {report.since_request:.1f} s."
+    first = f"first after {report.complied_after:.1f} s"
+    if report.complying is None:
+        return f"Request met {first}; nothing to judge in the last {report.seconds:.1f} s."
+    now = f"{report.complying:.0%} of what was judged in the last {report.seconds:.1f} s"
+    return f"**Request met**, {first}: {now}." if report.complying >= 0.5 else f"Request met {first}, but only {now}."
+
+
+def escaped(text: str) -> str:
     """Without what Markdown would take for markup."""
     return "".join(f"\\{c}" if c in "\\`*_{}[]<>#|~" else c for c in text)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import zlib
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -58,7 +60,7 @@ class Recording:
         try:
             values = json.loads(text)
             version = values.pop("version")
-        except (ValueError, AttributeError, KeyError, TypeError):
+        except (ValueError, AttributeError, KeyError, TypeError, RecursionError):
             raise ValueError("this is no recording: expected JSON written by a coaching session") from None
         if version != SCHEMA_VERSION:
             raise ValueError(f"recording has schema version {version!r}: this release reads version {SCHEMA_VERSION}")
@@ -66,7 +68,10 @@ class Recording:
             recording = cls(**values)
         except TypeError as error:
             raise ValueError(f"this recording is incomplete or has unknown entries: {error}") from None
-        recording.checks = [(int(step), int(checksum)) for step, checksum in recording.checks]
+        wrong = next((name for name, is_right in _SCHEMA.items() if not is_right(getattr(recording, name))), None)
+        if wrong is not None:
+            raise ValueError(f"this recording's {wrong!r} is not what a coaching session writes")
+        recording.checks = [(step, checksum) for step, checksum in recording.checks]
         return recording
 
     def save(self, file: Path | str) -> Path:
@@ -80,6 +85,58 @@ class Recording:
     def load(cls, file: Path | str) -> Recording:
         """Reads a JSON file; see `from_json`."""
         return cls.from_json(Path(file).read_text(encoding="utf-8"))
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def _is_style(value: Any) -> bool:
+    return isinstance(value, dict) and all(isinstance(v, str) or _is_number(v) for v in value.values())
+
+
+def _is_steering(value: Any) -> bool:
+    return isinstance(value, dict) and all(map(_is_number, value.values()))
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_event(value: Any) -> bool:
+    return isinstance(value, dict) and all(key in _EVENT and _EVENT[key](v) for key, v in value.items())
+
+
+def _are_events(value: Any) -> bool:
+    if not isinstance(value, list) or not all(_is_event(event) and "step" in event for event in value):
+        return False
+    steps = [event["step"] for event in value]
+    return steps == sorted(steps)
+
+
+def _are_checks(value: Any) -> bool:
+    return isinstance(value, list) and all(
+        isinstance(check, list) and len(check) == 2 and all(map(_is_count, check)) for check in value
+    )
+
+
+_EVENT: dict[str, Callable[[Any], bool]] = {
+    "step": _is_count,
+    "style": _is_style,
+    "controls": _is_steering,
+    "reset": lambda value: value is True,
+}
+_SCHEMA: dict[str, Callable[[Any], bool]] = {
+    "domain": lambda value: isinstance(value, str),
+    "source": lambda value: isinstance(value, str),
+    "seed": _is_count,
+    "style": _is_style,
+    "controls": _is_steering,
+    "endless": lambda value: isinstance(value, bool),
+    "events": _are_events,
+    "steps": _is_count,
+    "checks": _are_checks,
+}
 
 
 def checksum(observation: Tensor) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -26,10 +27,18 @@ from coachable.coach.vocabulary import (
 
 @dataclass(frozen=True)
 class Mention:
-    """A parameter that a phrase names, perhaps with a value: an option or a number."""
+    """What a word or phrase of the lexicon names.
 
-    name: str
+    Attributes:
+        names: parameters; several for a word such as "room", which is about the gaps on all sides.
+        value: an option or a number, if the word stands for one.
+        sign: +1 if the word asks for more of the parameters ("careful" for gaps), -1 if for less ("aggressive"), 0 if
+            it only names them ("gap").
+    """
+
+    names: tuple[str, ...]
     value: float | str | None = None
+    sign: int = 0
 
 
 @dataclass
@@ -62,7 +71,6 @@ class Segment:
     default: bool = False
     keep: bool = False
     repeated: bool = False
-    too: bool = False
     absolute: bool = False
     signed: bool = False
 
@@ -70,6 +78,22 @@ class Segment:
     def text(self) -> str:
         """What was said."""
         return " ".join(self.words)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters that all mentions have in common: "the bow of the hunter" is one bow."""
+        first, *others = (mention.names for mention in self.mentions) if self.mentions else ((),)
+        return tuple(name for name in first if all(name in names for names in others))
+
+    @property
+    def sense(self) -> int:
+        """+1 or -1 if the words ask for more or less of the parameters; 0 if they only name them."""
+        return math.prod(signs) if (signs := [m.sign for m in self.mentions if m.sign]) else 0
+
+    @property
+    def too(self) -> bool:
+        """Whether something is too much; at the end of a request "too" means "also"."""
+        return "too" in self.words[:-1]
 
     @property
     def has_head(self) -> bool:
@@ -93,21 +117,23 @@ class Segment:
 def split(tokens: Sequence[str], lexicon: Mapping[tuple[str, ...], Mention]) -> list[Segment]:
     """Cuts a phrase at punctuation, conjunctions, and where a request is complete and another begins.
 
+    The work grows in proportion to the number of tokens.
+
     Args:
         tokens: from `tokenise`.
         lexicon: what stemmed words name.
     """
-    longest = max((len(words) for words in lexicon), default=1)
+    sizes, named_ahead = _look_up(tokens, lexicon)
     stems = [stem(token) for token in tokens]
     found, segment, i = [], Segment(), 0
     while i < len(tokens):
-        size = next((n for n in range(longest, 0, -1) if tuple(stems[i : i + n]) in lexicon), 0)
-        mention = lexicon.get(tuple(stems[i : i + size]))
+        size = sizes[i]
+        mention = lexicon[tuple(stems[i : i + size])] if size else None
         if mention is None and tokens[i] in SEPARATORS:
             found.append(segment)
             segment, i = Segment(), i + 1
             continue
-        if _begins_another(segment, tokens[i:], mention, named_ahead=_named_ahead(stems[i:], lexicon)):
+        if _begins_another(segment, tokens[i : i + 2], mention, named_ahead[i]):
             found.append(segment)
             segment = Segment()
         if mention is not None:
@@ -121,19 +147,31 @@ def split(tokens: Sequence[str], lexicon: Mapping[tuple[str, ...], Mention]) -> 
     return _tidy(found)
 
 
-def _named_ahead(stems: Sequence[str], lexicon: Mapping[tuple[str, ...], Mention]) -> bool:
-    """Whether a parameter is named before the next separator."""
-    end = next((n for n, word in enumerate(stems) if word in SEPARATORS), len(stems))
-    return any(tuple(stems[i:j]) in lexicon for i in range(end) for j in range(i + 1, end + 1))
+def _look_up(tokens: Sequence[str], lexicon: Mapping[tuple[str, ...], Mention]) -> tuple[list[int], list[bool]]:
+    """Finds what the lexicon names at each token.
+
+    Returns:
+        The number of tokens of the longest entry that begins there, 0 if none does; and whether an entry lies between
+        there and the next separator.
+    """
+    longest = max((len(words) for words in lexicon), default=1)
+    stems = [stem(token) for token in tokens]
+    sizes, named_ahead = [0] * len(tokens), [False] * len(tokens)
+    ahead, clear = False, 0  # `clear` counts the tokens before the next separator
+    for i in reversed(range(len(tokens))):
+        fitting = [n for n in range(min(longest, len(tokens) - i), 0, -1) if tuple(stems[i : i + n]) in lexicon]
+        sizes[i] = fitting[0] if fitting else 0
+        clear = 0 if stems[i] in SEPARATORS else clear + 1
+        ahead = clear > 0 and (ahead or any(n <= clear for n in fitting))
+        named_ahead[i] = ahead
+    return sizes, named_ahead
 
 
 def _begins_another(segment: Segment, rest: Sequence[str], mention: Mention | None, named_ahead: bool) -> bool:
     if mention is not None:
-        named = segment.mentions[-1].name if segment.mentions else None
-        if mention.value is not None:
-            # "arms up": the option completes what the noun began
-            return segment.complete or (named is not None and named != mention.name)
-        return named is not None and named != mention.name
+        other = bool(segment.mentions) and not set(segment.names) & set(mention.names)
+        # "arms up": the option completes what the noun began
+        return other or (mention.value is not None and segment.complete)
     if not segment.complete:
         return False
     word = rest[0]
@@ -151,7 +189,9 @@ def _take(segment: Segment, tokens: Sequence[str], i: int) -> int:
     """Notes what a word means; returns how many tokens were used."""
     word = tokens[i]
     segment.words.append(word)
-    if word[-1].isdigit():
+    if word[-1].isdigit() and not math.isfinite(float(word)):
+        segment.unknown.append(word)
+    elif word[-1].isdigit():
         segment.signed = word.startswith("+")
         unit = stem(tokens[i + 1]) if i + 1 < len(tokens) else ""
         if unit in PERCENT or unit in UNITS:
@@ -193,7 +233,6 @@ def _take_modifier(segment: Segment, word: str) -> None:
     if word in ABSOLUTE:
         segment.absolute |= word != "by"
         known = True
-    segment.too |= word == "too"
     if not known:
         segment.unknown.append(word)
 

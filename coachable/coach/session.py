@@ -20,9 +20,9 @@ from coachable.coach.grammar import StyleGrammar, Understanding
 from coachable.coach.recording import Recording
 from coachable.coach.report import MeasuredWindow, StyleReport
 from coachable.coach.timeline import Timeline
-from coachable.domain import Domain, load_domain
-from coachable.styles import Choice, StyleSpace
-from coachable.training.weights import load_policy
+from coachable.domain import Domain
+from coachable.styles import Choice, StyleSpace, Weight
+from coachable.training.weights import domain_of, load_policy
 
 
 class CoachSession:
@@ -82,7 +82,9 @@ class CoachSession:
         self._controls = {control.parameter.name: control for control in self.coaching.controls}
         self._control_values = {name: cast(float, c.parameter.default) for name, c in self._controls.items()}
         self.grammar = StyleGrammar(
-            [*space.parameters, *(control.parameter for control in self.coaching.controls)], self.coaching.vocabulary
+            [*space.parameters, *(control.parameter for control in self.coaching.controls)],
+            self.coaching.vocabulary,
+            self.coaching.examples,
         )
         self._understood: Understanding | None = None
         self._recent = MeasuredWindow(domain.measures, round(window / domain.control_step))
@@ -102,7 +104,7 @@ class CoachSession:
             CheckpointError: if there is no such agent, or it is of another version.
         """
         agent = load_policy(source)
-        domain = load_domain(agent.metadata["domain"], agent.config)
+        domain = domain_of(agent)
         return cls(agent.actor, agent.space, domain, source=str(source), **settings)
 
     # -- requests --------------------------------------------------------------------------------------------------
@@ -147,9 +149,7 @@ class CoachSession:
         Raises:
             ValueError: for an unknown control or NaN.
         """
-        for name in values:
-            if name not in self._controls:
-                raise ValueError(f"no live control named {name!r}: {self.domain.name} has {list(self._controls)}")
+        self._check_controls(values)
         fitted = {name: self._controls[name].fit(float(value)) for name, value in values.items()}
         self._timeline.take_over()
         self._apply({"controls": fitted})
@@ -163,11 +163,23 @@ class CoachSession:
         Raises:
             ValueError: in strict mode, for a number outside the trained range.
         """
-        preset = next((name for name in self.presets if name.lower() == phrase.strip().lower()), None)
+        understood = self.understand(phrase)
+        self.follow(understood)
+        return understood
+
+    def understand(self, phrase: str) -> Understanding:
+        """What `say` takes a phrase to mean; asks for nothing yet, and may be called beside the thread that steps."""
+        preset = next((name for name in list(self.presets) if name.lower() == phrase.strip().lower()), None)
         if preset is not None:
-            self.apply(preset)
             return Understanding(phrase, dict(self.presets[preset]), (f"preset {preset}",), ())
-        understood = self.grammar.read(phrase, self.style | self.controls, self._understood)
+        return self.grammar.read(phrase, self.style | self.controls, self._understood)
+
+    def follow(self, understood: Understanding) -> None:
+        """Asks for what was understood.
+
+        Raises:
+            ValueError: in strict mode, for a number outside the trained range.
+        """
         style = {name: value for name, value in understood.changes.items() if name in self.space}
         controls = {name: float(value) for name, value in understood.changes.items() if name in self._controls}
         if style:
@@ -175,7 +187,6 @@ class CoachSession:
         if controls:
             self.steer(**controls)
         self._understood = understood
-        return understood
 
     def schedule(self, plan: Mapping[float, Mapping[str, float | str] | str]) -> None:
         """Asks for styles at given times from now on [s], each a style or a preset's name; replaces an earlier plan.
@@ -210,11 +221,16 @@ class CoachSession:
         """Starts a new episode; with a seed the session starts over, and with it the recording.
 
         Style and live controls stay; a plan is dropped.
+
+        Raises:
+            ValueError: if the seed is negative or has more than 63 bits.
         """
         if seed is None:
             self.cancel()
             self._apply({"reset": True})
             return
+        if not 0 <= seed < 2**63:
+            raise ValueError(f"seed = {seed}: expected a whole number from 0 to 2**63 - 1")
         self._timeline = Timeline(
             Recording(self.domain.name, self.source, seed, self.style, self.controls, self._episodes.endless)
         )
@@ -246,7 +262,7 @@ class CoachSession:
             self._begin_episode()
         transition = self._episodes.step(self.policy, self._theta)
         self._recent.add(transition)
-        if self._complied_at is None and self._recent.complies(self.step_count + 1 - self._steps_at_request):
+        if self._complied_at is None and self._recent.complies():
             self._complied_at = self.step_count + 1
         self._timeline.advance(self._episodes.observation)
         return transition
@@ -261,11 +277,17 @@ class CoachSession:
     # -- measuring -------------------------------------------------------------------------------------------------
 
     def report(self) -> StyleReport:
-        """Requested against measured style over the window, which begins anew with each episode."""
+        """Requested against measured style over the window, which begins anew with each request and episode."""
+        summary = self._recent.summary()
         return StyleReport(
             requested=self.style,
-            measured=self._recent.summary(),
+            measured={name: value for name, value in summary.items() if math.isfinite(value)},
+            unmeasured=tuple(name for name, value in summary.items() if not math.isfinite(value)),
+            seconds=len(self._recent) * self.domain.control_step,
             outside=dict(self._outside),
+            asks=any(not isinstance(p, Weight) or self.style[p.name] for p in self.space.parameters),
+            complying=self._recent.complying(),
+            needs=self._recent.needs,
             complied_after=None if self._complied_at is None else self._seconds(self._complied_at),
             since_request=self._seconds(self.step_count),
             episode=self._episodes.number,
@@ -311,12 +333,18 @@ class CoachSession:
         Any request, steering or reset in between takes over from the replay.
 
         Raises:
-            ValueError: if the recording belongs to another domain or style space.
+            ValueError: if the recording belongs to another domain or style space, or has a control that this one lacks;
+                the session then goes on as it was.
         """
         if recording.domain != self.domain.name:
             raise ValueError(f"the recording belongs to {recording.domain!r}, this session to {self.domain.name!r}")
-        self._theta, self._outside = self.space.make(strict=True, **recording.style), {}
-        self._control_values = {name: recording.controls.get(name, v) for name, v in self._control_values.items()}
+        theta = self.space.make(strict=True, **recording.style)
+        self._check_controls(recording.controls)
+        for event in recording.events:
+            self.space.make(strict=True, **(recording.style | event.get("style", {})))
+            self._check_controls(event.get("controls", {}))
+        self._theta, self._outside = theta, {}
+        self._control_values |= recording.controls
         self._episodes.endless = recording.endless
         self.reset(recording.seed)
         self._timeline.repeat(recording)
@@ -327,6 +355,12 @@ class CoachSession:
         return self._timeline.replayed is not None
 
     # -- inside ----------------------------------------------------------------------------------------------------
+
+    def _check_controls(self, values: Mapping[str, float]) -> None:
+        for name, value in values.items():
+            if name not in self._controls:
+                raise ValueError(f"no live control named {name!r}: {self.domain.name} has {list(self._controls)}")
+            self._controls[name].fit(float(value))
 
     def _apply(self, event: Mapping[str, Any]) -> None:
         """Carries out an event now, and records it."""
@@ -348,6 +382,7 @@ class CoachSession:
         changed = {name: value for name, value in self.style.items() if value != before[name]}
         if changed:
             self._steps_at_request, self._complied_at = self.step_count, None
+            self._recent.clear()
             self._timeline.note({"style": changed})
 
     def _begin_episode(self) -> None:

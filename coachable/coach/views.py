@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 import warnings
 from collections.abc import Callable
@@ -18,6 +19,8 @@ _PICTURES_PER_SECOND = 12.0
 _DRAWING_SHARE = 0.3  # of the loop's time, at most: the agent acts in the rest
 _PICTURE_SIZE = (800, 600)  # [px]
 _BORDER = 235  # grey
+_ASPECTS = (0.25, 4.0)  # of windows that pictures are fitted to
+_PHONE = 576  # [px]; in narrower windows viser's panel covers the lower right
 
 
 class View(Protocol):
@@ -54,6 +57,7 @@ class HumanoidView:
         server.scene.set_up_direction("+z")
         server.initial_camera.position = (2.0, -2.0, 1.3)
         server.initial_camera.look_at = (0.0, 0.0, 0.85)
+        server.on_client_connect(_above_the_panel)
         self._arrow: Any = None
         self._course: float | None = None
 
@@ -81,6 +85,16 @@ class HumanoidView:
         """See `View.close`."""
 
 
+def _above_the_panel(client: viser.ClientHandle) -> None:
+    """Shows the agent in the upper part of a narrow window, by a camera that is further away and points lower."""
+    camera = client.camera
+    if camera.image_width <= _PHONE:
+        with contextlib.suppress(ValueError):  # the browser told of a camera that cannot be
+            camera.up_direction = (0.0, 0.0, 1.0)
+            camera.position = (3.0, -3.0, 1.3)
+            camera.look_at = (0.0, 0.0, -0.9)
+
+
 class PictureView:
     """The domain's renderer as the background of the page, drawn only while somebody looks, slow ones less often."""
 
@@ -98,7 +112,9 @@ class PictureView:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # a browser has just gone away
             for client in clients.values():
-                client.scene.set_background_image(padded(picture, client.camera.aspect), format="jpeg", jpeg_quality=85)
+                camera = client.camera
+                fitted = padded(picture, camera.aspect, upper_left=camera.image_width <= _PHONE)
+                client.scene.set_background_image(fitted, format="jpeg", jpeg_quality=85)
         taken = time.perf_counter() - now
         self._due = now + max(1.0 / _PICTURES_PER_SECOND, taken / _DRAWING_SHARE)
 
@@ -110,16 +126,19 @@ class PictureView:
 _SCENES: dict[str, Callable[[viser.ViserServer, CoachSession], View]] = {"humanoid": HumanoidView}
 
 
-def padded(picture: np.ndarray, aspect: float) -> np.ndarray:
+def padded(picture: np.ndarray, aspect: float, upper_left: bool = False) -> np.ndarray:
     """A picture with borders, so that a window of that width per height does not distort it.
 
     Args:
         picture: (height, width, 3) uint8.
-        aspect: width per height of the window.
+        aspect: width per height of the window, as its browser tells; far beyond those of screens it is not followed.
+        upper_left: leave the borders below and on the right, otherwise the picture is in the middle.
     """
     height, width = picture.shape[:2]
+    aspect = min(max(aspect, _ASPECTS[0]), _ASPECTS[1]) if aspect > 0 else width / height
     across, down = max(0, round(height * aspect) - width), max(0, round(width / aspect) - height)
-    sides = ((down // 2, down - down // 2), (across // 2, across - across // 2), (0, 0))
+    before = (0, 0) if upper_left else (down // 2, across // 2)
+    sides = ((before[0], down - before[0]), (before[1], across - before[1]), (0, 0))
     return np.pad(picture, sides, constant_values=_BORDER)
 
 

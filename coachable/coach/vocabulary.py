@@ -92,7 +92,7 @@ FILLERS = _words(
     getting give set put have has having try walk walking walks move moving style than rather quite some any possible
     ok okay hey well thanks thank instead back exactly about roughly around by into or if when keep hold stay leave
     holding keeping bit lot lots touch tad one such kind sort how what which where when between during after before
-    over under per both each maybe"""
+    over under per both each maybe drive driving fight fighting"""
 )
 
 _ARTICLES = _words("the your my his her its their")  # "raise your arms" reads as "raise arms"

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     import viser
 
 _SLIDER_STEPS = 200
+_SPAN = 30.0  # [s] of simulated time that the chart shows
 _HISTORY = 150  # points of the chart
 _REQUESTED, _MEASURED = "#d62728", "#1f77b4"
 
@@ -51,9 +52,10 @@ class ParameterWidget:
 
     @property
     def asked(self) -> float | str:
-        """What the widget shows, as the session understands it."""
+        """What the widget shows, as the session understands it; a browser may have sent what is no option."""
         if isinstance(self.parameter, Choice):
-            return next(o for o in self.parameter.options if _words(o) == self.handle.value)
+            shown = str(self.handle.value)
+            return next((o for o in self.parameter.options if _words(o) == shown), shown)
         return float(self.handle.value)
 
     def take(self) -> dict[str, float | str]:
@@ -86,12 +88,21 @@ class MeasuredText:
         self.handle = server.gui.add_markdown(trained(parameter))
 
     def update(self, report: StyleReport, measures: list[str]) -> None:
-        """Shows the report's values of `measures`."""
-        shown = [f"{self._name(m)}**{readable_number(report.measured[m])}{self._unit(m)}**" for m in measures]
-        text = " · ".join(filter(None, [f"measured {', '.join(shown)}" if shown else "", trained(self.parameter)]))
-        outside = report.outside.get(self.parameter.name)
+        """Shows the report's values of the parameter's `measures`, or says why there are none."""
+        name, found = self.parameter.name, "not measured yet"
+        shown = [
+            f"{self._name(m)}**{self._value(report.measured[m])}{self._unit(m)}**"
+            for m in measures
+            if m in report.measured
+        ]
+        if shown:
+            found = f"measured {', '.join(shown)}"
+        elif report.seconds and not measures:
+            found = "no measure of its own"
+        text = " · ".join(filter(None, [found, trained(self.parameter)]))
+        outside = report.outside.get(name)
         if outside is not None:
-            used, unit = report.requested[self.parameter.name], f" {self.parameter.unit}".rstrip()
+            used, unit = report.requested[name], f" {self.parameter.unit}".rstrip()
             text += f"\n\n**Outside the trained range:** {outside:g}{unit} was asked for, {used:.3g}{unit} is used."
         write(self.handle, text)
 
@@ -100,44 +111,45 @@ class MeasuredText:
         rest = f"_{measure}_".replace(f"_{self.parameter.name}_", "_").strip("_")
         return f"{_words(rest)} " if rest else ""
 
+    def _value(self, value: float) -> str:
+        """Of a choice, the share of the time in which it was met."""
+        return f"{value:.0%}" if isinstance(self.parameter, Choice) else readable_number(value)
+
     def _unit(self, measure: str) -> str:
-        return f" {self.parameter.unit}" if self.parameter.unit and measure == self.parameter.name else ""
+        same = measure.removesuffix("_error") == self.parameter.name
+        return f" {self.parameter.unit}" if self.parameter.unit and same else ""
 
 
 class Chart:
-    """Requested against measured over the last seconds, of one parameter at a time."""
+    """Requested against measured over the last seconds, of one parameter at a time.
 
-    def __init__(self, server: viser.ViserServer, space: StyleSpace) -> None:
-        self._space = space
+    The axis of time is fixed: viser's plot otherwise remembers which share of the data was in view before the first
+    were drawn, and may show a part of the axis that has none.
+
+    Args:
+        server: where to add it.
+        folder: in which folder.
+        space: the styles.
+        redraw: called in viser's threads after the user chose another parameter; `add` is to follow.
+    """
+
+    def __init__(self, server: viser.ViserServer, folder: Any, space: StyleSpace, redraw: Callable[[], None]) -> None:
+        self._server, self._folder, self._space = server, folder, space
         self._history: deque[tuple[float, StyleReport]] = deque(maxlen=_HISTORY)
         self._names = {_words(name): name for name in space.names}
-        numeric = [_words(p.name) for p in space.parameters if not isinstance(p, Choice)]
-        self.choice = server.gui.add_dropdown("show", list(self._names), initial_value=[*numeric, *self._names][0])
-        self.plot = server.gui.add_uplot(data=(np.zeros(1), np.zeros(1), np.zeros(1)), height=190, **self._layout())
-        self.choice.on_update(lambda _: self._lay_out())
+        numeric = [p.name for p in space.parameters if not isinstance(p, Choice)]
+        self.shown = [*numeric, *space.names][0]
+        with folder:
+            self.choice = server.gui.add_dropdown("show", list(self._names), initial_value=_words(self.shown))
+            self.note = server.gui.add_markdown("")
+        self.choice.on_update(lambda _: redraw())
+        self.plot: Any = None
+        self._drawn: tuple[str, bool] | None = None  # parameter of the plot, and whether it has anything measured
 
-    def _layout(self) -> dict[str, Any]:
-        """Of the chosen parameter: a weight and what it brings about have no common unit, hence an axis each."""
-        import viser.uplot as uplot
-
-        apart = isinstance(self._space[self._names[self.choice.value]], Weight)
-        scale = "measured" if apart else "y"
-        axes = [uplot.Axis(size=34), uplot.Axis(size=48)]
-        if apart:
-            axes.append(uplot.Axis(scale=scale, side=1, size=56, stroke=_MEASURED, grid=uplot.Axis_Grid(show=False)))
-        return {
-            "series": (
-                uplot.Series(label="time [s]"),
-                uplot.Series(label="requested", stroke=_REQUESTED, width=2),
-                uplot.Series(label="measured (right)" if apart else "measured", stroke=_MEASURED, width=2, scale=scale),
-            ),
-            "scales": {"x": uplot.Scale(time=False)},
-            "axes": tuple(axes),
-        }
-
-    def _lay_out(self) -> None:
-        for name, value in self._layout().items():
-            setattr(self.plot, name, value)
+    def follow(self, name: str) -> None:
+        """Shows a parameter, because it was just asked for."""
+        if self.choice.value != _words(name):
+            self.choice.value = _words(name)
 
     def add(self, time: float, report: StyleReport) -> None:
         """A further point."""
@@ -146,27 +158,59 @@ class Chart:
         elif self._history and time == self._history[-1][0]:
             self._history.pop()  # shown again, for example while paused
         self._history.append((time, report))
-        self.draw()
+        self._draw()
 
-    def draw(self) -> None:
+    def _draw(self) -> None:
         """Shows the chosen parameter: a number as it is; of a choice, the share of time in which it was met."""
-        name = self._names[self.choice.value]
-        rows, seen = [], math.nan
-        for moment, report in self._history:
-            seen = self._measured(report, name, otherwise=seen)
-            if math.isfinite(seen):  # uPlot draws nothing at all if there are NaN
-                rows.append((moment, self._requested(report, name), seen))
-        if rows:
-            times, asked, measured = np.array(rows, dtype=float).T
-            self.plot.data = (times, asked, measured)
+        self.shown = self._names.get(str(self.choice.value), self.shown)
+        now = self._history[-1][0]
+        rows = [
+            (moment - now, self._requested(report), self._measured(report))
+            for moment, report in self._history
+            if moment >= now - _SPAN
+        ]
+        measured = [row for row in rows if math.isfinite(row[2])]  # uPlot draws nothing at all if there are NaN
+        columns = np.array(measured or rows, dtype=float).T
+        self._plot((self.shown, bool(measured)), tuple(columns if measured else columns[:2]))
+        write(self.note, "" if measured else f"{_words(self.shown)}: nothing was measured in the last {_SPAN:g} s")
 
-    def _requested(self, report: StyleReport, name: str) -> float:
-        value = report.requested[name]
+    def _plot(self, kind: tuple[str, bool], data: tuple[np.ndarray, ...]) -> None:
+        """Draws data in a plot of their kind: for another kind a new plot, so that its settings change together."""
+        if kind == self._drawn:
+            self.plot.data = data
+            return
+        if self.plot is not None:
+            self.plot.remove()
+        with self._folder:
+            self.plot = self._server.gui.add_uplot(data=data, height=190, **self._layout(*kind))
+        self._drawn = kind
+
+    def _layout(self, name: str, measured: bool) -> dict[str, Any]:
+        """Of a parameter: a weight and what it brings about have no common unit, hence an axis each."""
+        import viser.uplot as uplot
+
+        series = [uplot.Series(label="seconds ago"), uplot.Series(label="requested", stroke=_REQUESTED, width=2)]
+        axes = [uplot.Axis(size=34), uplot.Axis(size=48)]
+        apart = measured and isinstance(self._space[name], Weight)
+        if apart:
+            axes.append(uplot.Axis(scale="right", side=1, size=56, stroke=_MEASURED, grid=uplot.Axis_Grid(show=False)))
+        if measured:
+            label, scale = ("measured (right)", "right") if apart else ("measured", "y")
+            dots = uplot.Series_Points(show=True, size=3, fill=_MEASURED)  # where it was measured; lines only join them
+            series.append(uplot.Series(label=label, stroke=_MEASURED, width=2, scale=scale, points=dots))
+        return {
+            "series": tuple(series),
+            "scales": {"x": uplot.Scale(time=False, range=(-_SPAN, 0.0))},
+            "axes": tuple(axes),
+        }
+
+    def _requested(self, report: StyleReport) -> float:
+        value = report.requested[self.shown]
         return 1.0 if isinstance(value, str) else value
 
-    def _measured(self, report: StyleReport, name: str, otherwise: float) -> float:
-        measures = measures_by_parameter(self._space, report.measured)[name]
-        return report.measured[measures[0]] if measures else otherwise
+    def _measured(self, report: StyleReport) -> float:
+        measures = measures_by_parameter(self._space, report.measured)[self.shown]
+        return report.measured[measures[0]] if measures else math.nan
 
 
 def label(parameter: Parameter) -> str:

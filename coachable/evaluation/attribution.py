@@ -12,6 +12,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from coachable.domain import Domain
+from coachable.extras import how_to_install
 from coachable.styles import StyleSpace
 from coachable.training.rng import preserved_rng, seed_everything
 
@@ -155,5 +156,5 @@ def import_captum() -> Any:
     try:
         import captum.attr
     except ImportError as error:
-        raise ImportError(f"{error.name} is missing: pip install 'coachable[explain]'") from error
+        raise ImportError(f"{error.name} is missing: {how_to_install('explain')}") from error
     return captum.attr

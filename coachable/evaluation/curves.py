@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -27,15 +28,24 @@ def read_metric(run: Path, x: str, y: str) -> tuple[np.ndarray, np.ndarray]:
         y: column to draw.
 
     Raises:
-        ValueError: if there is no such column, or no row has both; lists the columns that exist.
+        ValueError: if the file is damaged, there is no such column, or no row has both; lists the columns that exist.
     """
-    with (run / "metrics.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    table = run / "metrics.csv"
+    try:
+        with table.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{table} is no table of metrics: {error}") from error
     columns = list(rows[0]) if rows else []
     for name in (x, y):
         if name not in columns:
             raise ValueError(f"{run} has no metric {name!r}: expected one of {columns}")
-    pairs = [(float(row[x]), float(row[y])) for row in rows if row[x] and row[y]]
+    try:
+        pairs = [(float(row[x]), float(row[y])) for row in rows if row[x] and row[y]]
+    except ValueError as error:
+        raise ValueError(f"{table} is damaged: {error} in {x!r} or {y!r}, expected numbers") from error
+    if not all(math.isfinite(at) for at, _ in pairs):
+        raise ValueError(f"{table} has values of {x!r} that are not finite: choose another x")
     if not pairs:
         raise ValueError(f"{run} has no row with both {x!r} and {y!r}")
     points = np.array(pairs)

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from coachable.domain import Domain, load_domain
+from coachable.domain import Domain
 from coachable.evaluation.figures import draw_style_grid
 from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.style_grid import (
@@ -19,7 +19,7 @@ from coachable.evaluation.style_grid import (
     write_csv,
 )
 from coachable.evaluation.switching import SwitchReport, evaluate_switching
-from coachable.training.weights import LoadedPolicy, load_policy
+from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
 
 def evaluate(
@@ -50,10 +50,11 @@ def evaluate(
 
     Raises:
         ValueError: if `episodes` is below 1.
+        CheckpointError: if the source does not hold a usable policy of its domain.
     """
-    out.mkdir(parents=True, exist_ok=True)
     agent = load_policy(source)
-    domain = load_domain(agent.metadata["domain"], agent.config)
+    domain = domain_of(agent)
+    out.mkdir(parents=True, exist_ok=True)
     options: dict[str, Any] = {"steps": steps, "seed": seed, "num_threads": num_threads, "progress": progress}
     settings = EvaluationSettings(episodes=episodes, switch_episodes=switch_episodes, **options)
     if domain.evaluation is not None:

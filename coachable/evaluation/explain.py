@@ -15,14 +15,14 @@ from torch import Tensor
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
-from coachable.domain import Domain, load_domain
+from coachable.domain import Domain
 from coachable.evaluation.attribution import Ranking, import_captum, input_groups, rank_groups
 from coachable.evaluation.figures import readable
 from coachable.evaluation.rollouts import record_episodes
 from coachable.evaluation.style_grid import markdown_table, write_csv
 from coachable.networks.plain import ActionOutputs
 from coachable.styles import StyleSpace
-from coachable.training.weights import load_policy
+from coachable.training.weights import domain_of, load_policy
 from coachable.transforms import coachable_env
 
 __all__ = ["explain", "record_states"]
@@ -64,7 +64,7 @@ def explain(
     """
     import_captum()
     agent = load_policy(source)
-    domain = load_domain(agent.metadata["domain"], agent.config)
+    domain = domain_of(agent)
     outputs = ActionOutputs(agent.actor).eval()
     groups = input_groups(domain, agent.space, outputs.observation_dim)
     trajectories = record_states(

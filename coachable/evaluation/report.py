@@ -11,8 +11,9 @@ import numpy as np
 from tqdm import tqdm
 
 from coachable import __version__
-from coachable.domain import Domain, load_domain
+from coachable.domain import Domain
 from coachable.evaluation.figures import readable
+from coachable.evaluation.outputs import complete_folder
 from coachable.evaluation.report_figures import draw_metrics, draw_requests, draw_switches, draw_tradeoffs
 from coachable.evaluation.report_page import Page, paragraph, picture, shown, table
 from coachable.evaluation.runs import (
@@ -27,7 +28,7 @@ from coachable.evaluation.runs import (
 from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.style_grid import acting, mean_of, training_counts, write_csv
 from coachable.styles import Setpoint
-from coachable.training.weights import LoadedPolicy, load_policy
+from coachable.training.weights import LoadedPolicy, domain_of, load_policy, widths_of
 
 __all__ = ["report", "write_report"]
 
@@ -51,11 +52,14 @@ def report(sources: Sequence[str | Path], out: Path, **settings: Any) -> str:
     agents = [load_policy(source) for source in sources]
     first = agents[0]
     for agent, source in zip(agents, sources, strict=True):
-        same = agent.metadata["domain"] == first.metadata["domain"] and first.space.encodes_like(agent.space)
-        if not same:
-            differences = " ".join(first.space.difference(agent.space)) or "they belong to different domains."
+        domains = agent.metadata["domain"], first.metadata["domain"]
+        same = domains[0] == domains[1] and widths_of(agent) == widths_of(first)
+        if not same or not first.space.encodes_like(agent.space):
+            differences = " ".join(first.space.difference(agent.space)) or "they differ in their observations"
+            if domains[0] != domains[1]:
+                differences = f"the one belongs to {domains[0]}, the other to {domains[1]}"
             raise ValueError(f"{source} cannot share a report with {sources[0]}: {differences}")
-    domain = load_domain(first.metadata["domain"], first.config)
+    domain = domain_of(first)
     return write_report(domain, dict(zip(map(str, sources), agents, strict=True)), out, **settings)
 
 
@@ -102,28 +106,28 @@ def write_report(
         planned = [(name, agent, seed) for name, agent in agents.items()]
     if not planned:
         raise ValueError(f"seeds must be at least 1, got {seeds}")
-    out.mkdir(parents=True, exist_ok=True)
-    options: dict[str, Any] = {"steps": steps, "num_threads": num_threads, "progress": progress}
-    options |= {"episodes": episodes, "switch_episodes": switch_episodes, "sweep_points": sweep_points}
-    bar = tqdm(planned, desc="evaluating", unit="run", disable=None if progress else True)
-    runs = [evaluate_run(label, domain, agent, seed=number, **options) for label, agent, number in bar]
-    agent = next(iter(agents.values()))
-    styles = StyleTable(runs, agent.space)
-    formats = _formats(styles, domain)
-    page = Page(f"{domain.name}: what was asked, and what was done", _lead(agents, runs, episodes))
-    _styles(page, styles, formats, agent, out)
-    _requests(page, styles, agent, runs, out)
-    _switches(page, domain, runs, switch_episodes, formats, out)
-    _tradeoffs(page, styles, runs, formats, out)
-    if domain.evaluation is not None:
-        settings = EvaluationSettings(episodes, switch_episodes, steps, seed, num_threads, progress, runs[0].sweeps)
-        _own(page, domain, agent, out, settings)
-    command = [f"coachable report {' '.join(agents)} --seed {seed} --episodes {episodes}"]
-    command += [f"--switch-episodes {switch_episodes} --sweep-points {sweep_points}"]
-    command += [f"--seeds {seeds}"] if len(agents) == 1 else []
-    command += [f"--steps {steps}"] if steps else []
-    footer = f"coachable {__version__}; made by: {' '.join(command)}"
-    (out / "report.html").write_text(page.text(footer), encoding="utf-8")
+    with complete_folder(out) as folder:
+        options: dict[str, Any] = {"steps": steps, "num_threads": num_threads, "progress": progress}
+        options |= {"episodes": episodes, "switch_episodes": switch_episodes, "sweep_points": sweep_points}
+        bar = tqdm(planned, desc="evaluating", unit="run", disable=None if progress else True)
+        runs = [evaluate_run(label, domain, agent, seed=number, **options) for label, agent, number in bar]
+        agent = next(iter(agents.values()))
+        styles = StyleTable(runs, agent.space)
+        formats = _formats(styles, domain)
+        page = Page(f"{domain.name}: what was asked, and what was done", _lead(agents, runs, episodes))
+        _styles(page, styles, formats, agent, folder)
+        _requests(page, styles, agent, runs, folder)
+        _switches(page, domain, runs, switch_episodes, formats, folder)
+        _tradeoffs(page, styles, runs, formats, folder)
+        if domain.evaluation is not None:
+            settings = EvaluationSettings(episodes, switch_episodes, steps, seed, num_threads, progress, runs[0].sweeps)
+            _own(page, domain, agent, folder, settings)
+        command = [f"coachable report {' '.join(agents)} --seed {seed} --episodes {episodes}"]
+        command += [f"--switch-episodes {switch_episodes} --sweep-points {sweep_points}"]
+        command += [f"--seeds {seeds}"] if len(agents) == 1 else []
+        command += [f"--steps {steps}"] if steps else []
+        footer = f"coachable {__version__}; made by: {' '.join(command)}"
+        (folder / "report.html").write_text(page.text(footer), encoding="utf-8")
     return _text(styles, runs, formats, out)
 
 

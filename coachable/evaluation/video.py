@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +16,21 @@ from torch import Tensor
 from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
-from coachable.domain import Domain, load_domain
+from coachable.domain import Domain
+from coachable.evaluation.outputs import complete_file
+from coachable.extras import how_to_install
 from coachable.keys import STYLE
-from coachable.styles import Choice, StyleSpace, Weight
+from coachable.styles import Choice, StyleRangeWarning, StyleSpace, Weight
 from coachable.training.rng import RandomStream
-from coachable.training.weights import load_policy
+from coachable.training.weights import domain_of, load_policy
 from coachable.transforms import coachable_env
 
 VIDEO_SUFFIXES = (".mp4", ".gif", ".png")
 _GIF_FPS = 20
 CAPTION = 44  # [px]
+_SMALLEST = (64, CAPTION + 16)  # [px]
+_LARGEST = 4096  # [px]
+_LONGEST = 3600.0  # [s]
 
 
 def render(
@@ -43,9 +49,9 @@ def render(
         source: checkpoint, run folder, weights file, or the name of a domain that ships with weights.
         out: file to write: `.mp4`, `.gif`, or `.png` for a sheet with one picture per style.
         styles: requests by parameter name, in order; default: every option of a choice, with the lower, middle and
-            upper value of the other parameters.
-        seconds_per_style: time between switches [s].
-        size: width and height [px].
+            upper value of the other parameters. Numbers outside the trained range are clamped, and the film says so.
+        seconds_per_style: time between switches [s], above 0 and at most 3600.
+        size: width and height [px], at least 64 x 60 and at most 4096 x 4096; even for mp4.
         seed: of the initial state, and of the actions where they are sampled.
         progress: show a bar.
 
@@ -53,15 +59,22 @@ def render(
         `out`.
 
     Raises:
-        ValueError: if the suffix of `out` is none of the above.
+        ValueError: if the suffix of `out` is none of the above, or a number lies outside its range.
         ImportError: for mp4 without PyAV; names the extra to install.
     """
     if out.suffix not in VIDEO_SUFFIXES:
         raise ValueError(f"cannot write {out.name}: expected a file ending in one of {VIDEO_SUFFIXES}")
+    if not 0.0 < seconds_per_style <= _LONGEST:
+        raise ValueError(f"seconds per style are {seconds_per_style}: expected more than 0, at most {_LONGEST:g}")
+    if any(not low <= side <= _LARGEST for side, low in zip(size, _SMALLEST, strict=True)):
+        smallest = "x".join(map(str, _SMALLEST))
+        raise ValueError(f"the size is {size[0]}x{size[1]}: expected {smallest} to {_LARGEST}x{_LARGEST}")
     if out.suffix == ".mp4":
+        if size[0] % 2 or size[1] % 2:
+            raise ValueError(f"the size is {size[0]}x{size[1]}: mp4 needs an even width and height")
         _import_av()
     agent = load_policy(source)
-    domain = load_domain(agent.metadata["domain"], agent.config)
+    domain = domain_of(agent)
     requests = default_tour(domain, agent.space) if styles is None else list(styles)
     period = max(1, round(seconds_per_style / domain.control_step))
     sheet = out.suffix == ".png"
@@ -69,11 +82,11 @@ def render(
     frames = _film(domain, agent.actor, agent.space, requests, period, size, seed, every=period if sheet else 1)
     total = len(requests) * (1 if sheet else period)
     bar = tqdm(frames, total=total, desc="drawing", unit="frame", disable=None if progress else True, leave=False)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    if sheet:
-        _write_sheet(list(bar), out)
-    else:
-        write_video(bar, out, round(1 / domain.control_step))
+    with complete_file(out) as unfinished:
+        if sheet:
+            _write_sheet(list(bar), unfinished)
+        else:
+            write_video(bar, unfinished, round(1 / domain.control_step))
     return out
 
 
@@ -126,11 +139,14 @@ def _film(
     renderer = domain.make_renderer(size[0], size[1] - CAPTION)
     chance = RandomStream(seed)
     env.set_seed(seed)
-    thetas = [space.make(**request) for request in requests]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", StyleRangeWarning)  # the caption says it
+        thetas = [space.make(**request) for request in requests]
     current = env.reset(TensorDict({STYLE: thetas[0][None]}, [1]))
     failures = 0
     try:
         for request, theta in zip(requests, thetas, strict=True):
+            asked = asked_line(space, request, theta)
             recent: list[dict[str, Tensor]] = []
             for step in range(1, period + 1):
                 with chance.drawn():
@@ -138,7 +154,7 @@ def _film(
                 transition = env.step(action)
                 recent.append(domain.measures.step(transition))
                 if step % every == 0:
-                    yield caption(renderer.draw(env), _caption_lines(domain, request, recent, failures))
+                    yield caption(renderer.draw(env), (asked, _measured_line(domain, recent, failures)))
                 current = step_mdp(transition)
                 if transition["next", "done"].any():
                     failures += int(transition["next", "terminated"].sum())
@@ -148,17 +164,38 @@ def _film(
         env.close()
 
 
-def _caption_lines(
-    domain: Domain, request: dict[str, Any], recent: list[dict[str, Tensor]], failures: int
-) -> tuple[str, str]:
+def asked_line(space: StyleSpace, request: Mapping[str, Any], theta: Tensor) -> str:
+    """Return what the agent is asked, for a caption; what was clamped names the value that had been requested.
+
+    Args:
+        space: the agent's styles.
+        request: values by parameter name; others have their default.
+        theta: what was made of it, (D,).
+    """
+    parts = []
+    for name, value in space.describe(theta).items():
+        if isinstance(value, str):
+            parts.append(f"{name} {value}")
+            continue
+        wanted = float(request.get(name, value))
+        clamped = abs(wanted - value) > 1e-6 * max(abs(wanted), abs(value))
+        if value or clamped or not isinstance(space[name], Weight):
+            parts.append(f"{name} {_short(value)}" + (f" (clamped from {_short(wanted)})" if clamped else ""))
+    return f"asked: {', '.join(parts) or 'every weight 0'}".replace("_", " ")
+
+
+def _short(value: float) -> str:
+    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+
+
+def _measured_line(domain: Domain, recent: list[dict[str, Tensor]], failures: int) -> str:
     window = recent[-round(2.0 / domain.control_step) :]
     record = {name: torch.stack([row[name] for row in window]) for name in window[0]}
     measured = domain.measures.summarise(record, torch.ones(len(window), 1, dtype=torch.bool))
-    asked = ", ".join(f"{k} {v:.2f}" if isinstance(v, float) else f"{v}" for k, v in request.items())
     wanted = [name.removeprefix("measured_") for name in domain.columns]
     published = {name: value for name, value in measured.items() if name in wanted} or measured
     shown = ", ".join(f"{k} {v.item():.2f}" for k, v in published.items() if not bool(v.isnan().any()))
-    return f"asked: {asked}".replace("_", " "), f"last 2 s: {shown}; failures {failures}".replace("_", " ")
+    return f"last 2 s: {shown}; failures {failures}".replace("_", " ")
 
 
 def caption(frame: np.ndarray, lines: tuple[str, str]) -> np.ndarray:
@@ -187,6 +224,6 @@ def _import_av() -> Any:
         import av
     except ImportError as error:
         raise ImportError(
-            'writing mp4 needs PyAV: pip install "coachable[video]", or choose a .gif or .png file'
+            f"writing mp4 needs PyAV: {how_to_install('video')}, or choose a .gif or .png file"
         ) from error
     return av

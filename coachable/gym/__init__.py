@@ -1,5 +1,12 @@
 """Gymnasium both ways: `StyleWrapper` makes its environments coachable, `GymnasiumEnv` trains them here."""
 
+from importlib.util import find_spec
+
+from coachable.extras import how_to_install
+
+if find_spec("gymnasium") is None:
+    raise ImportError(f"coachable.gym needs Gymnasium: {how_to_install('gym')}")
+
 from coachable.gym.env import GymnasiumEnv
 from coachable.gym.features import Features
 from coachable.gym.wrapper import StyleWrapper

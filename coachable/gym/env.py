@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from coachable.finite import require_finite_action
 from coachable.gym.actions import action_components, native_action
 from coachable.gym.features import Features, checked_features, flat_observation
 from coachable.keys import STYLE_FEATURES, TASK_REWARD
@@ -107,8 +108,7 @@ class GymnasiumEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actions = tensordict.get("action").detach()
-        if bool(actions.isnan().any()):
-            raise ValueError("action contains NaN: the policy has diverged")
+        require_finite_action(actions)
         choices = self.heads.choices(actions).tolist() if self.heads.categorical else [[]] * len(self.envs)
         axes = self.heads.split(actions)[1].clamp(-1.0, 1.0).tolist()
         rewards = np.zeros(len(self.envs))

@@ -28,11 +28,16 @@ class StyleWrapper(gymnasium.Wrapper, RecordConstructorArgs):
     info holds `style` (the one in the returned observation), and after a step `task_reward` and `style_reward`.
 
     Args:
-        env: Any Gymnasium environment.
+        env: A Gymnasium environment. Where its observation is a Dict or a Tuple, `flat` has to be set: few agents read
+            a Dict inside a Dict.
         style_reward: What following a style is rewarded with; brings the `StyleSpace`.
         features: What the reward's terms read, see `Features`.
         sampler: Distribution of styles; the space's own if None.
         flat: Observe one vector, `cat(flattened observation, style)`, instead of the Dict `{observation, style}`.
+
+    Raises:
+        ValueError: If the observation is a Dict or a Tuple and `flat` is not set, or if it has no fixed size and `flat`
+            is set.
 
     The style shown is raw theta. Networks that do not encode it themselves may want their inputs normalised.
 
@@ -56,6 +61,7 @@ class StyleWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         sampler: Sampler | None = None,
         flat: bool = False,
     ) -> None:
+        _check_observation(env.observation_space, flat)
         RecordConstructorArgs.__init__(
             self, _disable_deepcopy=True, style_reward=style_reward, features=features, sampler=sampler, flat=flat
         )
@@ -68,7 +74,7 @@ class StyleWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         style = spaces.Box(self.space.low.numpy(), self.space.high.numpy(), dtype=np.float32)
         if flat:
             inner = spaces.flatten_space(env.observation_space)
-            assert isinstance(inner, spaces.Box)  # of anything but sequences and graphs
+            assert isinstance(inner, spaces.Box)
             self._flat_dtype = np.result_type(inner.dtype, np.float32)
             low, high = np.append(inner.low, style.low), np.append(inner.high, style.high)
             self.observation_space = spaces.Box(
@@ -128,3 +134,17 @@ class StyleWrapper(gymnasium.Wrapper, RecordConstructorArgs):
             return {"observation": observation, STYLE: style}
         flattened = flat_observation(self.env.observation_space, observation)
         return np.concatenate([flattened, style]).astype(self._flat_dtype)
+
+
+def _check_observation(space: spaces.Space, flat: bool) -> None:
+    if flat and not space.is_np_flattenable:
+        raise ValueError(
+            f"the observation space {space} has no fixed size, so flat=True cannot make one vector of it: make it a "
+            "Box first, with gymnasium.wrappers.TransformObservation"
+        )
+    if not flat and isinstance(space, spaces.Dict | spaces.Tuple):
+        raise ValueError(
+            f"the observation is a {type(space).__name__}, which would lie inside the Dict that holds the style, and "
+            "few agents read that: pass flat=True for one vector, or flatten the environment first, with "
+            "gymnasium.wrappers.FlattenObservation"
+        )

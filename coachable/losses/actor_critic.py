@@ -18,6 +18,7 @@ from coachable.losses.functional import bootstrap_target
 from coachable.losses.policy import PolicyReader
 from coachable.networks.mixed_action import MixedAction
 from coachable.networks.tanh_gaussian import at_least_float32
+from coachable.ranges import POSITIVE, SHARE
 
 Reduction = Literal["none", "mean", "sum"]
 
@@ -72,8 +73,7 @@ class ActorCriticLoss(SACLoss):
                 f"{name} got {len(critics)} critic(s) for num_qvalue_nets={num_qvalue_nets}: pass a list of that many, "
                 "each built separately"
             )
-        if not (alpha > 0 and math.isfinite(alpha)):
-            raise ValueError(f"alpha must be positive and finite, got {alpha}")
+        POSITIVE.check("alpha", alpha)
         if reduction not in ("none", "mean", "sum"):
             raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
         policy = PolicyReader(actor_network, name, continuous_only=self._continuous_only, action_spec=action_spec)
@@ -217,6 +217,8 @@ class ActorCriticLoss(SACLoss):
                 f"{type(self).__name__} computes its own TD(0) target and takes gamma alone, got value_type="
                 f"{value_type}, {sorted(hyperparams)}; for n-step targets store n-step rewards with steps_to_next_obs"
             )
+        if "gamma" in hyperparams:
+            SHARE.check("gamma", hyperparams["gamma"])
         super().make_value_estimator(ValueEstimators.TD0, **hyperparams)
         if "gamma" in hyperparams:
             exact = torch.as_tensor(hyperparams["gamma"], dtype=torch.float64)

@@ -17,6 +17,7 @@ from coachable.losses.functional import (
     pessimistic_quantiles,
     quantile_huber_loss,
 )
+from coachable.ranges import COUNT, NOT_NEGATIVE
 
 EntropyInTarget = Literal["inside", "outside"]
 
@@ -58,10 +59,8 @@ class QRSACLoss(ActorCriticLoss):
         quantile_reduction: QuantileReduction = "mean",
         **options: Any,
     ) -> None:
-        if int(num_quantiles) != num_quantiles or num_quantiles < 1:
-            raise ValueError(f"num_quantiles must be a positive integer, got {num_quantiles}")
-        if not 0.0 <= kappa < float("inf"):
-            raise ValueError(f"kappa must not be negative, and finite, got {kappa}")
+        COUNT.check("num_quantiles", num_quantiles)
+        NOT_NEGATIVE.check("kappa", kappa)
         for name, value, choices in (
             ("target_min", target_min, get_args(TargetMin)),
             ("entropy_in_target", entropy_in_target, get_args(EntropyInTarget)),

@@ -11,6 +11,7 @@ from torch import Tensor
 from coachable.losses.actor_critic import ActorCriticLoss
 from coachable.networks.mixed_action import MixedAction
 from coachable.networks.tanh_gaussian import at_least_float32
+from coachable.ranges import COUNT
 
 
 class RACLoss(ActorCriticLoss):
@@ -43,8 +44,7 @@ class RACLoss(ActorCriticLoss):
         shared_entropy_noise: bool = True,
         **options: Any,
     ) -> None:
-        if int(entropy_samples) != entropy_samples or entropy_samples < 1:
-            raise ValueError(f"entropy_samples must be a positive integer, got {entropy_samples}")
+        COUNT.check("entropy_samples", entropy_samples)
         self.entropy_samples = int(entropy_samples)
         self.shared_entropy_noise = bool(shared_entropy_noise)
         super().__init__(actor_network, qvalue_network, **options)

@@ -20,13 +20,33 @@ class FlatBuffers:
         tensors: Float tensors on one device, trained parameters or not.
         low_dtype: Dtype of the rounded copies; `None` to use the tensors themselves.
         trained: Whether there are gradients.
+
+    Attributes:
+        originals: The tensors as they were given.
+        tensors: The same memory as that of the originals, without autograd.
+        low: The rounded copies.
+        grad: All gradients as one vector.
+        grads: The gradients, parts of `grad`.
     """
 
     def __init__(self, tensors: Sequence[Tensor], low_dtype: torch.dtype | None, trained: bool) -> None:
-        self.tensors = [tensor.detach() for tensor in tensors]
-        self.low = self.tensors if low_dtype is None else self._views(low_dtype)[1]
-        self.grad, self.grads = self._views(self.tensors[0].dtype) if trained else (torch.zeros(0), [])
         self.rounds = low_dtype is not None
+        self._low_dtype, self._trained = low_dtype, trained
+        self.bind(tensors)
+
+    def bind(self, tensors: Sequence[Tensor]) -> None:
+        """Take other tensors, or the same ones after their memory was replaced. The gradients become zero.
+
+        Args:
+            tensors: As in the constructor. One that is not contiguous is made so in place, because kernels read rows.
+        """
+        for tensor in tensors:
+            if not tensor.is_contiguous():
+                tensor.data = tensor.data.contiguous()
+        self.originals = list(tensors)
+        self.tensors = [tensor.detach() for tensor in tensors]
+        self.low = self.tensors if self._low_dtype is None else self._views(self._low_dtype)[1]
+        self.grad, self.grads = self._views(self.tensors[0].dtype) if self._trained else (torch.zeros(0), [])
         self._versions: list[int] = []
 
     def refresh(self) -> None:

@@ -1,7 +1,8 @@
 """The hand-written passes of residual networks on prepared memory, with the kernels of `kernels.c`.
 
-Between two products of matrices that fill the cache, every Python call is a cold one; so all views, addresses and
-buffers that do not change from update to update are made once.
+Between two products of matrices that fill the cache, every Python call is a cold one; so all views and buffers that do
+not change from update to update are made once. Addresses are not: whoever shares a network with other processes moves
+its parameters.
 """
 
 from __future__ import annotations
@@ -87,6 +88,8 @@ class Workspace:
 
 
 class _MemberSpace:
+    """Passes of one member. Addresses are taken at each call: parameters may move between calls."""
+
     def __init__(
         self,
         space: Workspace,
@@ -95,59 +98,29 @@ class _MemberSpace:
         member: Member,
         buffers: Sequence[tuple[Tensor, Tensor, Tensor, Tensor]],
     ) -> None:
-        self._space, self._layers = space, layers
+        self._space = space
         self._layer_forward, self._layer_backward = kernels.layer_forward, kernels.layer_backward
         even = all(layer.out_features % 2 == 0 for layer in layers)
         self._own_products = kernels.products if even else None
-        # Addresses do not keep tensors alive.
-        self._own, self._low, self._buffers, self._grads = member.parameters, member.products, buffers, member.grads
-        self._forward_steps: list[tuple[Any, ...]] = []
-        self._backward_steps: list[tuple[Any, ...]] = []
-        self._product_steps: list[tuple[Any, ...]] = []
-        x, i, rows = space._input, 0, space.rows
-        scratch = space._scratch.data_ptr()
+        parameters, grads = member.parameters, member.grads
+        self._layers: list[_LayerSpace] = []
+        x, i = space._input, 0
         for index, layer in enumerate(layers):
-            z, out, mean, rstd = buffers[index]
-            bias, gamma, beta = (t.data_ptr() for t in self._own[i + 1 : i + 4])
-            start, to, width = layer.skip_columns
-            statistics = (mean.data_ptr(), rstd.data_ptr())
-            arguments = (z.data_ptr(), bias, gamma, beta, x.data_ptr(), x.stride(0), start, to, width, layer.eps)
-            arguments += (rows, layer.out_features, out.data_ptr(), *statistics, scratch)
-            weight_address = self._low[i].data_ptr()
-            self._forward_steps.append((x, self._low[i].t(), z, layer.in_features, weight_address, arguments))
-            if space.keep:
-                n, m = layer.in_features, layer.out_features
-                # The gradient alternates between two buffers: the last layer's arrives in the first.
-                flow = len(layers) - 1 - index
-                here = space._flow[flow % 2].view(-1)[: rows * m].view(rows, m)
-                below = space._flow[(flow + 1) % 2].view(-1)[: rows * n].view(rows, n) if index else None
-                dz = space._dz.view(-1)[: rows * m].view(rows, m)
-                grads = self._grads[i : i + 4]
-                targets = [g.data_ptr() for g in (grads[2], grads[3], grads[1])] if grads else [None] * 3
-                first = (here.data_ptr(), z.data_ptr(), bias, gamma, beta, *statistics)
-                last = (m, dz.data_ptr(), *targets, scratch)
-                dw = space._dw[: m * n].view(m, n)
-                weight = grads[0] if grads else None
-                self._backward_steps.append((layer, x, here, below, dz, dz.t(), dw, weight, self._low[i], first, last))
-                factors = (dz.data_ptr(), m, x.data_ptr(), n, x.stride(0), rows)
-                target = weight.data_ptr() if weight is not None else None
-                addresses = dz.data_ptr(), weight_address, here.data_ptr(), None if below is None else below.data_ptr()
-                self._product_steps.append((factors, target, addresses, (start, to, width)))
-            x, i = out, i + 4
-        self._features = x
-        self._head = (self._own[i], self._own[i].t(), self._own[i + 1]) if i < len(self._own) else None
-        self._head_grads = self._grads[i:]
+            below = len(layers) - 1 - index
+            own = member.products[i], *parameters[i + 1 : i + 4]
+            self._layers.append(_LayerSpace(space, layer, x, own, grads[i : i + 4], buffers[index], below))
+            x, i = buffers[index][1], i + layer.tensors
+        self._features, self._scratch = x, space._scratch
+        self._head = (parameters[i], parameters[i + 1]) if i < len(parameters) else None
+        self._head_grads = grads[i:]
         self._head_kernels: tuple[Any, Any] | None = None
         if self._head is None:
             return
-        weight, _, bias = self._head
-        self._head_sizes = x.shape[1], weight.shape[0]
-        self._head_addresses = x.data_ptr(), weight.data_ptr(), bias.data_ptr()
-        self._head_targets: list[int | None] = [g.data_ptr() for g in self._head_grads] or [None] * 2
-        self._small_head = weight.shape[0] <= _FEW_OUTPUTS
+        outputs = self._head[0].shape[0]
+        self._head_sizes = x.shape[1], outputs
+        self._small_head = outputs <= _FEW_OUTPUTS
         if self._small_head:
             self._head_kernels = kernels.head_forward, kernels.head_backward
-            self._head_targets.append(scratch)
             return
         self._hidden = x if x.dtype == torch.float32 else space._arena.empty(*x.shape)  # what torch's head sees
         self._head_gradient = space._arena.empty(*x.shape) if space.keep else x
@@ -157,76 +130,154 @@ class _MemberSpace:
 
     def forward(self, out: Tensor) -> None:
         products = self.products()
-        if products is not None:
-            for _, _, _, inner, address, arguments in self._forward_steps:
-                products.dense_forward(inner, address, *arguments)
-        else:
-            for x, weight, z, _, _, arguments in self._forward_steps:
-                torch.mm(x, weight, out=z)
+        for layer in self._layers:
+            arguments = (*_addresses(layer.forward_inputs), *layer.forward_sizes, *_addresses(layer.forward_outputs))
+            if products is not None:
+                products.dense_forward(layer.shape.in_features, layer.low.data_ptr(), *arguments)
+            else:
+                torch.mm(layer.x, layer.low.t(), out=layer.z)
                 self._layer_forward(*arguments)
         if self._head is None:
             out.copy_(self._features)
             return
         if not self._small_head:  # the backward pass follows this choice
             self._head_kernels = products and (products.wide_head_forward, products.wide_head_backward)
+        weight, bias = self._head
         if self._head_kernels is not None:
-            self._head_kernels[0](*self._head_addresses, self._space.rows, *self._head_sizes, out.data_ptr())
+            addresses = _addresses((self._features, weight, bias))
+            self._head_kernels[0](*addresses, self._space.rows, *self._head_sizes, out.data_ptr())
         else:
             if self._hidden is not self._features:
                 self._hidden.copy_(self._features)
-            torch.addmm(self._head[2], self._hidden, self._head[1], out=out)
+            torch.addmm(bias, self._hidden, weight.t(), out=out)
 
     def backward(self, grad: Tensor, trained: bool, add: bool, rows: Tensor | None, columns: slice | None) -> Tensor:
         if rows is not None:
             grad = grad.index_select(0, rows)
-        count, top = grad.shape[0], self._backward_steps[-1][2]
-        if self._head_kernels is not None:
-            grad = grad.contiguous()
-            arguments = (grad.data_ptr(), *self._head_addresses[:2], count, *self._head_sizes, trained, add)
-            self._head_kernels[1](*arguments, top.data_ptr(), *self._head_targets)
-        elif self._head is not None:
-            if trained:
-                weight, bias = self._head_grads
-                if add:
-                    weight.addmm_(grad.t(), self._hidden)
-                    bias.add_(grad.sum(0))
-                else:
-                    torch.mm(grad.t(), self._hidden, out=weight)
-                    torch.sum(grad, 0, out=bias)
-            top[:count].copy_(torch.mm(grad, self._head[0], out=self._head_gradient[:count]))
-        else:
+        count, top = grad.shape[0], self._layers[-1].here
+        if self._head is None:
             top[:count].copy_(grad)
+        else:
+            self._head_backward(self._head[0], grad, trained, add, top)
         kernel, products = self._layer_backward, self.products()
-        address = None if rows is None else rows.data_ptr()
-        for index in reversed(range(len(self._layers))):
-            layer, x, here, below, dz, dz_t, dw, into, weight, first, last = self._backward_steps[index]
-            kernel(*first, address, count, trained, add, *last)
+        index = None if rows is None else rows.data_ptr()
+        for layer in reversed(self._layers):
+            targets = _addresses(layer.norm_grads) if trained else (None, None, None)
+            numbers = index, count, trained, add, layer.shape.out_features
+            kernel(
+                *_addresses(layer.backward_inputs), *numbers, layer.dz.data_ptr(), *targets, self._scratch.data_ptr()
+            )
             if products is not None:
-                factors, target, (dz_at, weight_at, here_at, below_at), (start, *skip) = self._product_steps[index]
                 if trained:
-                    products.weight_gradient(*factors, add, target)
-                n, m = layer.in_features, layer.out_features
-                if index:
-                    products.dense_backward(dz_at, count, m, weight_at, n, n, here_at, start, *skip, below_at)
+                    layer.weight_gradient(products, add)
+                if layer.below is not None:
+                    layer.input_gradient(products, count, 0, layer.shape.in_features, layer.below)
                 elif columns is not None:
-                    first_column, width = columns.start, columns.stop - columns.start
-                    grad = torch.empty(count, width, dtype=dz.dtype)
-                    factor = weight_at + first_column * dz.itemsize, n, width
-                    place = here_at, start - first_column, *skip, grad.data_ptr()
-                    products.dense_backward(dz_at, count, m, *factor, *place)
+                    width = columns.stop - columns.start
+                    grad = torch.empty(count, width, dtype=layer.dz.dtype)
+                    layer.input_gradient(products, count, columns.start, width, grad)
                 continue
             if trained:
-                if add:
-                    into.add_(torch.mm(dz_t, x))
-                elif into.dtype == dz_t.dtype:
-                    torch.mm(dz_t, x, out=into)
-                else:
-                    into.copy_(torch.mm(dz_t, x, out=dw))
-            if rows is not None:
-                dz, here = dz[:count], here[:count]
-            if below is not None:
-                below = below if rows is None else below[:count]
-                torch.addmm(layer.skip_adjoint(here), dz, weight, out=below)
+                layer.weight_gradient_of_torch(add)
+            dz, here, weight = layer.dz[:count], layer.here[:count], layer.low
+            if layer.below is not None:
+                torch.addmm(layer.shape.skip_adjoint(here), dz, weight, out=layer.below[:count])
             elif columns is not None:
-                return layer.skip_adjoint(here)[:, columns] + torch.mm(dz, weight[:, columns])
+                return layer.shape.skip_adjoint(here)[:, columns] + torch.mm(dz, weight[:, columns])
         return grad
+
+    def _head_backward(self, weight: Tensor, grad: Tensor, trained: bool, add: bool, top: Tensor) -> None:
+        count = grad.shape[0]
+        if self._head_kernels is not None:
+            grad = grad.contiguous()
+            first = _addresses((grad, self._features, weight))
+            targets = _addresses(self._head_grads) if trained else (None, None)
+            scratch = (self._scratch.data_ptr(),) if self._small_head else ()
+            self._head_kernels[1](*first, count, *self._head_sizes, trained, add, top.data_ptr(), *targets, *scratch)
+            return
+        if trained:
+            into, bias = self._head_grads
+            if add:
+                into.addmm_(grad.t(), self._hidden)
+                bias.add_(grad.sum(0))
+            else:
+                torch.mm(grad.t(), self._hidden, out=into)
+                torch.sum(grad, 0, out=bias)
+        top[:count].copy_(torch.mm(grad, weight, out=self._head_gradient[:count]))
+
+
+class _LayerSpace:
+    """Tensors and sizes that the kernels of one layer take.
+
+    Args:
+        space: Memory that all layers share.
+        shape: The layer.
+        x: Its input.
+        own: Weight in the dtype of the products, bias, and the layer norm's scale and shift.
+        grads: Where the gradients of weight, bias, scale and shift go, or nothing.
+        buffers: Product, output, mean and reciprocal deviation.
+        flow: Number of layers above.
+    """
+
+    def __init__(
+        self,
+        space: Workspace,
+        shape: Layer,
+        x: Tensor,
+        own: Sequence[Tensor],
+        grads: Sequence[Tensor],
+        buffers: tuple[Tensor, Tensor, Tensor, Tensor],
+        flow: int,
+    ) -> None:
+        rows, n, m = space.rows, shape.in_features, shape.out_features
+        self.low, *norm = own
+        self.z, out, mean, rstd = buffers
+        self.x, self.shape = x, shape
+        self.forward_inputs = (self.z, *norm, x)
+        self.forward_sizes = (x.stride(0), *shape.skip_columns, shape.eps, rows, m)
+        self.forward_outputs = (out, mean, rstd, space._scratch)
+        if not space.keep:
+            return
+        # The gradient alternates between two buffers: the last layer's arrives in the first.
+        self.here = _corner(space._flow[flow % 2], rows, m)
+        self.below = _corner(space._flow[(flow + 1) % 2], rows, n) if x is not space._input else None
+        self.dz, self._dw = _corner(space._dz, rows, m), _corner(space._dw, m, n)
+        self.backward_inputs = (self.here, self.z, *norm, mean, rstd)
+        self.norm_grads = (grads[2], grads[3], grads[1]) if grads else ()
+        self._weight_grad = grads[0] if grads else None
+
+    def weight_gradient(self, products: Products, add: bool) -> None:
+        """Gradient of the weight by the kernels."""
+        assert self._weight_grad is not None
+        rows, m = self.dz.shape
+        sizes = self.x.shape[1], self.x.stride(0), rows
+        target = self._weight_grad.data_ptr()
+        products.weight_gradient(self.dz.data_ptr(), m, self.x.data_ptr(), *sizes, add, target)
+
+    def weight_gradient_of_torch(self, add: bool) -> None:
+        """Gradient of the weight by torch's product."""
+        into = self._weight_grad
+        assert into is not None
+        if add:
+            into.add_(torch.mm(self.dz.t(), self.x))
+        elif into.dtype == self.dz.dtype:
+            torch.mm(self.dz.t(), self.x, out=into)
+        else:
+            into.copy_(torch.mm(self.dz.t(), self.x, out=self._dw))
+
+    def input_gradient(self, products: Products, count: int, first: int, width: int, into: Tensor) -> None:
+        """Gradient of `width` columns of the input from column `first`, by the kernels."""
+        n, m = self.shape.in_features, self.shape.out_features
+        start, to, columns = self.shape.skip_columns
+        weight = self.low.data_ptr() + first * self.low.itemsize
+        place = self.here.data_ptr(), start - first, to, columns, into.data_ptr()
+        products.dense_backward(self.dz.data_ptr(), count, m, weight, n, width, *place)
+
+
+def _corner(memory: Tensor, rows: int, columns: int) -> Tensor:
+    """The beginning of `memory` as a matrix."""
+    return memory.view(-1)[: rows * columns].view(rows, columns)
+
+
+def _addresses(tensors: Sequence[Tensor]) -> list[int]:
+    return [tensor.data_ptr() for tensor in tensors]

@@ -1,6 +1,5 @@
 """The replay buffer with event tables and multi-tables (paper, Stratified Sampling; algorithms.md sections 6 and 7)."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
+from coachable.files import load_state, save_state
+from coachable.ranges import NOT_NEGATIVE, Range
 from coachable.replay.events import EventPredicate, Route, StyleEvents
-from coachable.replay.files import load_state, save_state
+from coachable.replay.files import read_records, write_records
 from coachable.replay.n_step import NStep
 from coachable.replay.settings import checked_horizon, checked_minimum, checked_proportions, make_regions
 from coachable.replay.stratified import StratifiedSampler, allot
@@ -113,7 +114,10 @@ class EventTableBuffer(TensorDictReplayBuffer):
                 raise ValueError(f"EventTableBuffer takes no {name}: it has its own sampler and writer, in one process")
         if n_steps != 1 and gamma is None:
             raise ValueError(f"n_steps is {n_steps} but gamma is missing: give the discount of the loss")
-        n_step = NStep(n_steps, gamma or 1.0, discounted_keys) if n_steps != 1 else None
+        Range("[0, 1]", optional=True).check("gamma", gamma)
+        n_step = None if n_steps == 1 or gamma is None else NStep(n_steps, gamma, discounted_keys)
+        NOT_NEGATIVE.check("priority_alpha", priority_alpha)
+        NOT_NEGATIVE.check("priority_beta", priority_beta)
         self.regions = regions
         super().__init__(
             storage=storage(regions.total),
@@ -146,8 +150,7 @@ class EventTableBuffer(TensorDictReplayBuffer):
         Raises:
             ValueError: If the share is not between 0 and 1.
         """
-        if not 0.0 < event_share < 1.0:
-            raise ValueError(f"event_share is {event_share}: expected a share of the batch, between 0 and 1")
+        Range("(0, 1)").check("event_share", event_share)
         capacities = {"default": capacity, **dict.fromkeys(events.names, event_capacity)}
         shares = {"default": 1.0 - event_share, **dict.fromkeys(events.names, event_share / len(events.names))}
         proportions = {"table_proportions": shares, **kwargs}
@@ -289,32 +292,27 @@ class EventTableBuffer(TensorDictReplayBuffer):
             self._batch_size = state_dict["_batch_size"]
 
     def dumps(self, path: Path | str) -> None:
-        """Saves the buffer to a folder, as memory-mapped tensors and JSON, without pickle."""
+        """Saves the buffer to a folder, as `.npy` files and tensors, without pickle."""
         path = Path(path).absolute()
         path.mkdir(parents=True, exist_ok=True)
         with self._replay_lock:
-            initialized = self._storage.initialized
-            if initialized:
-                self._storage.dumps(path / "storage")
-            save_state(self._light_state(), path / "state")
-            metadata = {"batch_size": self._batch_size, "initialized": initialized}
-            (path / "buffer.json").write_text(json.dumps(metadata), encoding="utf-8")
+            write_records(self._storage, path)
+            save_state({"_batch_size": self._batch_size, **self._light_state()}, path / "state.pt")
 
     def loads(self, path: Path | str) -> None:
-        """Restores what `dumps` saved; the tables must be the same.
+        """Restores what `dumps` saved, executing nothing from it; the tables must be the same.
 
         Raises:
+            CheckpointError: If files are missing, damaged or of another kind.
             ValueError: If tables, horizon or prioritisation differ.
         """
         path = Path(path).absolute()
-        metadata = json.loads((path / "buffer.json").read_text(encoding="utf-8"))
-        state = load_state(path / "state")
+        state = load_state(path / "state.pt")
         with self._replay_lock:
             self._writer.load_state_dict(state["_writer"])
-            if metadata["initialized"]:
-                self._storage.loads(path / "storage")
+            read_records(self._storage, path)
             self._load_light_state(state)
-            self._batch_size = metadata["batch_size"]
+            self._batch_size = state["_batch_size"]
 
     def _light_state(self) -> dict[str, Any]:
         """All but the records."""

@@ -1,34 +1,133 @@
-"""State dicts on disk without pickle."""
+"""The records of a replay buffer on disk: one `.npy` file per entry with its checksum, written and read in chunks."""
 
-from collections.abc import Mapping
+import json
+import os
+import zlib
 from pathlib import Path
 from typing import Any
 
-from torchrl.checkpoint import StateDictCheckpointAdapter
+import numpy as np
+import torch
+from tensordict import TensorDict
 
-__all__ = ["load_state", "save_state"]
+from coachable.files import CheckpointError, refusing, write_text
 
+__all__ = ["read_records", "record_bytes", "write_records"]
 
-class _State:
-    """What the checkpoint adapter takes for a component."""
-
-    def __init__(self, state: Mapping[str, Any] | None = None) -> None:
-        self.state = state
-
-    def state_dict(self) -> Mapping[str, Any] | None:
-        return self.state
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        self.state = state
+_VERSION = 2  # 1, without a version, had no checksums
+_INDEX = "index.json"
+_CHUNK = 65_536  # records per copy: bounds the extra memory
 
 
-def save_state(state: Mapping[str, Any], path: Path) -> None:
-    """Writes nested dicts and lists of tensors, numbers and strings as memory-mapped tensors and JSON."""
-    StateDictCheckpointAdapter().save(_State(state), path, args=(), kwargs={})
+def write_records(storage: Any, folder: Path) -> None:
+    """Write the filled part of a `TensorStorage`.
+
+    Args:
+        storage: Of a replay buffer.
+        folder: Exists.
+
+    Raises:
+        OSError: If writing fails.
+    """
+    filled = len(storage)
+    index: dict[str, Any] = {"version": _VERSION, "filled": filled, "capacity": storage.max_size, "entries": []}
+    data = storage.get(slice(0, filled)).items(include_nested=True, leaves_only=True) if filled else ()
+    for key, value in data:
+        path = [key] if isinstance(key, str) else list(key)
+        dtype = np.lib.format.dtype_to_descr(_numpy(value[:1]).dtype)
+        crc = 0
+        with (folder / _file(path)).open("wb") as stream:
+            header = {"descr": dtype, "fortran_order": False, "shape": tuple(value.shape)}
+            np.lib.format.write_array_header_1_0(stream, header)
+            for start in range(0, filled, _CHUNK):
+                chunk = _numpy(value[start : start + _CHUNK])
+                crc = zlib.crc32(chunk.data, crc)
+                chunk.tofile(stream)
+            stream.flush()
+            os.fsync(stream.fileno())
+        index["entries"].append({"key": path, "dtype": dtype, "shape": list(value.shape), "crc32": crc})
+    write_text(folder / _INDEX, json.dumps(index, indent=1))
 
 
-def load_state(path: Path) -> Any:
-    """Reads what `save_state` wrote; the tensors are mapped to the files, so clone what is kept."""
-    loaded = _State()
-    StateDictCheckpointAdapter().load(loaded, path, map_location="cpu", tensor_load_kwargs={}, args=(), kwargs={})
-    return loaded.state
+def read_records(storage: Any, folder: Path) -> int:
+    """Fill a storage from `write_records`'s files.
+
+    Args:
+        storage: Of a buffer made like the saved one. Where reading fails, it may hold a part of the records.
+        folder: Written by `write_records`.
+
+    Returns:
+        How many records were read.
+
+    Raises:
+        CheckpointError: If files are missing, damaged or link elsewhere, or the capacities differ (a ring buffer's
+            order depends on it).
+    """
+    if not (folder / _INDEX).is_file():
+        raise CheckpointError(f"no such file: {folder / _INDEX}, which lists the records of the replay buffer")
+    with refusing(folder / _INDEX, "a list of records"):
+        index = json.loads((folder / _INDEX).read_text(encoding="utf-8"))
+        version, filled, capacity = index.get("version", 1), index["filled"], index["capacity"]
+        if version not in (1, _VERSION):
+            raise ValueError(f"it has version {version!r}, expected {_VERSION}")
+    if capacity != storage.max_size:
+        raise CheckpointError(
+            f"the replay buffer in {folder} holds {capacity} records, this run's {storage.max_size}: set the same "
+            f"capacity (replay_capacity), or remove {folder} to resume without it"
+        )
+    with refusing(folder, "records"):
+        arrays = {tuple(entry["key"]): _array(folder, entry, filled, version) for entry in index["entries"]}
+        if bool(arrays) != bool(filled):
+            raise ValueError(f"there are {len(arrays)} entries of {filled} records")
+        found = dict.fromkeys(arrays, 0)
+        for start in range(0, filled, _CHUNK):
+            stop = min(start + _CHUNK, filled)
+            chunk = TensorDict({}, batch_size=[stop - start])
+            for key, array in arrays.items():
+                values = np.array(array[start:stop], order="C")
+                found[key] = zlib.crc32(values.data, found[key])
+                chunk.set(key, torch.from_numpy(values))
+            storage.set(torch.arange(start, stop), chunk)
+    for entry in index["entries"]:
+        if version > 1 and found[tuple(entry["key"])] != entry["crc32"]:
+            raise CheckpointError(
+                f"{folder / _file(entry['key'])} is damaged: its content does not agree with its checksum in {_INDEX}. "
+                f"Resume from another checkpoint, or remove {folder} to resume without the replay buffer"
+            )
+    return filled
+
+
+def record_bytes(storage: Any) -> int:
+    """What the records of a storage take on disk."""
+    if not len(storage):
+        return 0
+    first = storage.get(slice(0, 1))
+    return len(storage) * sum(v.numel() * v.element_size() for v in first.values(True, True))
+
+
+def _array(folder: Path, entry: dict[str, Any], filled: int, version: int) -> np.ndarray:
+    file = folder / _file(entry["key"])
+    if not file.is_file():
+        raise CheckpointError(f"no such file: {file}, which {_INDEX} names")
+    try:
+        array = np.lib.format.open_memmap(file, mode="r")  # refuses arrays of objects, which would need pickle
+    except ValueError as error:
+        raise CheckpointError(f"{file} is damaged or no array of numbers: {error}") from error
+    expected = (entry["dtype"], tuple(entry["shape"])) if version > 1 else (array.dtype.str, (filled, *array.shape[1:]))
+    if (np.lib.format.dtype_to_descr(array.dtype), array.shape) != expected or array.shape[0] != filled:
+        raise CheckpointError(
+            f"{file} holds {array.dtype.str} of shape {array.shape}: {_INDEX} says {expected[0]} of shape {expected[1]}"
+        )
+    return array
+
+
+def _file(key: list[str]) -> str:
+    """Name of an entry's file, which never leads out of its folder."""
+    name = ".".join(key) + ".npy"
+    if Path(name).name != name:
+        raise CheckpointError(f"{name!r} is no name of a file of records: expected one without folders")
+    return name
+
+
+def _numpy(value: torch.Tensor) -> np.ndarray:
+    return np.ascontiguousarray(value.detach().cpu().numpy())

@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from coachable.keys import EVENTS, STYLE_FEATURES, STYLE_REWARD, TASK_REWARD
+from coachable.ranges import COUNT, SHARE
 from coachable.replay.steps import Steps
 
 __all__ = ["NStep"]
@@ -36,14 +37,12 @@ class NStep:
         patience: A stream of which nothing arrived for that many steps has ended.
 
     Raises:
-        ValueError: If `n_steps` is not positive or `gamma` lies outside (0, 1].
+        ValueError: If `n_steps` is not positive or `gamma` lies outside [0, 1].
     """
 
     def __init__(self, n_steps: int, gamma: float, discounted_keys: Sequence[Key] = (), patience: int = 2**62) -> None:
-        if n_steps < 1:
-            raise ValueError(f"n_steps is {n_steps}: expected at least 1")
-        if not 0.0 < gamma <= 1.0:
-            raise ValueError(f"gamma is {gamma}: expected a discount in (0, 1] (needed because n_steps is {n_steps})")
+        COUNT.check("n_steps", n_steps)
+        SHARE.check("gamma", gamma)
         self.n_steps = n_steps
         self.gamma = gamma
         self.summed = tuple(

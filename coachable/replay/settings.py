@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from coachable.ranges import COUNT, Range
 from coachable.replay.events import EventPredicate, Route
 from coachable.replay.regions import Regions
 
@@ -39,16 +40,15 @@ def checked_horizon(
     Raises:
         ValueError: If it is missing, not positive, or larger than a table.
     """
-    if num_envs is not None and num_envs < 1:
-        raise ValueError(f"num_envs is {num_envs}: expected a positive integer")
+    Range("[1, inf)", whole=True, optional=True).check("num_envs", num_envs)
     if events is None:
         if horizon is not None:
             raise ValueError(
                 f"event_horizon is {horizon} but there are no event tables: give events= as well, or neither"
             )
         return 1
-    if horizon is None or horizon < 1:
-        raise ValueError(f"event_horizon is {horizon}: expected the number of steps to store per event, at least 1")
+    COUNT.check("event_horizon", horizon)
+    assert horizon is not None
     for name, capacity in zip(regions.names[routed:], regions.capacities[routed:].tolist(), strict=True):
         if horizon > capacity:
             raise ValueError(

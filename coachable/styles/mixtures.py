@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Literal, get_args
 
+from coachable.ranges import SHARE
 from coachable.styles.parameters import Setpoint, Weight
 from coachable.styles.samplers import ContinuousOneHot, Mixture, OneHot, PointMass, Product, Sampler, Shared, Uniform
 from coachable.styles.space import StyleSpace
@@ -42,9 +43,10 @@ def style_mixture(
         return StyleSpace(space.parameters).sampler
     _require((Weight,), space, f"sampler {single} leaves all weights but one at 0, which {{}} cannot be (not a weight)")
     low, high = space.low.tolist(), space.high.tolist()
+    rest = _rest(neutral=neutral, independent=independent)
     every = Uniform(low, high)
     one = {"continuous_one_hot": ContinuousOneHot(low, high), "one_hot": OneHot(high), "independent": every}[single]
-    return Mixture([PointMass([0.0] * space.dim), every, one], [neutral, independent, 1.0 - neutral - independent])
+    return Mixture([PointMass([0.0] * space.dim), every, one], [neutral, independent, rest])
 
 
 def with_requests(space: StyleSpace, *, positive: float = 0.25, full: float = 0.15, neutral: float = 0.1) -> Sampler:
@@ -68,7 +70,7 @@ def with_requests(space: StyleSpace, *, positive: float = 0.25, full: float = 0.
     _require((Weight,), space, "sampler with_requests asks for weights of 0, which {} cannot be (not a weight)")
     high, zero = space.high.tolist(), [0.0] * space.dim
     parts = [PointMass(zero), PointMass(high), Uniform(zero, high), space.sampler]
-    return Mixture(parts, [neutral, full, positive, 1.0 - neutral - full - positive])
+    return Mixture(parts, [neutral, full, positive, _rest(neutral=neutral, full=full, positive=positive)])
 
 
 def with_extremes(
@@ -91,6 +93,7 @@ def with_extremes(
     Raises:
         ValueError: If a parameter is a choice or unknown, or the share is not in [0, 1].
     """
+    SHARE.check("share", share)
     _require((Weight, Setpoint), space, "sampler with_extremes asks for bounds, which {} cannot have (a choice)")
     chosen = space.names if only is None else tuple(only)
     if unknown := sorted(set(chosen) - set(space.names)):
@@ -107,6 +110,17 @@ def with_extremes(
         return Mixture([extremes, own], [share, 1.0 - share])
     mixed = Mixture([extremes, own.sampler], [share, 1.0 - share])
     return Shared(mixed, own.copies) if shared else mixed
+
+
+def _rest(**probabilities: float) -> float:
+    """What probabilities leave of 1."""
+    for name, value in probabilities.items():
+        SHARE.check(name, value)
+    rest = 1.0 - sum(probabilities.values())
+    if rest < -1e-9:
+        given = ", ".join(f"{name} {value}" for name, value in probabilities.items())
+        raise ValueError(f"{given} exceed 1 together: expected probabilities that sum to 1 at most")
+    return max(rest, 0.0)
 
 
 def _others(space: StyleSpace, kinds: tuple[type, ...]) -> list[str]:

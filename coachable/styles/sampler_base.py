@@ -31,7 +31,7 @@ class Sampler:
 
     A new sampler is a frozen dataclass that subclasses this and defines `dim`, `_draw` and, for the range check of
     `StyleSpace`, `support`. Its fields must be numbers, strings, samplers or tuples of these: serialisation follows
-    from them.
+    from them. Draws may depend on each other along the last batch dimension only (`Shared`).
     """
 
     @property
@@ -69,6 +69,15 @@ class Sampler:
         source = generator.device if generator is not None else target
         drawn = self._draw(tuple(shape), generator, source)
         return drawn if source == target else drawn.to(target)
+
+    def sample_independent(
+        self,
+        shape: Sequence[int] = (),
+        generator: Generator | None = None,
+        device: torch.device | str | None = None,
+    ) -> Tensor:
+        """Draws styles none of which depends on another, unlike the rows of a batch of `Shared`; see `sample`."""
+        return self.sample((*shape, 1), generator, device).squeeze(-2)
 
     def _draw(self, shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
         raise NotImplementedError(f"{type(self).__name__} must define _draw")

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Generator, Tensor
 
+from coachable.ranges import COUNT, FINITE, SHARE
 from coachable.styles.sampler_base import Sampler, constant, numbers
 
 __all__ = [
@@ -27,8 +28,14 @@ __all__ = [
 
 
 def _check_bounds(who: str, low: tuple[float, ...], high: tuple[float, ...]) -> None:
+    _check_finite(who, low + high)
     if len(low) != len(high) or not low or not all(a <= b for a, b in zip(low, high, strict=True)):
         raise ValueError(f"{who} has low {low} and high {high}: expected equal lengths and low <= high throughout.")
+
+
+def _check_finite(who: str, values: tuple[float, ...]) -> None:
+    for value in values:
+        FINITE.check(f"a value of {who}", value)
 
 
 def _rand(shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
@@ -58,6 +65,7 @@ class PointMass(Sampler):
 
     def __init__(self, values: float | Sequence[float]) -> None:
         object.__setattr__(self, "values", numbers(values))
+        _check_finite("PointMass", self.values)
 
     @property
     def dim(self) -> int:
@@ -135,7 +143,8 @@ class Mixture(Sampler):
             raise ValueError(
                 f"Mixture has components of dimensions {dims}: expected at least one, all of one dimension."
             )
-        if len(self.weights) != len(dims) or min(self.weights) < 0 or abs(sum(self.weights) - 1.0) > 1e-6:
+        fine = all(SHARE.holds(weight) for weight in self.weights) and abs(sum(self.weights) - 1.0) <= 1e-6
+        if len(self.weights) != len(dims) or not fine:
             raise ValueError(
                 f"Mixture has weights {self.weights}, summing to {sum(self.weights)}: "
                 f"expected {len(dims)} probabilities that sum to 1."
@@ -214,8 +223,7 @@ class UniformChoice(Sampler):
     n: int
 
     def __post_init__(self) -> None:
-        if self.n < 1:
-            raise ValueError(f"UniformChoice has n = {self.n}: expected at least one option.")
+        COUNT.check("n of UniformChoice", self.n)
 
     @property
     def dim(self) -> int:
@@ -279,6 +287,7 @@ class OneHot(Sampler):
 
     def __init__(self, values: float | Sequence[float]) -> None:
         object.__setattr__(self, "values", numbers(values))
+        _check_finite("OneHot", self.values)
 
     @property
     def dim(self) -> int:
@@ -297,7 +306,8 @@ class OneHot(Sampler):
 class Shared(Sampler):
     """One style for several rows of a batch, such as the cars of a race.
 
-    In a batch `(copies * n,)` rows i, i + n, i + 2 n and so on share a style.
+    In a batch `(copies * n,)` rows i, i + n, i + 2 n and so on share a style. Where every draw has to be independent,
+    as in relabelling, `sample_independent` shares nothing.
 
     Args:
         sampler: Distribution of the shared style.
@@ -316,8 +326,7 @@ class Shared(Sampler):
     copies: int
 
     def __post_init__(self) -> None:
-        if self.copies < 1:
-            raise ValueError(f"copies is {self.copies}: expected at least 1")
+        COUNT.check("copies", self.copies)
 
     @property
     def dim(self) -> int:

@@ -10,7 +10,6 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torch.autograd.graph import increment_version
 from torchrl.objectives import LossModule
 
 from coachable.networks.ensemble import CriticEnsemble, Triple, make_plan, planned_copy, residual_networks
@@ -21,8 +20,8 @@ from coachable.networks.fused import Plan
 class Acceleration:
     """Hand-written passes for a loss's policy and critics.
 
-    Gradients go to the parameters' `.grad`, which are parts of one buffer each for the policy and the critics. Outside
-    of :meth:`active` the loss is as it was.
+    Inside of :meth:`active`, gradients go to the parameters' `.grad`, which are parts of one buffer each for the policy
+    and the critics. Outside, the loss is as it was. Call :meth:`bind` if its parameters are others since.
 
     Args:
         loss_module: A loss for which :meth:`supports` holds.
@@ -32,26 +31,38 @@ class Acceleration:
     def __init__(self, loss_module: LossModule, dtype: torch.dtype | None) -> None:
         loss: Any = loss_module
         self._loss = loss
-        actor, critic = loss.actor_network, loss.qvalue_network
-        actor_names = [name for name, _ in actor.named_parameters()]
-        critic_names = [name for name, _ in critic.named_parameters()]
-        actor_params = _leaves(loss.actor_network_params, actor_names)
-        critic_params = _leaves(loss.qvalue_network_params, critic_names)
-        self.actor = FlatBuffers(actor_params, dtype, trained=True)
-        self.critic = FlatBuffers(critic_params, dtype, trained=True)
-        self._trained = [*zip(actor_params, self.actor.grads, strict=True)]
-        self._trained += zip(critic_params, self.critic.grads, strict=True)
-        self.target = FlatBuffers(_leaves(loss.target_qvalue_network_params, critic_names), dtype, trained=False)
-        members = self.critic.tensors[0].shape[0]
+        self._actor_names = [name for name, _ in loss.actor_network.named_parameters()]
+        self._critic_names = [name for name, _ in loss.qvalue_network.named_parameters()]
+        actor, critic, target = self._leaves()
+        self.actor = FlatBuffers(actor, dtype, trained=True)
+        self.critic = FlatBuffers(critic, dtype, trained=True)
+        self.target = FlatBuffers(target, dtype, trained=False)
+        self._buffers = (self.actor, self.critic, self.target)
+        self._prepare()
 
-        self._policies = residual_networks(actor)
+    def _leaves(self) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
+        """Parameters of policy, critics and target critics that the loss has now."""
+        loss = self._loss
+        return (
+            _leaves(loss.actor_network_params, self._actor_names),
+            _leaves(loss.qvalue_network_params, self._critic_names),
+            _leaves(loss.target_qvalue_network_params, self._critic_names),
+        )
+
+    def _prepare(self) -> None:
+        """Make what works on the tensors in the buffers."""
+        critic = self._loss.qvalue_network
+        members = self.critic.tensors[0].shape[0]
+        self._trained = [*zip(self.actor.originals, self.actor.grads, strict=True)]
+        self._trained += zip(self.critic.originals, self.critic.grads, strict=True)
+        self._policies = residual_networks(self._loss.actor_network)
         self._actor_plans = {
-            name: make_plan(network, name, _triples(self.actor, actor_names), 0, trained=True)
+            name: make_plan(network, name, _triples(self.actor, self._actor_names), 0, trained=True)
             for name, network in self._policies.items()
         }
 
         def plans(flat: FlatBuffers, trained: bool) -> dict[str, Plan]:
-            tensors = _triples(flat, critic_names)
+            tensors = _triples(flat, self._critic_names)
             networks = residual_networks(critic).items()
             return {name: make_plan(net, name, tensors, members, trained=trained) for name, net in networks}
 
@@ -60,8 +71,21 @@ class Acceleration:
         self.frozen_critics = _critics(critic, plans(self.critic, False))
         self.target_critics = _critics(critic, plans(self.target, False))
         self._ensemble = CriticEnsemble(critic, self._choose, members)
-        self._buffers = (self.actor, self.critic, self.target)
-        loss.register_load_state_dict_post_hook(_tell)
+
+    def bind(self) -> None:
+        """Go on with the loss's parameters as they are now, after they were replaced, cast or given other memory.
+
+        Raises:
+            RuntimeError: If :meth:`supports` does not hold any more.
+        """
+        if not self.supports(self._loss):
+            raise RuntimeError(
+                f"{type(self._loss).__name__} changed since its learner was made (another device, frozen parameters or "
+                "other networks): make a new learner for it"
+            )
+        for flat, tensors in zip(self._buffers, self._leaves(), strict=True):
+            flat.bind(tensors)
+        self._prepare()
 
     @staticmethod
     def supports(loss_module: LossModule) -> bool:
@@ -117,6 +141,8 @@ class Acceleration:
             loss._vmap_qnetworkN0 = ordinary
             for network in self._policies.values():
                 network.use_plan(None)
+            for parameter, _ in self._trained:
+                parameter.grad = None
 
     def buffers(self, name: str) -> tuple[FlatBuffers, FlatBuffers | None]:
         """Buffers of the `"actor"` or the `"critic"`, and those of its target network."""
@@ -129,21 +155,14 @@ class Acceleration:
         return (self.actor if name == "actor" else self.critic).grad
 
 
-def _tell(loss: LossModule, _: Any) -> None:
-    """Hook after loading, which goes through `.data`, so that versions do not tell of it.
-
-    It knows nothing but its arguments, so that a copy of the loss has one of its own.
-    """
-    increment_version([*loss.parameters(), *loss.buffers()])
-
-
 def _critics(critic: TensorDictModule, plans: dict[str, Plan]) -> nn.Module:
     module: Any = planned_copy(critic, plans)
     return module.module
 
 
-def _leaves(params: TensorDictBase, names: list[str]) -> list[Tensor]:
-    return [params.get(tuple(name.split("."))) for name in names]  # pyright: ignore[reportReturnType]
+def _leaves(params: Any, names: list[str]) -> list[Tensor]:
+    tensors = dict(params.named_parameters()) or dict(params.named_buffers())
+    return [tensors[name] for name in names]
 
 
 def _triples(flat: FlatBuffers, names: list[str]) -> dict[str, Triple]:

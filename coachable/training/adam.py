@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -45,17 +47,12 @@ class FlatAdam(torch.optim.Adam):
         super().__init__(params, lr=lr, eps=eps, fused=True)
         self._flat, self._target, self._tau = flat, target, tau
         self.grad_norm = torch.zeros(())
-        self._steps: list[Tensor] = []
-        self._moments: tuple[list[Tensor], list[Tensor]] = ([], [])
-        self._table = torch.empty(0)
         place_moments(self)
-        self._prepare()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore a state of this class or of `torch.optim.Adam`."""
         super().load_state_dict(state_dict)
         place_moments(self)
-        self._prepare()
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -63,43 +60,47 @@ class FlatAdam(torch.optim.Adam):
         (group,) = self.param_groups
         (beta1, beta2), rate, eps = group["betas"], group["lr"], group["eps"]
         flat, target, tensors = self._flat, self._target, self._flat.tensors
-        if torch.get_num_threads() <= KERNEL_THREADS and (kernels := load_kernels()):
-            steps = self._steps[0].item() + 1.0
-            rate, root = rate / (1.0 - beta1**steps), (1.0 - beta2**steps) ** -0.5
-            address = self._table.data_ptr()
-            squares = kernels[torch.float32].adam(address, len(tensors), rate, beta1, beta2, root, eps, self._tau)
+        states = [self.state[parameter] for parameter in flat.originals]
+        steps, first, second = ([state[name] for state in states] for name in ("step", "exp_avg", "exp_avg_sq"))
+        single = tensors[0].dtype == torch.float32
+        if single and torch.get_num_threads() <= KERNEL_THREADS and (kernels := load_kernels()):
+            taken = steps[0].item() + 1.0
+            rate, root = rate / (1.0 - beta1**taken), (1.0 - beta2**taken) ** -0.5
+            table = _table(flat, target, first, second, steps)
+            squares = kernels[torch.float32].adam(table, len(tensors), rate, beta1, beta2, root, eps, self._tau)
             self.grad_norm = torch.scalar_tensor(squares**0.5)
             flat.renewed()
             if target is not None:
                 target.renewed()
             return
-        torch._foreach_add_(self._steps, 1.0)
+        torch._foreach_add_(steps, 1.0)
         self.grad_norm = torch.linalg.vector_norm(flat.grad)
         options = {"lr": rate, "beta1": beta1, "beta2": beta2, "eps": eps, "weight_decay": 0.0}
-        moments = self._moments
-        torch._fused_adam_(tensors, flat.grads, *moments, [], self._steps, **options, amsgrad=False, maximize=False)
+        torch._fused_adam_(tensors, flat.grads, first, second, [], steps, **options, amsgrad=False, maximize=False)
         increment_version(tensors)  # torch's function does not
         flat.refresh()
         if target is not None:
             torch._foreach_lerp_(target.tensors, tensors, self._tau)
             target.refresh()
 
-    def _prepare(self) -> None:
-        """Sort the state as the buffers are, and write the addresses for the kernel, see `Parameter` in kernels.c."""
-        by_address = {p.data_ptr(): self.state[p] for p in self.param_groups[0]["params"]}
-        states = [by_address[tensor.data_ptr()] for tensor in self._flat.tensors]
-        self._steps = [state["step"] for state in states]
-        self._moments = [state["exp_avg"] for state in states], [state["exp_avg_sq"] for state in states]
-        flat, target, none = self._flat, self._target, [None] * len(states)
-        columns = [flat.tensors, *self._moments, flat.grads, flat.low if flat.rounds else none]
-        columns += [none, none] if target is None else [target.tensors, target.low if target.rounds else none]
-        columns += [self._steps]
-        self._table = torch.tensor(
-            [
-                [row[0].numel(), *(0 if tensor is None else tensor.data_ptr() for tensor in row)]
-                for row in zip(*columns, strict=True)
-            ]
-        )
+
+def _table(
+    flat: FlatBuffers, target: FlatBuffers | None, first: list[Tensor], second: list[Tensor], steps: list[Tensor]
+) -> Any:
+    """Sizes and addresses for one call of the kernel, see `Parameter` in kernels.c."""
+    none = [None] * len(steps)
+    columns: list[Sequence[Tensor | None]] = [
+        flat.tensors,
+        first,
+        second,
+        flat.grads,
+        flat.low if flat.rounds else none,
+    ]
+    columns += [none, none] if target is None else [target.tensors, target.low if target.rounds else none]
+    columns += [steps]
+    rows = [[0 if t is None else t.data_ptr() for t in row] for row in zip(*columns, strict=True)]
+    numbers = [number for t, row in zip(flat.tensors, rows, strict=True) for number in (t.numel(), *row)]
+    return (ctypes.c_int64 * len(numbers))(*numbers)
 
 
 def place_moments(optimizer: torch.optim.Adam) -> None:

@@ -18,6 +18,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from coachable.files import (
+    CheckpointError,
+    check_contained,
+    check_finite,
+    load_state,
+    save_state,
+    space_named,
+    sync_folder,
+    tensor_bytes,
+    write_text,
+)
+from coachable.replay.files import record_bytes
 from coachable.training.replay_files import write_replay
 
 __all__ = ["CheckpointError", "CheckpointStore", "check_fits", "check_writable", "find_checkpoint", "read_state"]
@@ -25,10 +37,7 @@ __all__ = ["CheckpointError", "CheckpointStore", "check_fits", "check_writable",
 SCHEMA_VERSION = 1
 _LATEST = "LATEST"
 _STATE = "state.pt"
-
-
-class CheckpointError(RuntimeError):
-    """A checkpoint is missing, damaged or does not fit the run that wants it."""
+_WEIGHTS = ("actor", "critics", "learner")  # parts of a state that must be finite
 
 
 class CheckpointStore:
@@ -65,24 +74,29 @@ class CheckpointStore:
             The folder.
 
         Raises:
-            OSError: if writing fails (disk full, no permission); the partial is removed first.
+            CheckpointError: if a weight is NaN or infinite; nothing is written.
+            OSError: if writing fails (disk full, no permission), with the space that is needed; the partial is removed.
         """
+        self._check_finite(state, int(metadata["frames"]))
         self.directory.mkdir(parents=True, exist_ok=True)
+        replay = replay if self.replay else None
+        required_bytes = tensor_bytes(state) + (0 if replay is None else record_bytes(replay.storage))
         name = self._free_name(int(metadata["frames"]))
         partial = self.directory / f".{name}.partial"
         shutil.rmtree(partial, ignore_errors=True)
         try:
-            partial.mkdir()
-            _save_tensors({"schema": SCHEMA_VERSION, **state}, partial / _STATE)
-            _write_text(partial / "metadata.json", json.dumps({**metadata, **_provenance()}, indent=1))
-            if replay is not None and self.replay:
-                write_replay(replay, partial / "replay")
-            _sync_folder(partial)
-            os.rename(partial, self.directory / name)
-            pointer = self.directory / f".{_LATEST}.partial"
-            _write_text(pointer, name + "\n")
-            os.replace(pointer, self.directory / _LATEST)
-            _sync_folder(self.directory)
+            with space_named(self.directory / name, required_bytes):
+                partial.mkdir()
+                save_state({"schema": SCHEMA_VERSION, **state}, partial / _STATE)
+                write_text(partial / "metadata.json", json.dumps({**metadata, **_provenance()}, indent=1))
+                if replay is not None:
+                    write_replay(replay, partial / "replay")
+                sync_folder(partial)
+                os.rename(partial, self.directory / name)
+                pointer = self.directory / f".{_LATEST}.partial"
+                write_text(pointer, name + "\n")
+                os.replace(pointer, self.directory / _LATEST)
+                sync_folder(self.directory)
         except BaseException:
             shutil.rmtree(partial, ignore_errors=True)
             raise
@@ -90,16 +104,31 @@ class CheckpointStore:
         return self.directory / name
 
     def try_save(self, state: Mapping[str, Any], metadata: Mapping[str, Any], replay: Any | None = None) -> Path | None:
-        """Like `save`, but a failed write only warns: a long training should outlive a disk that is full."""
+        """Like `save`, but a failed write only warns: a long training should outlive a disk that is full.
+
+        Raises:
+            CheckpointError: if a weight is NaN or infinite: going on would only lose time.
+        """
         try:
             return self.save(state, metadata, replay)
         except OSError as error:
             warnings.warn(
-                f"checkpoint at {metadata['frames']} frames was not written to {self.directory}: {error}. "
-                "Training goes on; the previous checkpoint is intact.",
+                f"checkpoint at {metadata['frames']} frames was not written: {error}. Training goes on; the previous "
+                "checkpoint is intact.",
                 stacklevel=2,
             )
             return None
+
+    def _check_finite(self, state: Mapping[str, Any], frames: int) -> None:
+        try:
+            check_finite({name: state[name] for name in _WEIGHTS if name in state}, f"the agent at {frames} frames")
+        except CheckpointError as error:
+            complete = _complete(self.directory) if self.directory.is_dir() else []
+            kept = f"{complete[-1]} is kept" if complete else "there is no earlier one"
+            raise CheckpointError(
+                f"no checkpoint was written, {kept}: {error}. Look for rewards that are too large, lower the learning "
+                "rates, or set learner.max_grad_norm"
+            ) from None
 
     def _free_name(self, frames: int) -> str:
         base = f"frames_{frames:012d}"
@@ -127,23 +156,24 @@ def find_checkpoint(path: Path | str) -> Path:
         path: a checkpoint, the `checkpoints` folder of a run, or the run's folder (then: its newest).
 
     Raises:
-        CheckpointError: if there is none.
+        CheckpointError: if there is none, or it links to what lies elsewhere.
     """
     path = Path(path).expanduser()
     if (path / _STATE).is_file():
-        return path
-    folder = path / "checkpoints" if (path / "checkpoints").is_dir() else path
-    pointer = folder / _LATEST
-    if pointer.is_file():
-        named = folder / pointer.read_text(encoding="utf-8").strip()
-        if (named / _STATE).is_file():
-            return named
-    complete = _complete(folder) if folder.is_dir() else []
-    if not complete:
-        raise CheckpointError(
-            f"no checkpoint at {path}: expected a run's folder, its checkpoints/ or one folder of them"
-        )
-    return complete[-1]
+        found = path
+    else:
+        folder = path / "checkpoints" if (path / "checkpoints").is_dir() else path
+        complete = _complete(folder) if folder.is_dir() else []
+        if not complete:
+            raise CheckpointError(
+                f"no checkpoint at {path}: expected a run's folder, its checkpoints/ or one folder of them"
+            )
+        newest = _pointed_to(folder)
+        found = next((checkpoint for checkpoint in complete if checkpoint.name == newest), complete[-1])
+        if not found.resolve().is_relative_to(path.resolve()):
+            raise CheckpointError(f"{found} lies at {found.resolve()}: expected a checkpoint inside of {path}, no link")
+    check_contained(found)
+    return found
 
 
 def read_state(path: Path | str, device: torch.device | str = "cpu") -> dict[str, Any]:
@@ -154,19 +184,16 @@ def read_state(path: Path | str, device: torch.device | str = "cpu") -> dict[str
         device: where tensors go.
 
     Raises:
-        CheckpointError: if it is damaged, of another schema, or would need pickle.
+        CheckpointError: if it is damaged, of another schema, would need pickle, or holds weights that are not finite.
     """
     path = Path(path)
     file = path / _STATE if path.is_dir() else path
-    try:
-        state = torch.load(file, map_location=device, weights_only=True)
-    except FileNotFoundError:
-        raise CheckpointError(f"no such file: {file}") from None
-    except Exception as error:
-        raise CheckpointError(f"cannot read {file}: {error}") from error
-    if not isinstance(state, dict) or state.get("schema") != SCHEMA_VERSION:
-        found = state.get("schema") if isinstance(state, dict) else type(state).__name__
-        raise CheckpointError(f"{file} has schema {found}, this version of coachable reads schema {SCHEMA_VERSION}")
+    state = load_state(file, device)
+    if state.get("schema") != SCHEMA_VERSION:
+        raise CheckpointError(
+            f"{file} has schema {state.get('schema')!r}, this version of coachable reads schema {SCHEMA_VERSION}"
+        )
+    check_finite({name: state[name] for name in _WEIGHTS if name in state}, file)
     return state
 
 
@@ -184,11 +211,12 @@ def check_fits(saved: Mapping[str, Tensor], present: Mapping[str, Tensor], what:
     """
     problems = [f"{name} is missing in the checkpoint" for name in present if name not in saved]
     problems += [f"{name} is unknown here" for name in saved if name not in present]
-    problems += [
-        f"{name} is {tuple(saved[name].shape)} in the checkpoint, {tuple(value.shape)} here"
-        for name, value in present.items()
-        if name in saved and saved[name].shape != value.shape
-    ]
+    for name, value in present.items():
+        there = saved.get(name, value)
+        if not isinstance(there, Tensor) or there.is_floating_point() != value.is_floating_point():
+            problems.append(f"{name} is no tensor of {value.dtype}s in the checkpoint")
+        elif there.shape != value.shape:
+            problems.append(f"{name} is {tuple(there.shape)} in the checkpoint, {tuple(value.shape)} here")
     if problems:
         shown = "; ".join(problems[:6]) + (f"; and {len(problems) - 6} more" if len(problems) > 6 else "")
         raise CheckpointError(
@@ -236,29 +264,13 @@ def _complete(directory: Path) -> list[Path]:
     return sorted(found, key=lambda p: ((p / _STATE).stat().st_mtime_ns, p.name))
 
 
-def _save_tensors(state: Mapping[str, Any], file: Path) -> None:
-    try:
-        with file.open("wb") as stream:
-            torch.save(dict(state), stream)
-            stream.flush()
-            os.fsync(stream.fileno())
-    except RuntimeError as error:  # torch's zip writer reports a failed write this way
-        raise OSError(str(error)) from error
-
-
-def _write_text(file: Path, text: str) -> None:
-    with file.open("w", encoding="utf-8") as stream:
-        stream.write(text)
-        stream.flush()
-        os.fsync(stream.fileno())
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+def _pointed_to(folder: Path) -> str:
+    """Name of the newest checkpoint, as the pointer says; it is only ever compared with names that exist."""
+    pointer = folder / _LATEST
+    if not pointer.is_file() or pointer.is_symlink():
+        return ""
+    with pointer.open("rb") as stream:
+        return stream.read(100).decode(errors="replace").strip()
 
 
 def _provenance() -> dict[str, Any]:

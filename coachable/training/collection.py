@@ -1,7 +1,9 @@
 """Collecting: TorchRL's collector with a state that a training can be resumed from, and a short evaluation."""
 
 import multiprocessing
+import os
 import signal
+import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterable
@@ -24,7 +26,6 @@ __all__ = [
     "evaluate_policy",
     "load_collector_state",
     "make_collector",
-    "require_finite",
     "simulation_env",
 ]
 
@@ -101,14 +102,35 @@ def make_collector(
         return collector
     if backend in ("process", "ray"):
         factories = [_SeededFactory(make_env, seed + i) for i in range(num_collectors)]
+        common |= plain if backend == "process" else _ray_options(num_collectors, plain)
+        collector = Collector(factories, policy, backend=backend, num_collectors=num_collectors, sync=sync, **common)
         if backend == "ray":
-            if find_spec("ray") is None:
-                raise ImportError("collector=ray needs Ray: pip install ray, or choose collector=process")
-            common["collector_kwargs"] = plain
-        else:
-            common |= plain
-        return Collector(factories, policy, backend=backend, num_collectors=num_collectors, sync=sync, **common)
+            collector.update_policy_weights_(policy)  # RayCollector wants that before the first batch
+        return collector
     raise ValueError(f"collector backend must be direct, process or ray, got {backend!r}")
+
+
+def _ray_options(num_collectors: int, plain: dict[str, Any]) -> dict[str, Any]:
+    if find_spec("ray") is None:
+        raise ImportError("collector=ray needs Ray: pip install 'coachable[cluster]', or choose collector=process")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray reports its use over the network otherwise
+    return {
+        "total_frames": sys.maxsize,  # RayCollector has no number for "until it is shut down"
+        "collector_kwargs": [plain | {"postproc": _OwnTrajectories(i, num_collectors)} for i in range(num_collectors)],
+        "ray_init_config": {"include_dashboard": False, "log_to_driver": False, "logging_level": "warning"},
+    }
+
+
+class _OwnTrajectories:
+    """Numbers the trajectories of a worker apart from those of the others: each counts from 0."""
+
+    def __init__(self, worker: int, workers: int) -> None:
+        self.worker = worker
+        self.workers = workers
+
+    def __call__(self, data: TensorDictBase) -> TensorDictBase:
+        key = ("collector", "traj_ids")
+        return data.set(key, data.get(key) * self.workers + self.worker)
 
 
 class _SeededFactory:
@@ -169,8 +191,8 @@ def load_collector_state(collector: BaseCollector, state: dict[str, Any]) -> boo
         warnings.warn("the collector's state was not saved or cannot be restored: episodes restart", stacklevel=2)
         return False
     env, base = collector.env, simulation_env(collector.env)
-    collector._frames = state["frames"]
-    collector._iter = state["iterations"]
+    collector._frames = int(state["frames"])
+    collector._iter = int(state["iterations"])
     if isinstance(env, TransformedEnv):
         env.load_state_dict(state["transforms"])
     if not state["carrier"] or not isinstance(base, ResumableEnv):
@@ -248,24 +270,3 @@ def _plain(td: TensorDictBase) -> dict[str, Any]:
         str(key): _plain(value) if isinstance(value, TensorDictBase) else value.detach().clone().cpu()
         for key, value in td.items()
     }
-
-
-def require_finite(data: TensorDictBase) -> None:
-    """Refuses transitions that would poison the replay buffer.
-
-    Args:
-        data: flat `[B]`.
-
-    Raises:
-        ValueError: if an observation or a reward is NaN or infinite.
-    """
-    for key in ("observation", ("next", "observation"), ("next", "reward")):
-        value = data.get(key)
-        # The sum is finite only if every entry is; that an overflow may look alike, the second look sorts out.
-        if not torch.isfinite(value.sum()) and not torch.isfinite(value).all():
-            rows = (~torch.isfinite(value)).flatten(1).any(1).nonzero().flatten().tolist()
-            raise ValueError(
-                f"{key!r} is not finite in {len(rows)} of {len(value)} collected transitions (first: row {rows[0]}): "
-                "none was stored. The environment has to end an episode whose physics explode, and rewards have to "
-                "be finite for every style: look at its step function and at the style terms."
-            )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import math
 import os
@@ -15,18 +16,23 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import LossModule, SoftUpdate
 
+from coachable.finite import NonFiniteError
+from coachable.ranges import AMOUNT, NOT_NEGATIVE, POSITIVE, SHARE, Range
 from coachable.training.acceleration import Acceleration
 from coachable.training.adam import FlatAdam, place_moments
 from coachable.training.lean_sac import LeanSAC
+from coachable.training.parameters import Watch, adopt_actor, follow, loaded, share_actor, trained_parameters
 from coachable.training.precision import Precision, resolve_precision
 
 _LOG = logging.getLogger(__name__)
 
+_ADVICE = "Look for extreme rewards or observations, lower the learning rates, or set max_grad_norm."
+
 UpdateOrder = Literal["simultaneous", "policy_first", "critic_first"]
 
 
-class NonFiniteLossError(RuntimeError):
-    """A loss became infinite or NaN."""
+class NonFiniteLossError(NonFiniteError):
+    """A loss or a gradient became infinite or NaN."""
 
 
 class _Losses(NamedTuple):
@@ -49,6 +55,9 @@ class Learner:
       target whose next actions come from the updated policy.
     - `"critic_first"` (common elsewhere): the critics step, then the policy on the updated critics.
 
+    Losses or gradients that are infinite or NaN reach no weight: such an update raises on a CPU, and is left out on a
+    GPU until the next check raises (see `check_every`).
+
     Args:
         loss_module: The loss.
         actor_lr: Learning rate of the policy.
@@ -64,8 +73,11 @@ class Learner:
             on a CPU, when policy and critics consist of nothing else. The numbers are the same, the update is faster.
         compile: Compile the loss functions with `torch.compile` where `fused` does not apply (on a GPU, or with
             networks of other kinds). On a CPU that takes a C++ compiler; without one the log says that it was left.
-        check_every: Read the non-finite flag every so many updates (a device synchronisation on a GPU); 0 leaves that
-            to calls of :meth:`check_finite`.
+        check_every: On a GPU, ask every so many updates whether one was left out, which waits for the device; 0 leaves
+            that to calls of :meth:`check_finite`. On a CPU every update is checked.
+
+    Between updates the loss and its policy may be moved to shared memory, cast to another dtype, loaded with
+    `assign=True` or given other `.data`; an update trains the parameters that they have then.
 
     Raises:
         ValueError: If an option is unknown or a number out of range.
@@ -87,19 +99,29 @@ class Learner:
         compile: bool = False,
         check_every: int = 100,
     ) -> None:
+        self._options = {name: value for name, value in locals().items() if name not in ("self", "loss_module")}
         if update_order not in get_args(UpdateOrder):
             raise ValueError(f"update_order must be one of {get_args(UpdateOrder)}, got {update_order!r}")
-        if not 0.0 < tau <= 1.0:
-            raise ValueError(f"tau must be in (0, 1], got {tau}")
-        if max_grad_norm is not None and not max_grad_norm > 0:
-            raise ValueError(f"max_grad_norm must be positive or None, got {max_grad_norm}")
+        rates = {"actor": actor_lr, "critic": critic_lr, "alpha": alpha_lr}
+        for name, rate in rates.items():
+            NOT_NEGATIVE.check(f"{name}_lr", rate)
+        POSITIVE.check("adam_eps", adam_eps)
+        Range("(0, 1]").check("tau", tau)
+        Range("(0, inf)", optional=True).check("max_grad_norm", max_grad_norm)
+        AMOUNT.check("check_every", check_every)
+        _check_loss(loss_module)
         self.loss_module = loss_module
         self.update_order: UpdateOrder = update_order
         self.max_grad_norm = max_grad_norm
         self.check_every = check_every
         self.updates = 0
         self.tau = tau
-        params = _parameter_groups(loss_module)
+        share_actor(loss_module)
+        self._watch = Watch(loss_module)
+        self._watch.forget_copies()
+        loss_module.register_load_state_dict_post_hook(loaded)
+        self._names = trained_parameters(loss_module)
+        self._params = params = self._present_parameters()
         device = params["actor"][0].device
         self.precision = resolve_precision(precision, device)
         self._device_type = device.type
@@ -110,8 +132,6 @@ class Learner:
             self._acceleration = Acceleration(loss_module, torch.bfloat16 if self.precision == "bf16" else None)
             if LeanSAC.supports(loss_module):
                 self._lean = LeanSAC(loss_module, self._acceleration)
-        self._params = params
-        rates = {"actor": actor_lr, "critic": critic_lr, "alpha": alpha_lr}
         self.optimizers: dict[str, torch.optim.Adam] = {
             name: self._adam(name, group, rates[name], adam_eps) for name, group in params.items() if group
         }
@@ -122,7 +142,8 @@ class Learner:
         self._losses = _Losses(loss.forward, loss.actor_loss, _critic_loss_of(loss))
         if compile and self._acceleration is None and _can_compile(device):
             self._losses = _Losses(*map(torch.compile, self._losses))
-        self._watch = torch.zeros((), device=device)
+        self._left_out = torch.zeros((), device=device)
+        self._watch.look()
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Make one update.
@@ -137,8 +158,10 @@ class Learner:
             that nothing waits for the device: call `.item()` when they are logged.
 
         Raises:
-            NonFiniteLossError: If a loss was infinite or NaN since the last check (see `check_every`).
+            NonFiniteLossError: If a loss or a gradient is infinite or NaN (on a GPU: was, see `check_every`); no weight
+                has been changed by it.
         """
+        self._follow()
         losses = self._losses
         if self._lean is not None and self._lean.serves(batch):
             losses = _Losses(self._lean.forward, self._lean.actor_loss, self._lean.critic_loss)
@@ -148,10 +171,6 @@ class Learner:
         if self._acceleration is None:
             self.target_updater.step()
         self.updates += 1
-        # A sum over updates stays NaN or infinite once a part was. The norms are in it because a NaN parameter can hide
-        # behind a rectifier in the losses, but not in the gradients.
-        for key in ("loss_actor", "loss_qvalue", "grad_norm_actor", "grad_norm_critic"):
-            self._watch.add_(metrics[key])
         if self.check_every and self.updates % self.check_every == 0:
             self.check_finite()
         if "entropy" in metrics and "alpha" in metrics:
@@ -176,13 +195,19 @@ class Learner:
             raise ValueError("this loss has no fixed entropy weight to scale: leave train.anneal_entropy at 1")
 
     def check_finite(self) -> None:
-        """Raise if a loss or gradient since the last check was not finite (this reads one number from the device)."""
-        if not math.isfinite(float(self._watch)):
+        """Raise if an update since the last check was left out on a GPU (this reads one number from the device)."""
+        found = float(self._left_out)
+        self._left_out.zero_()
+        if not math.isfinite(found):
             raise NonFiniteLossError(
-                f"a loss was NaN or infinite at or before update {self.updates}. Look for non-finite observations or "
-                "rewards in the replay buffer, a learning rate that is too large, or set max_grad_norm."
+                f"a loss or a gradient was not finite at or before update {self.updates}. {_ADVICE}"
             )
-        self._watch.zero_()
+
+    def check_weights(self) -> None:
+        """Raise if a trained parameter is not finite; updates keep those finite that are."""
+        for name, value in self.loss_module.named_parameters():
+            if not torch.isfinite(value).all():
+                raise NonFiniteError(f"{name} contains NaN or infinity: start from other weights.")
 
     def state_dict(self) -> dict[str, Any]:
         """Parameters, targets, optimiser moments and the update counter."""
@@ -194,6 +219,7 @@ class Learner:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`state_dict` returned; rates and a fixed entropy weight stay those of the constructor."""
+        self._follow()
         self.loss_module.load_state_dict(state["loss_module"])
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
@@ -202,7 +228,37 @@ class Learner:
         self.scale_learning_rates(1.0)
         self.scale_entropy_weight(1.0)
         self.updates = int(state["updates"])
-        self._watch.zero_()
+        self._left_out.zero_()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Learner:
+        """A learner of a copy of the loss, with a copy of the state."""
+        twin = type(self)(copy.deepcopy(self.loss_module, memo), **self._options)
+        twin.load_state_dict(copy.deepcopy(self.state_dict(), memo))
+        return twin
+
+    def _present_parameters(self) -> dict[str, list[nn.Parameter]]:
+        """The trained parameters that the loss has now."""
+        every = dict(self.loss_module.named_parameters())
+        return {kind: [every[name] for name in names] for kind, names in self._names.items()}
+
+    def _follow(self) -> None:
+        """Go on with the loss's parameters as they are now: others may be in their place, or other memory in theirs."""
+        adopt_actor(self.loss_module)
+        if not self._watch.changed():
+            return
+        self._watch.forget_copies()
+        self._params = self._present_parameters()
+        device = self._params["actor"][0].device
+        if device.type != self._device_type:
+            raise RuntimeError(
+                f"the loss was moved to {device} after its learner was made for {self._device_type}: make a learner of "
+                "the moved loss, and load this one's state_dict() into it"
+            )
+        if self._acceleration is not None:
+            self._acceleration.bind()
+        for name, optimizer in self.optimizers.items():
+            follow(optimizer, self._params[name])
+        self._watch.look()
 
     def _adam(self, name: str, params: list[nn.Parameter], lr: float, eps: float) -> torch.optim.Adam:
         acceleration = self._acceleration
@@ -222,39 +278,60 @@ class Learner:
             return nullcontext()
         return torch.autocast(self._device_type, dtype=torch.bfloat16)
 
-    def _step(self, name: str) -> Tensor:
-        """Clip, step, and return the norm of the gradient before clipping."""
-        params, optimizer = self._params[name], self.optimizers[name]
-        limit = self.max_grad_norm if name != "alpha" else None
-        if isinstance(optimizer, FlatAdam):
-            grad = cast(Acceleration, self._acceleration).gradient(name)
-            if limit is None:
-                optimizer.step()
-                return optimizer.grad_norm
-            norm = torch.linalg.vector_norm(grad)
-        else:
-            norm = torch.nn.utils.get_total_norm([p.grad for p in params if p.grad is not None])
-        if limit is not None:
-            torch.nn.utils.clip_grads_with_norm_(params, limit, norm)
-        optimizer.step()
-        if not isinstance(optimizer, FlatAdam):
-            optimizer.zero_grad(set_to_none=True)
-        return norm
+    def _step(self, losses: dict[str, Tensor], *names: str) -> dict[str, Tensor]:
+        """Clip and step, unless a number is not finite; return the norms of the gradients before clipping.
+
+        Args:
+            losses: What the gradients are of, by name.
+            names: Groups of parameters to step on their gradients.
+        """
+        norms = {f"grad_norm_{name}": self._gradient_norm(name) for name in names}
+        self._require_finite({**losses, **norms}, names)
+        for name, norm in zip(names, norms.values(), strict=True):
+            optimizer = self.optimizers[name]
+            if self.max_grad_norm is not None and name != "alpha":
+                torch.nn.utils.clip_grads_with_norm_(self._params[name], self.max_grad_norm, norm)
+            optimizer.step()
+            if not isinstance(optimizer, FlatAdam):
+                optimizer.zero_grad(set_to_none=True)
+        return norms
+
+    def _gradient_norm(self, name: str) -> Tensor:
+        if isinstance(self.optimizers[name], FlatAdam):
+            return torch.linalg.vector_norm(cast(Acceleration, self._acceleration).gradient(name))
+        return torch.nn.utils.get_total_norm([p.grad for p in self._params[name] if p.grad is not None])
+
+    def _require_finite(self, values: dict[str, Tensor], names: tuple[str, ...]) -> None:
+        """Raise on a CPU, or let a GPU leave the step out, if a loss or the norm of a gradient is not finite.
+
+        The norms are in it because a NaN parameter can hide behind a rectifier in the losses, but not in the gradients.
+        """
+        if self._device_type != "cuda":
+            found = {name: value.item() for name, value in values.items()}
+            if bad := [f"{name} is {value}" for name, value in found.items() if not math.isfinite(value)]:
+                for optimizer in self.optimizers.values():
+                    if not isinstance(optimizer, FlatAdam):  # whose gradients are written anew, not added to
+                        optimizer.zero_grad(set_to_none=True)
+                raise NonFiniteLossError(
+                    f"{', '.join(bad)} at update {self.updates + 1}: no weight was changed by it. {_ADVICE}"
+                )
+            return
+        total = torch.stack([value.detach().float() for value in values.values()]).sum()
+        self._left_out.add_(total)  # a sum stays NaN or infinite once a part was
+        for name in names:  # the fused Adam of a GPU then changes nothing, without waiting for the device
+            cast(Any, self.optimizers[name]).found_inf = (~total.isfinite()).float()
 
     def _simultaneous(self, batch: TensorDictBase, functions: _Losses) -> dict[str, Tensor]:
         with self._autocast():
-            losses = functions.both(batch)
-        total = losses["loss_actor"] + losses["loss_qvalue"]
-        if self._params["alpha"]:
-            total = total + losses["loss_alpha"]
-        total.backward()
-        metrics = {key: losses[key].detach() for key in ("loss_actor", "loss_qvalue", "alpha", "entropy")}
-        metrics["grad_norm_actor"] = self._step("actor")
-        metrics["grad_norm_critic"] = self._step("critic")
-        if self._params["alpha"]:
-            self._step("alpha")
+            outputs = functions.both(batch)
+        trained = ["loss_actor", "loss_qvalue", *(["loss_alpha"] if self._params["alpha"] else [])]
+        losses = {name: outputs[name] for name in trained}
+        cast(Tensor, sum(losses.values())).backward()
+        metrics = {key: outputs[key].detach() for key in ("loss_actor", "loss_qvalue", "alpha", "entropy")}
+        norms = self._step(losses, *(name for name, group in self._params.items() if group))
+        metrics |= {key: norms[key] for key in ("grad_norm_actor", "grad_norm_critic")}
         metrics["td_error"] = batch.get("td_error").mean()
-        return metrics | _critic_health(losses)
+        return metrics | _critic_health(outputs)
 
     def _sequential(self, batch: TensorDictBase, functions: _Losses) -> dict[str, Tensor]:
         policy_first = self.update_order == "policy_first"
@@ -263,7 +340,7 @@ class Learner:
             loss_qvalue, extra = functions.critic(batch)
         loss_qvalue.backward()
         metrics["loss_qvalue"] = loss_qvalue.detach()
-        metrics["grad_norm_critic"] = self._step("critic")
+        metrics |= self._step({"loss_qvalue": loss_qvalue}, "critic")
         batch.set("td_error", extra["td_error"])
         metrics["td_error"] = extra["td_error"].mean()
         if not policy_first:
@@ -274,15 +351,16 @@ class Learner:
         with self._autocast():
             loss_actor, extra = functions.actor(batch)
         loss_actor.backward()
-        metrics = {"loss_actor": loss_actor.detach(), "grad_norm_actor": self._step("actor")}
+        metrics = {"loss_actor": loss_actor.detach(), **self._step({"loss_actor": loss_actor}, "actor")}
         loss: Any = self.loss_module
         if "log_prob" in extra:
             log_prob = extra["log_prob"]
             metrics["entropy"] = -log_prob.mean()
             metrics["alpha"] = loss.log_alpha.detach().exp()
             if self._params["alpha"]:
-                loss.alpha_loss(log_prob).mean().backward()
-                self._step("alpha")
+                loss_alpha = loss.alpha_loss(log_prob).mean()
+                loss_alpha.backward()
+                self._step({"loss_alpha": loss_alpha}, "alpha")
         return metrics
 
 
@@ -292,19 +370,14 @@ def _critic_health(outputs: Any) -> dict[str, Tensor]:
     return {} if clipped is None else {"clipped_fraction": clipped.mean()}
 
 
-def _parameter_groups(loss_module: LossModule) -> dict[str, list[nn.Parameter]]:
-    """Split the trainable parameters into the policy's, the critics' and the temperature."""
-    groups: dict[str, list[nn.Parameter]] = {"actor": [], "critic": [], "alpha": []}
-    for name, parameter in loss_module.named_parameters():
-        if parameter.requires_grad:
-            kind = "actor" if name.startswith("actor_network_params") else "alpha" if name == "log_alpha" else "critic"
-            groups[kind].append(parameter)
-    if not groups["actor"] or not groups["critic"]:
-        missing = "critics" if groups["actor"] else "a policy (actor_network_params)"
-        raise ValueError(
-            f"{type(loss_module).__name__} has no trainable parameters of {missing}: the learner needs both"
-        )
-    return groups
+def _check_loss(loss_module: LossModule) -> None:
+    """Refuse what TorchRL's losses let pass: a discount outside [0, 1], the logarithm of a negative entropy weight."""
+    gamma = getattr(getattr(loss_module, "_value_estimator", None), "gamma", None)
+    if gamma is not None:
+        SHARE.check("gamma of the loss", float(gamma))
+    log_alpha = getattr(loss_module, "log_alpha", None)
+    if log_alpha is not None and bool(torch.isnan(log_alpha)):
+        raise ValueError("alpha of the loss is below 0: expected a number of at least 0")
 
 
 def _can_compile(device: torch.device) -> bool:

@@ -15,6 +15,9 @@ from tqdm import tqdm
 __all__ = ["CsvLog", "MetricsLog", "Progress", "wandb_logger"]
 
 
+_MOVE = "Move it away to go on with a new one"
+
+
 class CsvLog:
     """Rows of numbers in one CSV file that may gain columns.
 
@@ -38,7 +41,10 @@ class CsvLog:
     def rewind(self, limit: float, key: str = "frames") -> None:
         """Drops rows whose `key` exceeds `limit`: they belong to a course that a resumed training leaves behind."""
         rows = self._read()
-        kept = [row for row in rows if float(row.get(key) or 0) <= limit]
+        try:
+            kept = [row for row in rows if float(row.get(key) or 0) <= limit]
+        except ValueError as error:
+            raise ValueError(f"{self.path} is damaged: {error} in {key!r}. {_MOVE}") from error
         if len(kept) < len(rows):
             self._rewrite(kept)
 
@@ -55,10 +61,13 @@ class CsvLog:
     def _read(self) -> list[dict[str, Any]]:
         if not self.path.exists():
             return []
-        with self.path.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file)
-            self.columns = list(reader.fieldnames or [])
-            return list(reader)
+        try:
+            with self.path.open(newline="", encoding="utf-8") as file:
+                reader = csv.DictReader(file)
+                self.columns = list(reader.fieldnames or [])
+                return list(reader)
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise ValueError(f"{self.path} is no table of metrics: {error}. {_MOVE}") from error
 
     def _rewrite(self, rows: list[dict[str, Any]]) -> None:
         partial = self.path.with_name(self.path.name + ".partial")

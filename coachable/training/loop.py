@@ -14,10 +14,12 @@ from torchrl.collectors import BaseCollector, Collector
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 
+from coachable.files import refusing
+from coachable.finite import NonFiniteError, require_finite
 from coachable.keys import EVENTS, STYLE, STYLE_FEATURES, TASK_REWARD
 from coachable.replay import EventTableBuffer
 from coachable.training.checkpoint import CheckpointStore, find_checkpoint, read_state
-from coachable.training.collection import collector_state, load_collector_state, require_finite
+from coachable.training.collection import collector_state, load_collector_state
 from coachable.training.episodes import EpisodeStatistics, Means
 from coachable.training.learner import Learner
 from coachable.training.logging import MetricsLog, Progress
@@ -121,11 +123,13 @@ class Train:
             The latest value of every metric.
 
         Raises:
-            ValueError: if an observation or a reward is not finite.
+            NonFiniteError: if a number of a transition, loss or gradient is not finite. It is not stored, it changes
+                no weight, and no checkpoint is written after it. Or if a weight was not finite from the start.
         """
         self.progress.start(self.frames, self.learner.updates)
         batches = iter(self.collector)
         try:
+            self.learner.check_weights()
             with stop_signals() as stop:
                 while self.frames < self.settings.total_frames and not stop.is_set():
                     data = self._collect(batches)
@@ -135,6 +139,9 @@ class Train:
                     self._log_if_due()
                     self._checkpoint_if_due()
                 self._finish(interrupted=stop.is_set())
+        except NonFiniteError as error:
+            error.args = (f"{error} The training stopped at env-step {self.frames:,}, without another checkpoint.",)
+            raise
         finally:
             self.progress.close()
             self.collector.shutdown()
@@ -151,13 +158,12 @@ class Train:
 
     def _store(self, data: TensorDictBase) -> None:
         with self._timed("store"):
-            data = data.contiguous().reshape(
-                -1
-            )  # flattening the lazy stack without contiguous() takes 25 times as long
-            require_finite(data)
-            self._episodes.add(data)
+            data = data.contiguous()  # flattening the lazy stack without it takes 25 times as long
+            stored = data.select(*self.replay_keys)
+            require_finite(stored)
+            self._episodes.add(data.reshape(-1))
             # Of one trajectory, earlier steps come first: all that an EventTableBuffer needs besides its number.
-            self.replay.extend(data.select(*self.replay_keys))
+            self.replay.extend(stored.reshape(-1))
 
     def _update(self, new_frames: int, stop: threading.Event) -> None:
         warming_up = self.frames - self._filled_from <= self.settings.warmup_frames
@@ -269,13 +275,14 @@ class Train:
             The checkpoint.
 
         Raises:
-            CheckpointError: if there is none, or style space or network shapes differ.
+            CheckpointError: if there is none, it is damaged, or style space or network shapes differ.
         """
         path = find_checkpoint(path)
         state = read_state(path)
         require_same_agent(state, self.describe(), path)
-        self.log.rewind(state["loop"]["frames"])
-        self.load_state_dict(state, path / "replay" if (path / "replay").is_dir() else None)
+        with refusing(path, "the state of a training"):
+            self.load_state_dict(state, path / "replay" if (path / "replay").is_dir() else None)
+        self.log.rewind(self.frames)
         return path
 
     def load_state_dict(self, state: Mapping[str, Any], replay: Path | None = None) -> None:
@@ -286,10 +293,10 @@ class Train:
             replay: folder of the saved replay buffer; None starts with an empty one, and says so.
         """
         self.learner.load_state_dict(state["learner"])
-        self.frames = state["loop"]["frames"]
-        self.owed = state["loop"]["owed"]
-        self._evaluations = state["loop"]["evaluations"]
-        self._filled_from = state["loop"]["filled_from"]
+        self.frames = int(state["loop"]["frames"])
+        self.owed = float(state["loop"]["owed"])
+        self._evaluations = int(state["loop"]["evaluations"])
+        self._filled_from = int(state["loop"]["filled_from"])
         if replay is not None:
             read_replay(self.replay, replay)
         else:

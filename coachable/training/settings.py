@@ -2,7 +2,22 @@
 
 from dataclasses import dataclass
 
+from coachable.ranges import AMOUNT, COUNT, NOT_NEGATIVE, SHARE, Range
+
 __all__ = ["TrainSettings"]
+
+_RANGES = {
+    "total_frames": COUNT,
+    "batch_size": COUNT,
+    "warmup_frames": AMOUNT,
+    "utd_ratio": Range("[0, inf)", optional=True),
+    "throttle": Range("(0, inf)", optional=True),
+    "anneal": SHARE,
+    "anneal_entropy": Range("(0, 1]"),
+    "eval_interval": AMOUNT,
+    "log_interval": NOT_NEGATIVE,
+    "checkpoint_interval": NOT_NEGATIVE,
+}
 
 
 @dataclass(frozen=True)
@@ -36,17 +51,10 @@ class TrainSettings:
 
     def __post_init__(self) -> None:
         """Refuses what cannot work."""
-        for name in ("total_frames", "batch_size"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name, expected in _RANGES.items():
+            expected.check(name, getattr(self, name))
         if self.utd_ratio is None and self.throttle is None:
             raise ValueError("utd_ratio=null (as many updates as fit) needs a throttle: set train.throttle=RATE")
-        if self.utd_ratio is not None and self.utd_ratio < 0:
-            raise ValueError(f"utd_ratio must not be negative, got {self.utd_ratio}")
-        if not 0.0 <= self.anneal <= 1.0:
-            raise ValueError(f"anneal must be between 0 and 1, got {self.anneal}")
-        if not 0.0 < self.anneal_entropy <= 1.0:
-            raise ValueError(f"anneal_entropy must be above 0 and at most 1, got {self.anneal_entropy}")
 
     def learning_rate_factor(self, frames: int) -> float:
         """What the learning rates are multiplied with after so many env-steps (see `anneal`)."""

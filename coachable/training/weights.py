@@ -1,8 +1,8 @@
 """Agents in files: what identifies one, loading its policy, exporting and reusing its weights."""
 
-import importlib
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,16 +11,35 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from coachable.domain import Domain, load_domain
+from coachable.files import check_finite, refusing, save_state, space_named, tensor_bytes
+from coachable.networks import make_gaussian_actor, make_mixed_actor
+from coachable.networks.mixed import MixedPolicy
+from coachable.networks.plain import policy_network
 from coachable.networks.residual import with_new_inputs
-from coachable.styles import StyleSpace
+from coachable.styles import Choice, StyleSpace
 from coachable.training.checkpoint import SCHEMA_VERSION, CheckpointError, check_fits, find_checkpoint, read_state
 
-__all__ = ["LoadedPolicy", "agent_state", "export_weights", "initialise_from", "load_policy", "require_same_agent"]
+__all__ = [
+    "LoadedPolicy",
+    "agent_state",
+    "domain_of",
+    "export_weights",
+    "initialise_from",
+    "load_policy",
+    "require_same_agent",
+    "widths_of",
+]
 
 _PRETRAINED = Path(__file__).resolve().parent.parent / "pretrained"
 _CRITICS = "qvalue_network_params."
 _PATHS = ("run_dir", "resume", "init_from")  # of the machine that trained, not of the agent
-_AGENT = ("domain", "space", "config", "network", "actor", "critics")
+_AGENT = {"domain": str, "space": dict, "config": dict, "network": dict, "actor": dict, "critics": dict}
+_ACTORS = {  # what a file may name as its network: nothing else is called
+    f"{module}.{make.__name__}": make
+    for make in (make_gaussian_actor, make_mixed_actor)
+    for module in ("coachable.networks", make.__module__)
+}
 
 
 class LoadedPolicy(NamedTuple):
@@ -83,19 +102,60 @@ def load_policy(path_or_domain: Path | str, device: torch.device | str = "cpu") 
         CheckpointError: if there is no such thing, or it does not describe its policy.
     """
     file = _locate(path_or_domain)
-    state = read_state(file, device)
-    missing = [name for name in _AGENT if name not in state]
-    if missing:
-        raise CheckpointError(f"{file} does not describe a policy: it lacks {', '.join(missing)}")
-    space = StyleSpace.from_dict(state["space"])
-    actor = _build(state["network"]["actor"], space, file).to(device)
-    check_fits(state["actor"], _tensors(actor.state_dict()), "actor", file)
-    actor.load_state_dict(state["actor"])
-    actor.eval().requires_grad_(False)
-    counters = state.get("loop", {}) | {"updates": state.get("learner", {}).get("updates")}
-    counters |= state.get("counters", {})
-    metadata = {"domain": state["domain"], "source": str(file), **{k: counters.get(k) for k in ("frames", "updates")}}
-    return LoadedPolicy(actor, space, state["config"], metadata)
+    state = _read_agent(file, device)
+    with refusing(file, "a style space"):
+        space = StyleSpace.from_dict(state["space"])
+    with refusing(file, "a network"):
+        with torch.device("meta"):  # no file makes this machine allocate more than it holds itself
+            check_fits(state["actor"], _tensors(_build(state["network"], space, file).state_dict()), "actor", file)
+        actor = _build(state["network"], space, file).to(device)
+        actor.load_state_dict(state["actor"])
+        actor.eval().requires_grad_(False)
+    with refusing(file, "counters"):
+        counters = state.get("loop", {}) | {"updates": state.get("learner", {}).get("updates")}
+        counters |= state.get("counters", {})
+        known = {name: None if counters.get(name) is None else int(counters[name]) for name in ("frames", "updates")}
+    return LoadedPolicy(actor, space, state["config"], {"domain": state["domain"], "source": str(file), **known})
+
+
+def domain_of(agent: LoadedPolicy) -> Domain:
+    """The built-in domain of an agent, as it was in its training; its environments are checked against the agent.
+
+    Args:
+        agent: from `load_policy`.
+
+    Raises:
+        ValueError: if there is no such domain.
+        CheckpointError: if the agent has other styles, or its configuration makes no environment.
+    """
+    name, source = agent.metadata["domain"], agent.metadata["source"]
+    load_domain(name)
+    with refusing(source, "a configuration of its environment"):
+        domain = load_domain(name, agent.config)
+        here, there = _names(domain.make_space()), _names(agent.space)
+    if here != there:
+        raise CheckpointError(f"{source} has the styles {', '.join(there)}: domain {name} has {', '.join(here)}")
+    reads = widths_of(agent)
+
+    def make_env(*arguments: Any, **options: Any) -> Any:
+        with refusing(source, "a configuration of its environment"):
+            env = domain.make_env(*arguments, **options)
+        gives = (env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1])
+        if reads != gives:
+            raise CheckpointError(
+                f"{source} reads {reads[0]} observations and gives {reads[1]} actions: expected {gives[0]} and "
+                f"{gives[1]}, as domain {name} has them"
+            )
+        return env
+
+    return replace(domain, make_env=make_env)
+
+
+def widths_of(agent: LoadedPolicy) -> tuple[int, int]:
+    """Number of observations that an agent reads, and of actions that it gives."""
+    policy = policy_network(agent.actor)
+    actions = policy.heads.action_dim if isinstance(policy, MixedPolicy) else (policy.trunk.out_features or 0) // 2
+    return policy.trunk.in_features - agent.space.dim, actions
 
 
 def export_weights(checkpoint: Path | str, out: Path | str) -> Path:
@@ -109,18 +169,26 @@ def export_weights(checkpoint: Path | str, out: Path | str) -> Path:
         The file.
     """
     source = _locate(checkpoint)
-    state = read_state(source)
+    state = _read_agent(source)
+    if "loop" not in state and "counters" in state:
+        raise CheckpointError(f"{source} is a small weights file already: expected a run's folder or a checkpoint")
     agent = {name: state[name] for name in _AGENT}
     # Tensors are copied, because a slice or a shared parameter would drag its whole storage into the file.
-    agent["actor"] = {name: value.clone() for name, value in agent["actor"].items()}
-    agent["critics"] = {name: value.clone() for name, value in agent["critics"].items()}
+    with refusing(source, "weights"):
+        agent["actor"] = {name: value.clone() for name, value in agent["actor"].items()}
+        agent["critics"] = {name: value.clone() for name, value in agent["critics"].items()}
+        counters = {"frames": state["loop"]["frames"], "updates": state["learner"]["updates"]}
+    check_finite({"actor": agent["actor"], "critics": agent["critics"]}, source)
     agent["config"] = {**agent["config"], **dict.fromkeys(_PATHS)}
-    counters = {"frames": state["loop"]["frames"], "updates": state["learner"]["updates"]}
     out = Path(out)
     out.parent.mkdir(parents=True, exist_ok=True)
     partial = out.with_name(out.name + ".partial")
-    torch.save({"schema": SCHEMA_VERSION, **agent, "counters": counters}, partial)
-    os.replace(partial, out)
+    try:
+        with space_named(out, tensor_bytes(agent)):
+            save_state({"schema": SCHEMA_VERSION, **agent, "counters": counters}, partial)
+            os.replace(partial, out)
+    finally:
+        partial.unlink(missing_ok=True)
     return out
 
 
@@ -145,16 +213,14 @@ def initialise_from(
         CheckpointError: if style parameters or network shapes differ, or there is no room for new observations.
     """
     file = _locate(path_or_domain)
-    state = read_state(file)
-    _check_space({**state["space"], "sampler": space.to_dict()["sampler"]}, space, file)
+    state = _read_agent(file)
+    with refusing(file, "a style space"):
+        _check_space({**state["space"], "sampler": space.to_dict()["sampler"]}, space, file)
     present = loss_module.state_dict()
     for part, fresh in (("actor", _tensors(actor.state_dict())), ("critics", _with_prefix(present, _CRITICS))):
         if new_observations:
-            seen = state["network"]["actor"]["obs_dim"]
-            try:
-                state[part] = _widened(state[part], seen, new_observations)
-            except ValueError as error:
-                raise CheckpointError(f"{file}: {error}") from error
+            with refusing(file, "a network"):
+                state[part] = _widened(state[part], state["network"]["actor"]["obs_dim"], new_observations)
         check_fits(state[part], fresh, part, file)
     actor.load_state_dict(state["actor"])
     for name, value in state["critics"].items():
@@ -184,9 +250,11 @@ def require_same_agent(saved: Mapping[str, Any], present: Mapping[str, Any], sou
     Raises:
         CheckpointError: saying how domain, style space or network shapes differ.
     """
+    _check_agent(saved, source)
     if saved["domain"] != present["domain"]:
         raise CheckpointError(f"{source} belongs to domain {saved['domain']!r}, this run to {present['domain']!r}")
-    _check_space(saved["space"], StyleSpace.from_dict(present["space"]), source)
+    with refusing(source, "a style space"):
+        _check_space(saved["space"], StyleSpace.from_dict(present["space"]), source)
     for part in ("actor", "critics"):
         check_fits(saved[part], present[part], part, source)
 
@@ -224,13 +292,34 @@ def _locate(path_or_domain: Path | str) -> Path:
         raise CheckpointError(f"{error}; domains with weights: {', '.join(domains) or 'none'}") from None
 
 
+def _read_agent(source: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
+    state = read_state(source, device)
+    _check_agent(state, source)
+    return state
+
+
+def _check_agent(state: Mapping[str, Any], source: Path | str) -> None:
+    missing = [name for name in _AGENT if name not in state]
+    if missing:
+        raise CheckpointError(f"{source} does not describe a policy: it lacks {', '.join(missing)}")
+    for name, kind in _AGENT.items():
+        if not isinstance(state[name], kind):
+            raise CheckpointError(
+                f"{source} has a {type(state[name]).__name__} as its {name}: expected a {kind.__name__}"
+            )
+
+
 def _build(network: Mapping[str, Any], space: StyleSpace, source: Path) -> TensorDictModuleBase:
-    arguments = dict(network)
-    target = str(arguments.pop("_target_"))
-    if not target.startswith("coachable.networks."):  # a file must not choose what is imported and called
-        raise CheckpointError(f"{source} names {target!r} as its network: only coachable.networks.* is loaded")
-    module, _, name = target.rpartition(".")
-    return getattr(importlib.import_module(module), name)(space=space, **arguments)
+    arguments = dict(network["actor"])
+    target = arguments.pop("_target_")
+    if target not in _ACTORS:
+        names = " or ".join(name for name in _ACTORS if name.count(".") == 2)
+        raise CheckpointError(f"{source} names {target!r} as its network: expected {names}")
+    return _ACTORS[target](space=space, **arguments)
+
+
+def _names(space: StyleSpace) -> list[str]:
+    return [f"{p.name} ({'/'.join(p.options)})" if isinstance(p, Choice) else p.name for p in space.parameters]
 
 
 def _tensors(state: Mapping[str, Any]) -> dict[str, Tensor]:

@@ -9,6 +9,8 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Transform
 
+from coachable.ranges import SHARE
+
 
 @dataclass(frozen=True)
 class MirrorMap:
@@ -63,8 +65,7 @@ class MirrorSymmetry(Transform):
 
     def __init__(self, maps: Mapping[NestedKey, MirrorMap], probability: float = 0.5, seed: int = 0) -> None:
         super().__init__(in_keys=[], out_keys=[])
-        if not 0 <= probability <= 1:
-            raise ValueError(f"probability must lie in [0, 1], got {probability}")
+        SHARE.check("probability of MirrorSymmetry", probability)
         self.probability = probability
         self.generator = torch.Generator().manual_seed(seed)
         self._maps = {

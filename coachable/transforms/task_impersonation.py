@@ -8,6 +8,7 @@ from torch import Tensor
 from torchrl.envs import Transform
 
 from coachable import keys
+from coachable.ranges import AMOUNT
 from coachable.styles.reward import StyleReward
 from coachable.styles.samplers import Sampler
 from coachable.styles.space import StyleSpace
@@ -26,8 +27,8 @@ class TaskImpersonation(Transform):
     priority update takes the largest over a transition's columns (`EventTableBuffer`, or the default reduction of
     TorchRL's own buffers).
 
-    Of n-step transitions only style rewards that are linear in the features can be relabelled: let the buffer sum the
-    features too (`discounted_keys` of `EventTableBuffer`).
+    Of n-step transitions only style rewards that are linear in the features can be relabelled, and samples of several
+    steps are refused with any other: let the buffer sum the features too (`discounted_keys` of `EventTableBuffer`).
 
     Args:
         style_reward: The only code that computes style rewards, the environment's own object.
@@ -70,11 +71,10 @@ class TaskImpersonation(Transform):
         style_reward_key: NestedKey = keys.STYLE_REWARD,
     ) -> None:
         super().__init__(in_keys=[], out_keys=[])
-        if isinstance(n, bool) or not isinstance(n, int) or n < 0:
-            raise ValueError(f"TaskImpersonation got n = {n!r}: expected the number of further styles, 0 or more")
+        AMOUNT.check("n of TaskImpersonation", n)
         self.style_reward = style_reward
         self.space = style_reward.space if space is None else space
-        self.n = n
+        self.n = int(n)
         self.sampler = self.space.sampler if sampler is None else sampler
         if self.sampler.dim != self.space.dim:
             raise ValueError(
@@ -104,13 +104,15 @@ class TaskImpersonation(Transform):
 
         Raises:
             KeyError: If an entry is missing.
-            ValueError: If the stored style has another size than the space.
+            ValueError: If the stored style has another size than the space, or transitions sum several steps while the
+                style reward is not linear in the features.
         """
         if not self.n:
             return tensordict
+        self._refuse_sums(tensordict)
         stored, features, task_reward, reward = self._entries(tensordict)
         shape = tensordict.batch_size
-        drawn = self.sampler.sample((*shape, self.n), self.generator, stored.device)
+        drawn = self.sampler.sample_independent((*shape, self.n), self.generator, stored.device)
         dim = len(shape)
         features = features.unsqueeze(dim)
         features = features.expand(*shape, self.n, *features.shape[dim + 1 :])
@@ -131,6 +133,16 @@ class TaskImpersonation(Transform):
         if logged is not None:
             out.set(self.style_reward_key, torch.cat([logged.unsqueeze(dim), style_reward], dim))
         return out
+
+    def _refuse_sums(self, tensordict: TensorDictBase) -> None:
+        steps = tensordict.get("steps_to_next_obs", None)
+        if steps is None or self.style_reward.is_linear or steps.max() <= 1:
+            return
+        raise ValueError(
+            f"TaskImpersonation got sums over up to {int(steps.max())} steps: the style reward is not linear in its "
+            "features, and their sum does not tell what another style would have earned. Store single steps "
+            "(n_steps=1), or give TaskImpersonation n=0."
+        )
 
     def _entries(self, tensordict: TensorDictBase) -> tuple[Tensor, Any, Tensor, Tensor]:
         wanted = (self.style_key, self.features_key, self.task_reward_key, self.reward_key)

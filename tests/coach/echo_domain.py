@@ -30,10 +30,11 @@ def echo_space() -> StyleSpace:
 class EchoMeasures:
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
         action = transition["next", STYLE_FEATURES][:, 0]
-        return {"target": action, "target_error": (action - transition[STYLE][:, 0]).abs(), "pace": action.abs()}
+        error = (action - transition[STYLE][:, 0]).abs()
+        return {"target": action, "target_error": error, "pace": action.abs(), "fire": action**2}
 
     def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
-        return {name: torch.where(alive, record[name], torch.nan).nanmean(0) for name in ("target", "pace")}
+        return {name: torch.where(alive, record[name], torch.nan).nanmean(0) for name in ("target", "pace", "fire")}
 
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
         return record["target_error"] < 1e-6

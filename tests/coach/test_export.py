@@ -121,7 +121,23 @@ def test_a_file_that_disagrees_is_noticed(tmp_path):
     assert largest_difference(out, plain, SPACE) <= TOLERANCE
     with torch.no_grad():
         policy_network(actor).trunk.head.bias += 0.5
-    assert largest_difference(out, plain, SPACE) > 0.01
+        assert largest_difference(out, plain, SPACE) > 0.01
+        policy_network(actor).trunk.head.bias.fill_(float("nan"))
+        assert largest_difference(out, plain, SPACE) == float("inf"), "NaN is no agreement"
+
+
+def test_a_full_disk_is_one_sentence_with_the_space_needed(make_train, tmp_path, monkeypatch):
+    make_train(total_frames=80).run()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(
+        OSError, match=r"^cannot write \S+: it needs about \d+\.\d MB, .* MB are free \(No space left on"
+    ):
+        export(tmp_path / "run", tmp_path / "out" / "policy.onnx")
+    assert list((tmp_path / "out").iterdir()) == []
 
 
 def test_a_policy_without_style_is_refused():

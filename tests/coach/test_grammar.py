@@ -2,8 +2,9 @@
 
 import pytest
 
+from coachable.coach import segments
 from coachable.coach.coaching import coaching_of
-from coachable.coach.grammar import StyleGrammar
+from coachable.coach.grammar import MAX_PHRASE, StyleGrammar
 from coachable.coach.vocabulary import tokenise
 from coachable.envs.humanoid import humanoid_style_space
 from coachable.styles import Choice, Setpoint, Weight
@@ -16,7 +17,7 @@ NOW = {"pose": "arms_in_front", "step_length": 0.475, "course": 0.0}
 def grammar():
     coaching = coaching_of("humanoid")
     controls = [control.parameter for control in coaching.controls]
-    return StyleGrammar([*humanoid_style_space().parameters, *controls], coaching.vocabulary)
+    return StyleGrammar([*humanoid_style_space().parameters, *controls], coaching.vocabulary, coaching.examples)
 
 
 # Steps of the range 0.35 m: a bit 0.035, plain 0.07, much 0.14.
@@ -72,6 +73,7 @@ NOT_UNDERSTOOD = [
     ("not 0.4 m", "say what instead"),
     ("", "an empty phrase"),
     ("?!", "'?!'"),
+    ("step length " + "9" * 400, "how much"),
 ]
 
 
@@ -95,6 +97,7 @@ def test_phrases_that_are_not_understood_say_so(grammar, phrase, reason):
     understood = grammar.read(phrase, NOW)
     assert not understood.changes
     assert f"not understood: {understood.failed[0]}" in str(understood)
+    assert ("try: shorter steps, arms up, 0.4 m" in str(understood)) == bool(understood.examples)
     assert reason in understood.failed[0]
 
 
@@ -164,11 +167,48 @@ def test_weights_are_encouraged_and_discouraged():
     assert "of what: melee or fire or frost or speed?" in grammar.read("more", now).failed[0]
 
 
+class CountingLexicon(dict):
+    """Counts what is looked up in it."""
+
+    looked_up = 0
+
+    def __contains__(self, words):
+        self.looked_up += 1
+        return super().__contains__(words)
+
+
+@pytest.mark.parametrize("piece", ["shorter steps ", "a ", "arms ", "x ", "not ", ", ", "0.4 m ", "steps much more "])
+def test_the_work_grows_with_the_length_of_the_phrase(grammar, piece):
+    lexicon = CountingLexicon(grammar.lexicon)
+    longest = max(map(len, lexicon))
+    for repeats in (10, MAX_PHRASE // len(piece)):
+        tokens = tokenise(piece * repeats)
+        lexicon.looked_up = 0
+        segments.split(tokens, lexicon)
+        assert lexicon.looked_up <= longest * len(tokens)
+
+
+def test_a_phrase_that_is_too_long_is_refused_in_a_sentence(grammar):
+    longest = "arms up," + "a" * (MAX_PHRASE - 8)
+    assert grammar.read(longest, NOW).changes == {"pose": "arms_up"}
+    refused = grammar.read(longest + "a", NOW)
+    assert refused.changes == {}
+    assert refused.failed == ("the phrase has 2,001 characters, at most 2,000 are read",)
+
+
+def test_an_unknown_word_is_answered_with_what_works_without_examples():
+    grammar = StyleGrammar([Weight("melee", 0.0, 1.0), Choice("side", ("left", "right_hand"))])
+    answer = str(grammar.read("sing", {"melee": 0.0, "side": "left"}))
+    assert answer == "not understood: 'sing' (unknown: sing); try: more melee, right hand"
+
+
 def test_the_vocabulary_is_checked():
     with pytest.raises(ValueError, match="words for 'poses': expected one of"):
         StyleGrammar(humanoid_style_space(), {"poses": ("arms",)})
     with pytest.raises(ValueError, match=r"'pose=down': options are"):
         StyleGrammar(humanoid_style_space(), {"pose=down": ("arms down",)})
+    with pytest.raises(ValueError, match="words for 'stride': expected one of"):
+        StyleGrammar(humanoid_style_space(), {"-step_length -stride": ("arms down",)})
 
 
 def test_tokens():

@@ -16,8 +16,10 @@ viser = pytest.importorskip("viser")
 import msgspec  # noqa: E402, viser brings it
 import websockets.sync.client as websockets  # noqa: E402, viser brings it
 
+from coachable.coach import film as film_module  # noqa: E402
 from coachable.coach import views  # noqa: E402
-from coachable.coach.page import CoachPage  # noqa: E402
+from coachable.coach.page import CoachPage, verdict  # noqa: E402
+from coachable.coach.report import StyleReport  # noqa: E402
 from coachable.coach.server import make_server  # noqa: E402
 from coachable.coach.session import CoachSession  # noqa: E402
 from coachable.styles import StyleRangeWarning  # noqa: E402
@@ -100,9 +102,48 @@ def test_nan_from_a_browser_changes_nothing(page):
     wait_for(lambda: "**Problem:**" in page.status.content and "NaN" in page.status.content)
     assert page.session.style["target"] == pytest.approx(0.5)
     assert page.widgets["target"].handle.value == pytest.approx(0.5)
-    speed = page.loop.speed
-    page.speed.value = math.nan
-    assert page.loop.speed == speed
+
+
+@pytest.mark.parametrize("speed", [math.nan, math.inf, -1.0, 0.0, 1e6])
+def test_impossible_speeds_are_refused(page, speed):
+    page.speed.value = 2.0
+    wait_for(lambda: page.loop.speed == 2.0)
+    page.speed.value = speed
+    wait_for(lambda: "speed = " in page.status.content and "from 0.1 to 4" in page.status.content)
+    assert page.loop.speed == 2.0 and page.speed.value == 2.0
+
+
+def test_an_unknown_option_or_button_changes_nothing(page):
+    page.widgets["mood"].handle.value = "angry"
+    wait_for(lambda: "no option" in page.status.content and page.widgets["mood"].handle.value == "calm")
+    page._press("Explode")
+    do(page)
+    assert page.loop.paused and page.session.style["mood"] == "calm"
+
+
+def test_more_requests_than_can_be_carried_out_are_left_out(page):
+    held, go = threading.Event(), threading.Event()
+    page.loop.submit(lambda _: held.set() or go.wait(20))
+    assert held.wait(20)
+    for _ in range(1000):
+        page.loop.submit(lambda session: session.set(target=0.1))
+    assert "some of it was left out" in page.loop.problem
+    go.set()
+    wait_for(lambda: not page.loop._changes.qsize())
+    do(page)
+    assert page.session.style["target"] == pytest.approx(0.1)
+
+
+def test_changes_that_keep_coming_leave_the_agent_time_to_act(page):
+    """Each change asks for the next, as a browser can."""
+
+    def again(_session):
+        page.loop.submit(again)
+
+    page.loop.submit(again)
+    page._press("Resume")
+    count = page.session.step_count
+    wait_for(lambda: page.session.step_count > count + 5)
 
 
 @contextmanager
@@ -110,9 +151,11 @@ def wire(page):
     """A browser's connection without the browser: yields a function that sends a widget's new value."""
     from viser._messages import GuiUpdateMessage, ViewerCameraMessage
 
-    address = f"ws://127.0.0.1:{page.server.get_port()}"
+    address = f"127.0.0.1:{page.server.get_port()}"
     protocol = f"viser-v{viser.__version__}"
-    with websockets.connect(address, subprotocols=[protocol], origin=address, max_size=None) as socket:
+    with websockets.connect(
+        f"ws://{address}", subprotocols=[protocol], origin=f"http://{address}", max_size=None
+    ) as socket:
 
         def send(message):
             socket.send(msgspec.msgpack.encode(message.as_serializable_dict()))
@@ -168,6 +211,157 @@ def test_the_phrase_box_says_what_it_understood(page):
     assert page.widgets["target"].handle.value == pytest.approx(0.4)
     answer = page.answer.content.replace("\\", "")
     assert "target 0 → 0.4 m" in answer and "not understood: 'sing' (unknown: sing)" in answer
+
+
+def test_long_phrases_and_plans_are_not_read(page):
+    page.phrase.value = "target 0.4 m " * 200
+    page.say.value = True
+    wait_for(lambda: "the phrase has 2,600 characters: at most 200 are read" in page.status.content)
+    page.plan.value = "1: default\n" * 1000
+    page.run_plan.value = True
+    wait_for(lambda: "the plan has 11,000 characters: at most 2,000 are read" in page.status.content)
+    assert page.session.style["target"] == 0.0 and not page.session.scheduled
+
+
+def test_the_agent_acts_while_a_phrase_is_read(page, monkeypatch):
+    reading, finish = threading.Event(), threading.Event()
+    read = page.session.grammar.read
+
+    def slowly(*arguments):
+        reading.set()
+        assert finish.wait(20)
+        return read(*arguments)
+
+    monkeypatch.setattr(page.session.grammar, "read", slowly)
+    page._press("Resume")
+    page.phrase.value = "target 0.4 m"
+    threading.Thread(target=setattr, args=(page.say, "value", True)).start()  # as viser does for a browser
+    assert reading.wait(20)
+    count = page.session.step_count
+    wait_for(lambda: page.session.step_count > count + 5)
+    page.run_plan.value = True
+    wait_for(lambda: "still being read" in page.status.content)
+    finish.set()
+    wait_for(lambda: page.session.style["target"] == pytest.approx(0.4))
+
+
+def test_a_recording_with_an_unknown_control_is_refused_and_the_session_goes_on(page):
+    page._press("Step")
+    do(page)
+    bad = page.session.recording()
+    bad.events.append({"step": 0, "controls": {"altitude": 1.0}})
+    page.loop.submit(lambda session: session.replay(bad))
+    wait_for(lambda: "no live control named" in page.status.content)
+    page.widgets["target"].handle.value = 0.5
+    page._press("Step")
+    do(page)
+    assert page.session.style["target"] == pytest.approx(0.5) and page.loop.problem == ""
+
+
+def test_presets_do_not_pile_up(page):
+    page.preset_name.value = "x" * 100
+    page.loop.submit(page._save_preset)
+    wait_for(lambda: "at most 40 characters" in page.status.content)
+    page.session.presets |= {f"p{number}": {} for number in range(48)}
+    for name in ("last", "one too many"):
+        page.preset_name.value = name
+        page.loop.submit(page._save_preset)
+        do(page)
+    assert len(page.session.presets) == len(page.preset.options) == 50
+
+
+def test_one_film_at_a_time_and_not_of_long_sessions(page, monkeypatch):
+    go = threading.Event()
+    monkeypatch.setattr(film_module, "film", lambda *_, **__: go.wait(20) and (_ for _ in ()).throw(ValueError("torn")))
+    page._press("Step")
+    for _ in range(2):
+        page.loop.submit(lambda session: page._shoot(session, None))
+    wait_for(lambda: "a film is being drawn already" in page.status.content)
+    go.set()
+    wait_for(lambda: page.film_note.content == "Problem: torn")
+    monkeypatch.setattr(film_module, "_LONGEST_SESSION", 0.01)
+    page.loop.submit(lambda session: page._shoot(session, None))
+    wait_for(lambda: "at most 0 s are filmed here" in page.status.content)
+
+
+def test_the_chart_follows_what_was_asked_for_last(page):
+    page._press("Step")
+    do(page)
+    page.widgets["fire"].handle.value = 1.0
+    wait_for(lambda: page.chart.shown == "fire" and page.chart.choice.value == "fire")
+    page.widgets["mood"].handle.value = "wild card"
+    wait_for(lambda: page.chart.shown == "mood")
+    say(page, "target 0.4 m")
+    assert page.chart.shown == "target"
+    page.chart.choice.value = "fire"
+    wait_for(lambda: page.chart.shown == "fire")
+    page.widgets["target"].handle.value = 0.5
+    wait_for(lambda: page.chart.shown == "target")
+
+
+def test_the_chart_has_a_fixed_axis_of_time_and_says_when_nothing_was_measured(page):
+    for _ in range(2):
+        page._press("Step")
+        do(page)
+    assert page.chart.plot.scales["x"]["range"] == (-30.0, 0.0)
+    ago, asked, measured = page.chart.plot.data
+    assert ago == pytest.approx([-0.05, 0.0]) and measured == pytest.approx(asked)
+    page.chart.choice.value = "mood"
+    wait_for(lambda: "mood: nothing was measured" in page.chart.note.content)
+    assert len(page.chart.plot.data) == 2, "what was asked for only"
+
+
+def test_what_is_shown_is_measured_or_says_that_it_is_not(page):
+    page.widgets["target"].handle.value = 0.5
+    do(page)
+    texts = {name: text.handle.content for name, text in page.measured.items()}
+    assert texts["target"] == "not measured yet · trained -0.8 to 0.8 m"
+    page._press("Step")
+    do(page)
+    texts = {name: text.handle.content for name, text in page.measured.items()}
+    assert texts["target"] == "measured **0.5 m** · trained -0.8 to 0.8 m"
+    assert texts["mood"] == "no measure of its own"
+    do(page, lambda session: session.set(target=-0.5))
+    assert "not measured yet" in page.measured["target"].handle.content, "0.5 m belongs to the request before"
+
+
+def report(**changes):
+    """Of a request that was met, with changes."""
+    values = {
+        "requested": {"target": 0.5},
+        "measured": {"target": 0.5},
+        "unmeasured": (),
+        "seconds": 2.0,
+        "outside": {},
+        "asks": True,
+        "complying": 1.0,
+        "needs": "a footstep",
+        "complied_after": 0.5,
+        "since_request": 9.0,
+        "episode": 1,
+        "episode_time": 9.0,
+        "ended": None,
+        "endings": {},
+    }
+    return StyleReport(**values | changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({}, "**Request met**, first after 0.5 s: 100% of what was judged in the last 2.0 s."),
+        ({"complying": 0.25}, "Request met first after 0.5 s, but only 25% of what was judged in the last 2.0 s."),
+        ({"complying": None}, "Request met first after 0.5 s; nothing to judge in the last 2.0 s."),
+        ({"complying": 0.0, "complied_after": None}, "Request not yet met, after 9.0 s."),
+        (
+            {"complying": None, "complied_after": None},
+            "Request not judged yet, after 9.0 s: that takes a footstep.",
+        ),
+        ({"asks": False, "complied_after": None}, "Nothing is asked for: every weight is 0."),
+    ],
+)
+def test_the_verdict_says_what_it_rests_on(changes, text):
+    assert verdict(report(**changes)) == text
 
 
 def test_outside_the_trained_range_is_flagged(page):
@@ -264,6 +458,8 @@ def test_a_failing_view_leaves_the_read_outs(page, monkeypatch):
 
 
 def test_a_weight_and_what_it_brings_about_have_an_axis_each(page):
+    page._press("Step")
+    do(page)
     assert page.chart.choice.value == "target" and len(page.chart.plot.axes) == 2
     page.chart.choice.value = "fire"
     wait_for(lambda: len(page.chart.plot.axes) == 3)
@@ -305,7 +501,7 @@ def test_a_picture_is_drawn_only_while_somebody_looks(server, monkeypatch):
     view = views.make_view(server, session)
     drawn = []
     scene = SimpleNamespace(set_background_image=lambda picture, **_: drawn.append(picture.shape))
-    client = SimpleNamespace(scene=scene, camera=SimpleNamespace(aspect=2.0))
+    client = SimpleNamespace(scene=scene, camera=SimpleNamespace(aspect=2.0, image_width=1200))
     view.update()
     assert drawn == []
     monkeypatch.setattr(server, "get_clients", lambda: {0: client})
@@ -322,6 +518,42 @@ def test_pictures_keep_their_proportions():
     wide, tall = views.padded(picture, 2.0), views.padded(picture, 1.0)
     assert wide.shape == (60, 120, 3) and (wide[:, 20:100] == 0).all() and (wide[:, :20] > 0).all()
     assert tall.shape == (80, 80, 3) and (tall[10:70] == 0).all() and (tall[70:] > 0).all()
+
+
+@pytest.mark.parametrize("aspect", [0.0, -1.0, 1e-9, 1e9, math.inf, math.nan])
+def test_no_window_makes_a_picture_huge(aspect):
+    picture = np.zeros((60, 80, 3), dtype=np.uint8)
+    assert views.padded(picture, aspect).size <= 4 * 4 * picture.size
+
+
+def test_in_a_narrow_window_the_picture_lies_above_the_panel(server, monkeypatch):
+    """viser's panel covers the lower 60 % of such a window."""
+    session, shown = echo_session(), []
+    view = views.make_view(server, session)
+    scene = SimpleNamespace(set_background_image=lambda picture, **_: shown.append(picture))
+    client = SimpleNamespace(scene=scene, camera=SimpleNamespace(aspect=0.5, image_width=400))
+    monkeypatch.setattr(server, "get_clients", lambda: {0: client})
+    view.update()
+    drawn = (shown[0] != views._BORDER).any(-1).any(-1)
+    assert shown[0].shape[:2] == (1600, 800) and drawn[:600].all() and not drawn[600:].any()
+    view.close()
+    session.close()
+
+
+def test_in_a_narrow_window_the_camera_shows_the_agent_above_the_panel():
+    camera = SimpleNamespace(image_width=400)
+    views._above_the_panel(SimpleNamespace(camera=camera))
+    position, target = np.array(camera.position), np.array(camera.look_at)
+    ahead = (target - position) / np.linalg.norm(target - position)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    up = np.cross(right / np.linalg.norm(right), ahead)
+    for height in (0.0, 2.0):  # from the soles to the hands
+        seen = np.array([0.0, 0.0, height]) - position
+        share = (seen @ up) / (seen @ ahead) / np.tan(np.deg2rad(75.0) / 2)  # -1 below, 1 above
+        assert 0.2 < share < 1.0, "above the panel's 60 %"
+    wide = SimpleNamespace(image_width=1280)
+    views._above_the_panel(SimpleNamespace(camera=wide))
+    assert not hasattr(wide, "look_at")
 
 
 def test_the_humanoid_stays_in_the_middle_of_the_scene(server):

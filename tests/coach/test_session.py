@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -13,9 +14,9 @@ from coachable.coach.recording import Recording, ReplayMismatch
 from coachable.coach.session import CoachSession
 from coachable.envs.humanoid import humanoid_style_space
 from coachable.keys import STYLE
-from coachable.styles import Choice, StyleRangeWarning, StyleSpace
+from coachable.styles import Choice, StyleRangeWarning, StyleReward, StyleSpace, Term, Weight
 from coachable.training.checkpoint import CheckpointError
-from tests.coach.echo_domain import echo_session
+from tests.coach.echo_domain import ECHO, EchoMeasures, echo_session
 
 
 @pytest.fixture
@@ -88,7 +89,7 @@ def test_measured_beside_requested(session):
     session.run(0.5)
     report = session.report()
     assert report.requested["target"] == 0.5
-    assert report.measured == {"task_reward": 0.0, "target": 0.5, "pace": 0.5}
+    assert report.measured == {"task_reward": 0.0, "target": 0.5, "pace": 0.5, "fire": 0.25}
     assert report.complied_after == pytest.approx(0.05)
     assert report.since_request == pytest.approx(0.5)
 
@@ -103,6 +104,67 @@ def test_compliance_counts_from_the_latest_request(session):
     session.set(target=0.0)
     session.step()
     assert session.report().complied_after == pytest.approx(0.05)
+
+
+def test_the_window_begins_anew_with_a_request(session):
+    session.set(target=0.5)
+    session.run(0.5)
+    session.set(target=-0.5)
+    report = session.report()
+    assert report.measured == {} and report.seconds == 0.0 and report.complying is None
+    session.step()
+    report = session.report()
+    assert report.measured["target"] == -0.5 and report.seconds == pytest.approx(0.05) and report.complying == 1.0
+
+
+def test_compliance_is_a_share_of_the_steps_that_can_be_judged(session):
+    class Measures(EchoMeasures):
+        needs = "a full moon"
+
+        def judged(self, record):
+            return record["fire"] > 0.1
+
+    session._recent.measures = Measures()
+    session.set(target=0.1)
+    session.run(0.5)
+    report = session.report()
+    assert (report.complying, report.complied_after, report.needs) == (None, None, "a full moon")
+    session.set(target=0.5)
+    session.step()
+    session.policy = TensorDictModule(lambda style: -style[..., :1], in_keys=[STYLE], out_keys=["action"])
+    session.run(0.15)
+    report = session.report()
+    assert report.complying == pytest.approx(0.25) and report.complied_after == pytest.approx(0.05)
+
+
+def test_what_has_no_value_is_named(session):
+    class Measures(EchoMeasures):
+        def summarise(self, record, alive):
+            return super().summarise(record, alive) | {"target": torch.tensor([math.nan])}
+
+    session._recent.measures = Measures()
+    session.step()
+    report = session.report()
+    assert report.unmeasured == ("target",) and "target" not in report.measured
+
+
+def test_a_style_of_zero_weights_asks_for_nothing():
+    """Of the domains whose styles are weights only."""
+    space = StyleSpace([Weight("fire", -1.0, 2.0)])
+    policy = TensorDictModule(lambda style: style[..., :1] * 0.0, in_keys=[STYLE], out_keys=["action"])
+    reward = StyleReward(space, {"fire": Term(lambda f, s: f[..., 0] * s["fire"], parameters=("fire",))})
+    session = CoachSession(policy, space, replace(ECHO, make_reward=lambda _: reward))
+    assert not session.report().asks
+    session.set(fire=1.0)
+    assert session.report().asks
+    session.close()
+
+
+def test_seeds_have_a_range(session):
+    for seed in (-1, 2**63):
+        with pytest.raises(ValueError, match="expected a whole number from 0"):
+            session.reset(seed)
+    session.step()
 
 
 def run_until_ended(session: CoachSession) -> None:
@@ -166,6 +228,8 @@ def test_phrases_and_presets(session):
     understood = session.say("wild card, target 0.3 m, sing")
     assert session.style["mood"] == "wild_card" and session.style["target"] == pytest.approx(0.3)
     assert understood.failed == ("'sing' (unknown: sing)",)
+    assert session.understand("target 0.5 m").changes == {"target": 0.5}
+    assert session.style["target"] == pytest.approx(0.3), "understanding asks for nothing"
     session.say("a bit more")
     assert session.style["target"] == pytest.approx(0.46)  # a tenth of the range, upwards as before
     assert session.say("Default").said == ("preset default",)
@@ -245,10 +309,28 @@ def test_bad_recordings(session):
         ({"colour": 1}, "unknown entries"),
         ({"domain": "racing"}, "belongs to 'racing'"),
         ({"style": {"speed": 1.0}}, "unknown style parameter 'speed'"),
+        ({"controls": {"altitude": 1.0}}, "no live control named 'altitude'"),
+        ({"events": [{"step": 0, "controls": {"altitude": 1.0}}]}, "no live control named 'altitude'"),
+        ({"events": [{"step": 0, "style": {"speed": 1.0}}]}, "unknown style parameter 'speed'"),
+        ({"events": [{"step": 0, "style": {"target": 7.0}}]}, "lies outside"),
+        ({"events": [{"step": 0, "reset": 1}]}, "'events' is not what"),
+        ({"events": [{"step": 0, "explode": True}]}, "'events' is not what"),
+        ({"events": [{"style": {}}]}, "'events' is not what"),
+        ({"events": [{"step": 3, "reset": True}, {"step": 1, "reset": True}]}, "'events' is not what"),
+        ({"events": 5}, "'events' is not what"),
+        ({"controls": {"course": math.inf}}, "'controls' is not what"),
+        ({"checks": [[1, 2, 3]]}, "'checks' is not what"),
+        ({"seed": -1}, "'seed' is not what"),
+        ({"seed": 10**30}, "expected a whole number"),
+        ({"steps": "many"}, "'steps' is not what"),
     ]:
         with pytest.raises(ValueError, match=message):
             session.replay(Recording.from_json(json.dumps(good | change)))
-    for text in ("", "[1]", "{}", "nonsense"):
+        before = session.step_count
+        session.set(target=0.25)
+        session.step()
+        assert session.step_count == before + 1 and session.style["target"] == 0.25, "the session goes on"
+    for text in ("", "[1]", "{}", "nonsense", "[" * 100_000):
         with pytest.raises(ValueError, match="no recording"):
             Recording.from_json(text)
 
@@ -292,6 +374,19 @@ class TestHumanoid:
         report = humanoid.report()
         assert report.requested == {"pose": "t_pose", "step_length": 0.5}
         assert {"forward_speed", "pose_held"} <= set(report.measured)
+
+    def test_it_is_judged_by_footsteps(self, humanoid):
+        humanoid.reset(seed=1)
+        humanoid.set(pose="arms_up", step_length=0.5)
+        assert humanoid.report().measured == {}, "nothing before a step was made"
+        humanoid.step()
+        report = humanoid.report()
+        assert report.unmeasured == ("step_length", "step_length_error") and report.needs == "a footstep"
+        assert report.complying is None and report.complied_after is None
+        while humanoid.report().complied_after is None:
+            humanoid.step()
+        report = humanoid.report()
+        assert report.complying is not None and "step_length" in report.measured
 
     def test_the_course_turns_and_wraps_around(self, humanoid):
         humanoid.reset(seed=1)

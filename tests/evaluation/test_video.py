@@ -1,12 +1,18 @@
 """Films: encoders, captions and the tour of styles."""
 
+import warnings
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
 
 from coachable.domain import load_domain
 from coachable.envs.humanoid import humanoid_style_space
-from coachable.evaluation.video import default_tour, render, write_video
+from coachable.evaluation import video
+from coachable.evaluation.video import asked_line, default_tour, render, write_video
+from coachable.styles import StyleRangeWarning, StyleSpace, Weight
+from coachable.training.weights import load_policy
 
 
 def frames(count=8):
@@ -44,6 +50,61 @@ def test_the_tour_shows_every_pose_with_three_lengths():
 def test_another_suffix_is_refused_before_anything_is_drawn(tmp_path):
     with pytest.raises(ValueError, match=r"cannot write film.avi: expected a file ending in one of"):
         render("humanoid", tmp_path / "film.avi")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"size": (64, 44)}, "the size is 64x44: expected 64x60 to 4096x4096"),
+        ({"size": (100_000, 480)}, "the size is 100000x480: expected"),
+        ({"size": (641, 480)}, "mp4 needs an even width and height"),
+        ({"seconds_per_style": float("nan")}, "seconds per style are nan: expected more than 0"),
+        ({"seconds_per_style": 0.0}, "seconds per style are 0.0: expected more than 0"),
+    ],
+)
+def test_odd_settings_are_refused_before_anything_is_drawn(tmp_path, settings, message):
+    with pytest.raises(ValueError, match=message):
+        render("humanoid", tmp_path / "film.mp4", **settings)
+
+
+def test_the_caption_shows_what_the_agent_is_asked():
+    space = humanoid_style_space()
+
+    def line(**request):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", StyleRangeWarning)
+            return asked_line(space, request, space.make(**request))
+
+    assert line(pose="t_pose", step_length=0.5) == "asked: pose t pose, step length 0.5"
+    assert line(step_length=9.0) == "asked: pose arms in front, step length 0.65 (clamped from 9)"
+    assert line(pose="arms_up", step_length=0.0) == "asked: pose arms up, step length 0.3 (clamped from 0)"
+    assert line() == "asked: pose arms in front, step length 0.475"
+
+
+def test_the_caption_leaves_out_weights_of_zero():
+    space = StyleSpace([Weight("fire", 0.0, 1.0), Weight("tire", -60.0, 12000.0)])
+    assert asked_line(space, {"fire": 0.0}, space.make(fire=0.0)) == "asked: every weight 0"
+    assert asked_line(space, {"tire": 6000.0}, space.make(tire=6000.0)) == "asked: tire 6000"
+
+
+def test_the_film_of_a_request_outside_the_range_says_so(monkeypatch):
+    captions = []
+    monkeypatch.setattr(video, "caption", lambda frame, lines: captions.append(lines))
+    agent, domain = load_policy("humanoid"), replace(load_domain("humanoid"), make_renderer=BlankRenderer)
+    film = video._film(domain, agent.actor, agent.space, [{"step_length": 9.0}], 1, (64, 64), 0, every=1)
+    assert len(list(film)) == 1
+    assert captions[0][0] == "asked: pose arms in front, step length 0.65 (clamped from 9)"
+
+
+class BlankRenderer:
+    def __init__(self, width, height):
+        pass
+
+    def draw(self, env):
+        return None
+
+    def close(self):
+        pass
 
 
 def test_the_tour_of_weights_is_the_grid():

@@ -447,15 +447,15 @@ def test_dispatch_and_key_lists(case: Case) -> None:
 # Bad input: one clear error each, at construction.
 
 BAD_OPTIONS = [
-    (QRSACLoss, {"num_quantiles": 0}, "num_quantiles must be a positive integer, got 0"),
-    (QRSACLoss, {"kappa": -1.0}, "kappa must not be negative"),
+    (QRSACLoss, {"num_quantiles": 0}, "num_quantiles is 0: expected a whole number of at least 1"),
+    (QRSACLoss, {"kappa": -1.0}, "kappa is -1.0: expected a number of at least 0"),
     (QRSACLoss, {"target_min": "mean"}, "target_min must be one of"),
     (QRSACLoss, {"entropy_in_target": "none"}, "entropy_in_target must be one of"),
     (QRSACLoss, {"quantile_reduction": "max"}, "quantile_reduction must be one of"),
-    (RACLoss, {"entropy_samples": 0}, "entropy_samples must be a positive integer, got 0"),
-    (RACLoss, {"entropy_samples": -3}, "entropy_samples must be a positive integer, got -3"),
-    (RACLoss, {"alpha": 0.0}, "alpha must be positive and finite"),
-    (RACLoss, {"alpha": math.nan}, "alpha must be positive and finite"),
+    (RACLoss, {"entropy_samples": 0}, "entropy_samples is 0: expected a whole number of at least 1"),
+    (RACLoss, {"entropy_samples": -3}, "entropy_samples is -3: expected a whole number of at least 1"),
+    (RACLoss, {"alpha": 0.0}, "alpha is 0.0: expected a number above 0"),
+    (RACLoss, {"alpha": math.nan}, "alpha is nan: expected a number above 0"),
     (RACLoss, {"reduction": "median"}, "reduction must be"),
     (RACLoss, {"num_qvalue_nets": 3}, r"got 2 critic\(s\) for num_qvalue_nets=3"),
     (RACLoss, {"num_qvalue_nets": 0}, r"num_qvalue_nets=0"),

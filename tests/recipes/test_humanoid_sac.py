@@ -44,6 +44,14 @@ def _resume(run_dir, *arguments):
     return train
 
 
+@pytest.mark.parametrize("name", ["a=b", "a, b", "it's {here}", "1.5", "x=y=[z]"])
+def test_any_name_of_a_folder_can_be_written_to_and_resumed(tmp_path, name):
+    assert _compose(f"run_dir={tmp_path / name}")["run_dir"] == str(tmp_path / name)
+    assert _compose(f"run_dir='{tmp_path / 'quoted'}'")["run_dir"] == str(tmp_path / "quoted")
+    assert _compose(f"init_from={tmp_path / name}")["init_from"] == str(tmp_path / name)
+    assert _compose("init_from=null")["init_from"] is None
+
+
 def test_the_paper_preset_is_the_papers():
     config = _compose("preset=paper")
     assert config["gamma"] == 0.99 and config["replay_capacity"] == 750_000
@@ -134,6 +142,8 @@ def test_a_resumed_run_keeps_its_configuration(tmp_path):
     assert config["run_dir"] == str(tmp_path / "run")
     with pytest.raises(SystemExit, match=r"gamma cannot change in a resumed run: start a new one with init_from="):
         _compose(f"resume={tmp_path / 'run'}", "gamma=0.9")
+    with pytest.raises(ValueError, match=r"train.batch_size=0: expected a whole number of at least 1"):
+        _compose(f"resume={tmp_path / 'run'}", "train.batch_size=0")
     with pytest.raises(SystemExit, match="a resumed run keeps its preset"):
         _compose(f"resume={tmp_path / 'run'}", "preset=cpu")
     with pytest.raises(CheckpointError, match="no checkpoint at"):

@@ -636,5 +636,5 @@ def test_the_share_of_event_tables():
     step = {"done": torch.zeros(60, 1, dtype=torch.bool), "events": fired}
     rb.extend(TensorDict({"t": torch.arange(60), "next": step}, [60]))
     assert torch.bincount(rb.sample()["table"]).tolist() == [16, 2, 2]
-    with pytest.raises(ValueError, match=r"event_share is 1.0: expected a share"):
+    with pytest.raises(ValueError, match=r"event_share is 1.0: expected a number in \(0, 1\)"):
         EventTableBuffer.for_events(events, event_share=1.0, **sizes)

@@ -20,7 +20,7 @@ from coachable.styles import (
     UniformChoice,
     Weight,
 )
-from coachable.styles.mixtures import with_extremes, with_requests
+from coachable.styles.mixtures import style_mixture, with_extremes, with_requests
 
 N = 200_000
 
@@ -241,10 +241,18 @@ def test_names_of_samplers_are_unique():
         (lambda: Mixture([PointMass(0)], [0.5, 0.5]), "expected 1 probabilities"),
         (lambda: Mixture([], []), "at least one"),
         (lambda: Product([]), "at least one"),
-        (lambda: UniformChoice(0), "at least one"),
+        (lambda: UniformChoice(0), "n of UniformChoice is 0: expected a whole number of at least 1"),
         (lambda: with_requests(StyleSpace([Weight("drift", 0.0, 5.0)]), full=0.9), "probabilities that sum to 1"),
         (lambda: with_requests(StyleSpace([Setpoint("pace", 0.0, 1.0)])), "with_requests asks for weights of 0.*pace"),
-        (lambda: with_extremes(StyleSpace([Setpoint("pace", 0.0, 1.0)]), share=2.0), "probabilities that sum to 1"),
+        (lambda: with_requests(StyleSpace([Weight("drift", 0.0, 5.0)]), full=-0.1), r"full is -0.1: .* in \[0, 1\]"),
+        (lambda: style_mixture(StyleSpace([Weight("a", 0, 5)]), neutral=float("nan")), "neutral is nan: expected"),
+        (lambda: style_mixture(StyleSpace([Weight("a", 0, 5)]), neutral=0.6, independent=0.6), "exceed 1 together"),
+        (lambda: with_extremes(StyleSpace([Setpoint("pace", 0.0, 1.0)]), share=2.0), r"share is 2.0: .* in \[0, 1\]"),
+        (lambda: Mixture([PointMass(0)], [float("nan")]), "probabilities that sum to 1"),
+        (lambda: Uniform(0, float("inf")), "a value of Uniform is inf: expected a number that is finite"),
+        (lambda: PointMass(float("nan")), "a value of PointMass is nan"),
+        (lambda: OneHot([1.0, float("inf")]), "a value of OneHot is inf"),
+        (lambda: Shared(PointMass(0), 0), "copies is 0: expected a whole number of at least 1"),
         (lambda: with_extremes(StyleSpace([Choice("gait", ("run", "hop"))])), "with_extremes asks for bounds.*gait"),
         (lambda: with_extremes(StyleSpace([Setpoint("pace", 0, 1)]), only=["gait"]), "extremes of gait.*some of pace"),
         (lambda: Sampler.from_dict({"type": "Levy"}), "unknown sampler type 'Levy'"),

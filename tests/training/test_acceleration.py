@@ -6,28 +6,10 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives import SACLoss
 
-from coachable.losses import CatRACLoss, QRSACLoss
-from coachable.networks import make_critic, make_gaussian_actor
-from coachable.networks.action_heads import ActionHeads
-from coachable.networks.hl_gauss_critic import make_hl_gauss_critic
-from coachable.networks.mixed import make_mixed_actor
+from coachable.networks import make_gaussian_actor
 from coachable.training import Learner
 from coachable.training.acceleration import Acceleration
-from tests.sac_problem import ACT, OBS, ScaledStyle, make_batch, make_loss
-
-WIDTHS = (64, 48)
-
-
-def qr_sac():
-    actor = make_gaussian_actor(OBS, ACT, ScaledStyle(), WIDTHS)
-    critics = [make_critic(OBS, ACT, ScaledStyle(), WIDTHS, num_outputs=8) for _ in range(2)]
-    return QRSACLoss(actor, critics, num_quantiles=8)
-
-
-def cat_rac():
-    heads = ActionHeads(axes=ACT)
-    critics = [make_hl_gauss_critic(OBS, ACT, ScaledStyle(), WIDTHS) for _ in range(2)]
-    return CatRACLoss(make_mixed_actor(OBS, heads, ScaledStyle(), WIDTHS), critics, entropy_samples=10)
+from tests.sac_problem import ACT, OBS, WIDTHS, ScaledStyle, cat_rac, make_batch, make_loss, qr_sac
 
 
 @pytest.mark.parametrize("shape", [(32,), (8, 4)])

@@ -142,15 +142,61 @@ def test_gradients_are_clipped_separately_and_norms_are_those_before_clipping():
     torch.testing.assert_close(seen["critic"], torch.tensor(1e-3), rtol=1e-3, atol=0)
 
 
-def test_non_finite_loss_is_reported_at_the_next_check():
-    learner = Learner(make_loss(), precision="fp32", check_every=2)
-    bad = make_batch(16)
-    bad["next", "reward"][3] = float("nan")
-    learner.update(bad)
-    with pytest.raises(NonFiniteLossError, match="update 2"):
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), 1e30])
+@pytest.mark.parametrize("order", ["simultaneous", "policy_first", "critic_first"])
+@pytest.mark.parametrize("fused", [True, False])
+def test_a_loss_that_is_not_finite_reaches_no_weight(fused, order, bad):
+    learner = Learner(make_loss(), precision="fp32", update_order=order, fused=fused)
+    before = copy.deepcopy(learner.state_dict())
+    data = make_batch(16)
+    data["next", "reward"][3] = bad
+    with pytest.raises(NonFiniteLossError, match=r"loss_qvalue is (nan|inf).* at update 1: no weight was changed"):
+        learner.update(data)
+    after = learner.state_dict()
+    assert after["updates"] == 0
+    for name, value in before["loss_module"].items():
+        assert torch.isfinite(value).all()
+        if order != "policy_first" or not name.startswith("actor"):  # the policy's own gradient was finite
+            assert torch.equal(value, after["loss_module"][name]), name
+    metrics = learner.update(make_batch(16))  # nothing is left over
+    assert all(torch.isfinite(value) for value in metrics.values())
+
+
+def test_weights_that_are_not_finite_are_noticed_at_the_first_update():
+    """Also behind a rectifier, which turns NaN into nothing in the loss but not in the gradients."""
+    loss = make_loss()
+    next(iter(loss.actor_network_params.values(True, True))).data.view(-1)[0] = float("nan")
+    with pytest.raises(NonFiniteLossError, match="at update 1"):
+        Learner(loss, precision="fp32").update(make_batch(16))
+
+
+def test_a_temperature_that_is_not_finite_does_not_move():
+    loss = make_loss(fixed_alpha=False, target_entropy=-3.0)
+    learner = Learner(loss, precision="fp32", update_order="policy_first")
+    before = loss.log_alpha.item()
+    learner._params["alpha"][0].register_hook(lambda grad: grad * float("nan"))
+    with pytest.raises(NonFiniteLossError, match="grad_norm_alpha is nan"):
         learner.update(make_batch(16))
-    with pytest.raises(NonFiniteLossError):
-        learner.check_finite()
+    assert loss.log_alpha.item() == before
+
+
+def test_on_a_gpu_the_step_is_left_out_and_reported_at_the_next_check():
+    """The device's part, tried on a CPU: its fused Adam leaves a step out, too, where `found_inf` is set."""
+    learner = Learner(make_loss(), precision="fp32", fused=False, check_every=2)
+    learner._device_type = "cuda"
+    before = copy.deepcopy(learner.state_dict())
+    data = make_batch(16)
+    data["next", "reward"][3] = float("nan")
+    learner.update(data)
+    for name, value in learner.state_dict()["loss_module"].items():
+        assert torch.isfinite(value).all()
+        if name.startswith("qvalue"):
+            assert torch.equal(value, before["loss_module"][name]), name
+    with pytest.raises(NonFiniteLossError, match="at or before update 2"):
+        learner.update(make_batch(16))
+    learner.check_finite()
+    after = learner.state_dict()["loss_module"]
+    assert any((value != before["loss_module"][name]).any() for name, value in after.items())
 
 
 @pytest.mark.parametrize("order", ["simultaneous", "policy_first"])
@@ -212,6 +258,13 @@ def test_bad_options_raise():
         Learner(loss, tau=0.0)
     with pytest.raises(ValueError, match="max_grad_norm"):
         Learner(loss, max_grad_norm=-1.0)
+    loss.log_alpha.fill_(math.nan)
+    with pytest.raises(ValueError, match="alpha of the loss is below 0"):
+        Learner(loss)
+    loss = make_loss()
+    loss.make_value_estimator(gamma=1.5)
+    with pytest.raises(ValueError, match=r"gamma of the loss is 1.5: expected a number in \[0, 1\]"):
+        Learner(loss)
     assert resolve_precision("bf16") == "bf16"
 
 

@@ -120,24 +120,15 @@ def test_without_a_ratio_the_learner_fills_the_throttled_time(make_train):
 
 
 def test_the_share_of_annealing_is_a_share():
-    with pytest.raises(ValueError, match="anneal must be between 0 and 1"):
+    with pytest.raises(ValueError, match=r"anneal is 1.5: expected a number in \[0, 1\]"):
         TrainSettings(total_frames=10, anneal=1.5)
-    with pytest.raises(ValueError, match="anneal_entropy must be above 0"):
+    with pytest.raises(ValueError, match=r"anneal_entropy is 0.0: expected a number in \(0, 1\]"):
         TrainSettings(total_frames=10, anneal_entropy=0.0)
 
 
 def test_a_ratio_of_none_needs_a_throttle():
     with pytest.raises(ValueError, match=r"needs a throttle: set train\.throttle=RATE"):
         TrainSettings(total_frames=1, utd_ratio=None)
-
-
-@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
-def test_a_bad_observation_is_refused_before_it_is_stored(make_train, bad):
-    train = make_train(total_frames=400)
-    train.collector.env.base_env.poison = bad
-    with pytest.raises(ValueError, match=r"not finite in 1 of 4 collected transitions"):
-        train.run()
-    assert len(train.replay) == 0
 
 
 def test_replay_holds_raw_style_and_no_copy_of_it(make_train):
@@ -218,8 +209,8 @@ def test_a_failed_checkpoint_does_not_end_the_training(make_train, tmp_path, mon
     def fail(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("coachable.training.checkpoint._save_tensors", fail)
-    with pytest.warns(UserWarning, match=r"was not written .*No space left on device.*Training goes on"):
+    monkeypatch.setattr("coachable.training.checkpoint.save_state", fail)
+    with pytest.warns(UserWarning, match=r"was not written: .*No space left on device.*Training goes on"):
         train.run()
     assert train.frames == 120
     assert not [p for p in (tmp_path / "run" / "checkpoints").iterdir() if p.name != "LATEST"]

@@ -1,15 +1,23 @@
 """Relabelling at sampling time: labels, rewards, what stays, and the random numbers it takes."""
 
+import contextlib
+from functools import partial
+from typing import get_args
+
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import LazyTensorStorage, MultiStep, TensorDictReplayBuffer
 
+from coachable.envs.combat import combat_style_space
+from coachable.envs.humanoid import humanoid_style_space
+from coachable.envs.racing.families import FAMILIES, family_style
 from coachable.replay import EventTableBuffer, KeyEvents
 from coachable.styles import (
     Choice,
     PointMass,
     Setpoint,
+    Shared,
     StyleReward,
     StyleSpace,
     Term,
@@ -17,7 +25,9 @@ from coachable.styles import (
     Weight,
     WeightedFeature,
 )
+from coachable.styles.mixtures import Single, own, style_mixture, with_extremes, with_requests
 from coachable.transforms import StyleRewardTransform, TaskImpersonation
+from tests.echo import echo_space
 
 SPACE = StyleSpace([Choice("pose", ("front", "up")), Setpoint("length", 0.3, 0.6), Weight("melee", -1.0, 2.0)])
 TERMS = {
@@ -108,6 +118,120 @@ def test_styles_come_from_the_training_distribution():
     assert abs(style.mean().item() - 0.3) < 5 * (0.2 / 12**0.5) / 8000**0.5
     fixed = TaskImpersonation(reward, n=2, sampler=PointMass([0.25]))(td)
     assert (fixed["style"][:, 1:] == 0.25).all() and (fixed["next", "style"][:, 1:] == 0.25).all()
+
+
+def spaces_and_samplers():
+    """Every style space that the recipes train on, with every sampler that serves it."""
+    spaces = [humanoid_style_space(), combat_style_space(["melee", "skykiller"]), combat_style_space(), echo_space()]
+    spaces += [family_style(family)[0] for family in FAMILIES]
+    makers = {
+        "default": own,
+        **{single: partial(style_mixture, single=single) for single in get_args(Single)},
+        "with_requests": with_requests,
+        "with_extremes": with_extremes,
+        "own_extremes": partial(with_extremes, shared=False),
+    }
+    for space in spaces:
+        for name, make in makers.items():
+            with contextlib.suppress(ValueError):  # not every sampler serves every kind of parameter
+                yield pytest.param(space, make(space), id=f"{space.name}-{space.dim}-{name}")
+
+
+@pytest.mark.parametrize("space, sampler", list(spaces_and_samplers()))
+def test_labels_are_independent_over_transitions_and_copies(space, sampler):
+    """As often two labels of a transition are one and the same as two draws of the sampler's distribution are."""
+    reward = StyleReward(space, {"any": Term(lambda f, s: f[..., 0], space.names)})
+    size = 300
+    one = torch.ones(size, 1)
+    td = TensorDict(
+        {"style": space.sample((size,)), "next": {"reward": one, "task_reward": one, "style_features": one}}, [size]
+    )
+    draws = sampler.sample_independent((20_000,), torch.Generator().manual_seed(1))
+    alike = (draws[::2] == draws[1::2]).all(-1).double().mean().item()
+    for n in range(1, 7):
+        labels = TaskImpersonation(reward, n=n, sampler=sampler, seed=n)(td)["style"][:, 1:]
+        for shift in (1, 2, 3):  # copies of one transition, then one copy of several transitions
+            _assert_alike(labels, labels.roll(shift, 1), alike) if n > shift else None
+            _assert_alike(labels, labels.roll(shift, 0), alike)
+        if alike == 0.0:
+            assert len(labels.reshape(-1, space.dim).unique(dim=0)) == size * n
+    _assert_same_distribution(labels.reshape(-1, space.dim), draws)
+
+
+def _assert_alike(a, b, probability):
+    same = (a == b).all(-1).double()
+    error = (probability * (1 - probability) / same.numel()) ** 0.5
+    assert abs(same.mean().item() - probability) <= 6 * error + 0.01
+
+
+def _assert_same_distribution(labels, draws):
+    """Each entry, by the largest gap between the two distribution functions (Kolmogorov and Smirnov)."""
+    for entry in range(draws.shape[1]):
+        at = labels[:, entry].unique()
+        gap = (labels[:, entry].sort().values.contiguous(), draws[:, entry].sort().values.contiguous())
+        cdfs = [torch.searchsorted(values, at, right=True) / len(values) for values in gap]
+        assert (cdfs[0] - cdfs[1]).abs().max() < 2.4 * (1 / len(labels) + 1 / len(draws)) ** 0.5
+
+
+def test_the_cars_of_a_race_share_a_style_and_their_labels_do_not():
+    space = family_style("aggressiveness")[0]
+    assert isinstance(space.sampler, Shared)
+    copies = space.sampler.copies
+    drawn = space.sample((copies * 7,), torch.Generator().manual_seed(0)).reshape(copies, 7, space.dim)
+    assert (drawn == drawn[0]).all() and len(drawn[0].unique(dim=0)) == 7
+    assert len(space.sampler.sample_independent((copies, 7)).reshape(-1, space.dim).unique(dim=0)) == 7 * copies
+
+
+def test_samplers_that_share_nothing_draw_as_before():
+    """The same numbers in the same order, so that a seed goes on to mean what it meant."""
+    sampler = style_mixture(StyleSpace([Weight("a", -1.0, 1.0), Weight("b", 0.0, 2.0)]))
+    independent = sampler.sample_independent((5, 3), torch.Generator().manual_seed(0))
+    assert torch.equal(independent, sampler.sample((5, 3), torch.Generator().manual_seed(0)))
+
+
+def steps(n: int) -> TensorDict:
+    td = transitions(n).exclude(("next", "style"))
+    td["next", "done"][:] = td["next", "terminated"][:] = False
+    return td
+
+
+@pytest.mark.parametrize("summed", [True, False])
+def test_sums_are_refused_where_the_style_reward_is_not_linear(summed):
+    keys = [("next", "style_features")] if summed else []
+    relabel = TaskImpersonation(REWARD, n=2)
+    buffer = EventTableBuffer(
+        {"default": 100}, n_steps=3, gamma=0.9, num_envs=1, discounted_keys=keys, batch_size=8, transform=relabel
+    )
+    buffer.extend(steps(60))
+    with pytest.raises(ValueError, match=r"sums over up to 3 steps: the style reward is not linear .*n_steps=1"):
+        buffer.sample()
+
+
+def test_sums_of_torchrls_own_n_step_returns_are_refused_too():
+    relabel = TaskImpersonation(REWARD, n=2)
+    data = MultiStep(gamma=0.9, n_steps=3)(steps(40).reshape(1, 40)).reshape(-1)
+    with pytest.raises(ValueError, match="sums over up to 3 steps"):
+        relabel(data)
+
+
+def test_sums_are_relabelled_where_the_style_reward_is_linear():
+    space = StyleSpace([Weight("a", 0.0, 1.0)])
+    reward = StyleReward(space, {"a": WeightedFeature("a", 0)})
+    td = steps(60)
+    td["style"] = td["style"][:, :1].abs()
+    relabel = TaskImpersonation(reward, n=2)
+    features = [("next", "style_features")]
+    buffer = EventTableBuffer({"default": 100}, n_steps=3, gamma=0.9, num_envs=1, discounted_keys=features)
+    buffer.append_transform(relabel)
+    buffer.extend(td)
+    sample = buffer.sample(8)
+    expected = sample["next", "task_reward"] + sample["style"] * sample["next", "style_features"][..., :1]
+    torch.testing.assert_close(sample["next", "reward"][:, 1:], expected[:, 1:])
+
+
+def test_single_steps_of_a_buffer_that_counts_them_are_relabelled():
+    td = transitions(16).set("steps_to_next_obs", torch.ones(16, 1, dtype=torch.long))
+    assert TaskImpersonation(REWARD, n=2)(td).shape == (16, 3)
 
 
 def test_n_zero_changes_nothing():
@@ -225,7 +349,7 @@ def test_state_is_part_of_the_buffer_state():
 
 @pytest.mark.parametrize("n", [-1, 1.5, True])
 def test_bad_n(n):
-    with pytest.raises(ValueError, match="further styles"):
+    with pytest.raises(ValueError, match="n of TaskImpersonation is"):
         TaskImpersonation(REWARD, n=n)
 
 

@@ -38,6 +38,7 @@ from coachable.envs.combat.traits import (
     site_table,
 )
 from coachable.envs.combat.traps import TrapNumbers
+from coachable.finite import require_finite_action
 from coachable.keys import EVENTS, STYLE_FEATURES, TASK_REWARD
 from coachable.transforms.gamepad import GAMEPAD, canonical_rows
 
@@ -202,8 +203,7 @@ class CombatEnv(EnvBase):
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action").detach()
-        if torch.isnan(action).any():
-            raise ValueError("action contains NaN: the policy has diverged")
+        require_finite_action(action)
         pad = canonical_rows(action.to(torch.float32).T.contiguous())
         noise = Noise.draw(self.num_enemies, self.num_envs, self._random)
         components = run_step(self.state, pad, self.rules, noise, self._ammo, self._sections)

@@ -24,6 +24,9 @@ class CombatMeasures:
         styles: names of theta's weights, in order; all 18 by default.
     """
 
+    needs = "damage, under a weight above 0"
+    """What it takes to tell whether the agent complies."""
+
     def __init__(self, styles: Sequence[str] | None = None) -> None:
         self.styles = check_styles(styles)
         self._high = combat_style_space(self.styles).high
@@ -66,3 +69,7 @@ class CombatMeasures:
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
         """See `StyleMeasures.complies`: damage was done, and it counted for the style that was asked for."""
         return record["requested"] > 0
+
+    def judged(self, record: Mapping[str, Tensor]) -> Tensor:
+        """(T, N) bool: damage was done while a style was asked for."""
+        return ~torch.isnan(record["requested"]) & ((record["damage"] > 0) | (record["requested"] > 0))

@@ -24,7 +24,9 @@ from coachable.envs.humanoid.observation import (
 from coachable.envs.humanoid.rewards import move_reward
 from coachable.envs.humanoid.simulation import HumanoidSimulation, Kinematics
 from coachable.envs.humanoid.styles import STYLE_FEATURES_SIZE, pack_style_features
+from coachable.finite import require_finite_action
 from coachable.keys import STYLE_FEATURES, TASK_REWARD
+from coachable.ranges import COUNT
 
 EPISODE_STEPS = 1000
 FALL_HEIGHT = 1.1  # [m], an episode ends when the head is lower
@@ -69,6 +71,7 @@ class HumanoidEnv(EnvBase):
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
         if step_max <= 0:
             raise ValueError(f"step_max must be positive seconds, got {step_max}")
+        COUNT.check("episode_steps", episode_steps)
         super().__init__(device="cpu", batch_size=torch.Size((num_envs,)))
         if num_threads is None:
             num_threads = min(len(os.sched_getaffinity(0)), num_envs)
@@ -134,9 +137,9 @@ class HumanoidEnv(EnvBase):
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        controls = np.clip(tensordict.get("action").detach().numpy().astype(np.float64), -1.0, 1.0)
-        if np.isnan(controls).any():
-            raise ValueError("action contains NaN: the policy has diverged")
+        action = tensordict.get("action").detach()
+        require_finite_action(action)
+        controls = np.clip(action.numpy().astype(np.float64), -1.0, 1.0)
         diverged = self.simulation.step(controls)
         self.divergences += int(diverged.sum())
         self.steps += 1

@@ -26,6 +26,9 @@ class HumanoidMeasures:
         upper: (3, 6) joint bounds of the poses plus the tolerance [rad].
     """
 
+    needs = "a footstep"
+    """What it takes to tell whether the walker complies."""
+
     def __init__(self) -> None:
         bounds = torch.from_numpy(np.deg2rad(pose_bounds_deg())).float()
         slack = float(np.deg2rad(POSE_TOLERANCE_DEG))
@@ -54,3 +57,7 @@ class HumanoidMeasures:
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
         """See `StyleMeasures.complies`: a strike of the requested length, with the arms in pose."""
         return (record["pose_held"] > 0) & (record["step_length_error"] < LENGTH_TOLERANCE)
+
+    def judged(self, record: Mapping[str, Tensor]) -> Tensor:
+        """(T, N) bool: a foot struck."""
+        return ~torch.isnan(record["step_length"])

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from coachable.envs.humanoid.model import NUM_POSITIONS, load_spec
-from coachable.gl import INSTALL_HINT, NO_BACKEND, choose_gl_backend
+from coachable.gl import INSTALL_HINT, NO_BACKEND, RenderingError, choose_gl_backend
 
 CAMERA_DISTANCE = 3.2  # [m]
 CAMERA_ELEVATION = -12.0  # [deg]
@@ -84,10 +84,10 @@ def _make_gl_context(width: int, height: int):
     """
     backend = choose_gl_backend()
     if backend == NO_BACKEND:
-        raise RuntimeError(INSTALL_HINT)
+        raise RenderingError(INSTALL_HINT)
     try:
         context = import_module(f"mujoco.{backend}").GLContext(width, height)
         context.make_current()
     except (ImportError, AttributeError, RuntimeError, OSError) as error:
-        raise RuntimeError(f"MUJOCO_GL={backend} failed ({error}): {INSTALL_HINT}") from error
+        raise RenderingError(f"MUJOCO_GL={backend} failed ({error}): {INSTALL_HINT}") from error
     return context

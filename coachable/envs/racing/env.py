@@ -26,7 +26,9 @@ from coachable.envs.racing.state import STATE_ROWS
 from coachable.envs.racing.styles import style_features_size
 from coachable.envs.racing.task import TaskWeights
 from coachable.envs.racing.track import Course, Track
+from coachable.finite import require_finite_action
 from coachable.keys import STYLE_FEATURES, TASK_REWARD
+from coachable.ranges import COUNT
 
 EPISODE_STEPS = 1500  # 150 s
 SCENARIO = "scenario"
@@ -114,6 +116,7 @@ class RacingEnv(EnvBase):
             raise ValueError(
                 f"num_envs is {num_envs}: expected a positive multiple of the {controlled} controlled cars"
             )
+        COUNT.check("episode_steps", episode_steps)
         if controlled < cars and driver is None:
             raise ValueError(f"{cars - controlled} cars of each race have no driver: pass driver=")
         if copies < 1 or (num_envs // controlled) % copies:
@@ -238,8 +241,7 @@ class RacingEnv(EnvBase):
         action = tensordict.get("action").detach()
         if action.shape != (self.num_envs, 2):
             raise ValueError(f"action has shape {tuple(action.shape)}: expected ({self.num_envs}, 2), steer and pedals")
-        if torch.isnan(action).any():
-            raise ValueError("action contains NaN: the policy has diverged")
+        require_finite_action(action)
         action = action.clamp(-1.0, 1.0).to(torch.float32)
         if self.driver is not None and self.controlled < self.cars:
             driven = self.driver(self, self._observation[self.num_envs :])

@@ -13,11 +13,17 @@ from coachable.envs.racing.families import check_family
 from coachable.envs.racing.observation import own_columns
 from coachable.envs.racing.referee import TELEMETRY
 from coachable.envs.racing.simulation import CONTROL_STEP
-from coachable.envs.racing.styles import FUEL, TIRE, gap_columns
+from coachable.envs.racing.styles import DRIFT, FUEL, NEAR_DISTANCE, TIRE, anyone_near, gap_columns
 from coachable.keys import STYLE, STYLE_FEATURES
 
 DRIFT_ANGLE_DEG = 20.0  # that counts as a drift
 GRIP_ANGLE_DEG = 8.0  # that counts as none
+_NEEDS = {
+    "drift": "a step",
+    "resources": "whole stints with and without saving, as `coachable evaluate` drives them",
+    "aggressiveness": f"another car within {NEAR_DISTANCE:g} m",
+}
+"""What it takes to tell whether a car complies, by family."""
 _COLUMN = {name: index for index, name in enumerate(TELEMETRY)}
 
 
@@ -34,12 +40,14 @@ class RacingMeasures:
     def __init__(self, family: str) -> None:
         check_family(family)
         self.family = family
+        self.needs = _NEEDS[family]
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
         """See `StyleMeasures.step`. Angles in degrees, wear and fuel per kilometre, gaps in metres.
 
         "steering_change" is that of the steering command in a control step, at most 2: agents that steer from lock to
-        lock in every step may drive well otherwise.
+        lock in every step may drive well otherwise. For aggressiveness "longitudinal" is the distance to the nearest
+        car straight ahead or behind, "lateral" that to the nearest one beside; NaN where there is none within 10 m.
         """
         theta, features = transition.get(STYLE), transition.get(("next", STYLE_FEATURES))
         telemetry = transition.get(("next", "telemetry"))
@@ -64,13 +72,15 @@ class RacingMeasures:
         }
         if self.family == "drift":
             found["heading"] = told("heading")
+            found["slip_ratio_front"], found["slip_ratio_rear"] = features[:, DRIFT].unbind(-1)[2:]
             asked = theta[:, 1] > 1.0
             angle = found["slip_angle_rear"]
             found["complied"] = torch.where(asked, angle >= DRIFT_ANGLE_DEG, angle <= GRIP_ANGLE_DEG).float()
         elif self.family == "resources":
             found["complied"] = 1.0 - found["off"]
         else:
-            found["complied"] = _margins_kept(features, theta).float()
+            found["longitudinal"], found["lateral"] = _distances(features)
+            found["complied"] = torch.where(anyone_near(features), _margins_kept(features, theta).float(), torch.nan)
         return found
 
     def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
@@ -91,9 +101,16 @@ class RacingMeasures:
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
         """See `StyleMeasures.complies`.
 
-        Drifting above 20 degrees where asked for and below 8 where not; on the track; margins kept.
+        Drifting above 20 degrees where asked for and below 8 where not; on the track; margins to a car nearby kept.
         """
         return record["complied"] > 0
+
+    def judged(self, record: Mapping[str, Tensor]) -> Tensor:
+        """(T, N) bool: in this step one can tell whether the car complies.
+
+        Margins are kept or not only while another car is near. Savings show only beside a stint that does not save.
+        """
+        return ~torch.isnan(record["complied"]) & (self.family != "resources")
 
 
 class TelemetryMeasures:
@@ -134,3 +151,15 @@ def _margins_kept(features: Tensor, theta: Tensor) -> Tensor:
     """(N,) bool: no near opponent within the longitudinal and the lateral margin at once."""
     long, lat, near = gap_columns(features)
     return ~((near > 0.0) & (long < theta[:, :1]) & (lat < theta[:, 1:2])).any(-1)
+
+
+def _distances(features: Tensor) -> tuple[Tensor, Tensor]:
+    """Distances to the nearest car straight ahead or behind and to the nearest one beside, (N,) each [m]."""
+    long, lat, near = gap_columns(features)
+    return _nearest(long, (near > 0.0) & (lat == 0.0)), _nearest(lat, (near > 0.0) & (long == 0.0))
+
+
+def _nearest(distances: Tensor, counts: Tensor) -> Tensor:
+    """Smallest of the distances (N, A) that count, (N,); NaN where none does."""
+    found = torch.nn.functional.pad(torch.where(counts, distances, torch.inf), (0, 1), value=torch.inf).amin(-1)
+    return torch.where(torch.isinf(found), torch.nan, found)

@@ -1,0 +1,228 @@
+"""Who may talk to the page's web server, and what the server takes from them.
+
+viser serves any host name and any origin, and hands on whatever a connection sends. The guard stands between it and
+`websockets`, which it is built on: it judges each request by its headers and each message by its content.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import http
+import ipaddress
+import logging
+import math
+import re
+import socket
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import msgspec
+import websockets.asyncio.server as server
+from websockets import Headers
+from websockets.http11 import Request, Response
+
+_THIS_MACHINE = ("localhost", "127.0.0.1", "::1")
+_EVERYWHERE = ("", "*", "0.0.0.0", "::")
+_HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([^\[\]:@/\s]+))(?::\d{1,5})?", re.IGNORECASE)
+_PROTOCOL = re.compile(r"viser-v[\w.+-]{1,32}")
+_CONNECTIONS = 64  # at a time
+_LONGEST_MESSAGE = 1 << 20  # [byte]; viser's browsers send files in pieces of half of it
+_UPLOADED = 32 << 20  # [byte], by one connection
+_PIECES = 64  # of an uploaded file
+_MESSAGES_PER_SECOND = 300.0  # of one connection; the rest waits
+_LONGEST_TEXT = 20_000  # [characters] in a text box
+_LARGEST_WINDOW = 1 << 16  # [px]
+_QUESTIONS_OF_A_PAGE = ("websocket", "playbackPath")  # ask the page to show what another server sends
+
+_log = logging.getLogger("coachable.page")
+_log.addHandler(logging.NullHandler())  # what a stranger sends belongs into no terminal
+
+
+class Guard:
+    """Serves viser's page to its own origin and host names only.
+
+    Args:
+        host: address that the server listens on.
+
+    Attributes:
+        active: whether a server was started under the guard.
+    """
+
+    def __init__(self, host: str) -> None:
+        self.active = False
+        self._everywhere = host in _EVERYWHERE
+        self._names = {*_THIS_MACHINE, host.lower().strip("[]")}
+        if self._everywhere:
+            self._names.add(socket.gethostname().lower())
+
+    @contextlib.contextmanager
+    def around(self) -> Iterator[None]:
+        """The server that is started meanwhile is guarded. viser itself has no setting for this."""
+        serve = server.serve
+        setattr(server, "serve", self._serve(serve))  # noqa: B010, a class stands there
+        try:
+            yield
+        finally:
+            setattr(server, "serve", serve)  # noqa: B010
+
+    def _serve(self, serve: Callable[..., Any]) -> Callable[..., Any]:
+        def guarded(handler: Any, host: str, port: int, **settings: Any) -> Any:
+            self.active = True
+            asyncio.get_running_loop().set_exception_handler(_note)
+            settings |= {
+                "process_request": self._request(settings.get("process_request") or (lambda *_: None)),
+                "create_connection": GuardedConnection,
+                "max_size": _LONGEST_MESSAGE,
+                "logger": _log,
+            }
+            return serve(handler, host, port, **settings)
+
+        return guarded
+
+    def _request(self, answer: Callable[..., Response | None]) -> Callable[..., Response | None]:
+        def judge(connection: server.ServerConnection, request: Request) -> Response | None:
+            reason = self.refusal(request)
+            if reason:
+                return _refused(http.HTTPStatus.FORBIDDEN, reason)
+            if _is_upgrade(request.headers) and len(connection.server.connections) >= _CONNECTIONS:
+                return _refused(http.HTTPStatus.SERVICE_UNAVAILABLE, f"{_CONNECTIONS} browsers are connected already")
+            response = answer(connection, request)
+            if response is not None:
+                response.headers.update(_protection(request.headers["Host"]))
+            return response
+
+        return judge
+
+    def refusal(self, request: Request) -> str:
+        """Why a request is refused, empty if it is not."""
+        hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
+        if len(hosts) != 1 or not self._is_mine(hosts[0]):
+            return "this host name is not the page's own: open the page under the address that it was announced with"
+        own = f"http://{hosts[0]}".lower()
+        upgrade = _is_upgrade(request.headers)
+        if any(origin.lower() != own for origin in origins) or len(origins) > 1 or (upgrade and not origins):
+            return "only the page itself may talk to this server"
+        if upgrade and not _PROTOCOL.fullmatch(request.headers.get("Sec-WebSocket-Protocol", "")):
+            return "this is no connection of the page"
+        if set(parse_qs(urlsplit(request.path).query, keep_blank_values=True)) & set(_QUESTIONS_OF_A_PAGE):
+            return "the page shows this server only"
+        return ""
+
+    def _is_mine(self, host: str) -> bool:
+        """Whether a `Host` header names this server; any port, because it may be forwarded."""
+        match = _HOST.fullmatch(host)
+        name = (match[1] or match[2]).lower() if match else ""
+        return name in self._names or (self._everywhere and _is_address(name))
+
+
+class GuardedConnection(server.ServerConnection):
+    """A browser's connection, of which viser sees only the messages that the page needs."""
+
+    def __init__(self, *arguments: Any, **settings: Any) -> None:
+        super().__init__(*arguments, **settings)
+        self._uploaded = 0
+        self._free_at = 0.0  # moment at which the next message may be taken
+
+    async def recv(self, decode: bool | None = None) -> Any:
+        """The next message that is acceptable; one that is no message of a browser ends the connection."""
+        while True:
+            message = await super().recv(decode)
+            await self._keep_pace()
+            try:
+                wanted = is_wanted(message)
+            except Exception as error:  # random bytes can fail in any way
+                _log.info("a message was refused: %s", error)
+                await self.close(1007, "this is no message of the page")
+                continue
+            if wanted == "FileTransferPart":
+                self._uploaded += len(message)
+                if self._uploaded > _UPLOADED:
+                    await self.close(1009, "too much was uploaded")
+                    continue
+            if wanted:
+                return message
+
+    async def _keep_pace(self) -> None:
+        now = time.monotonic()
+        self._free_at = max(self._free_at, now - 1.0) + 1.0 / _MESSAGES_PER_SECOND
+        if self._free_at > now:
+            await asyncio.sleep(self._free_at - now)
+
+
+def is_wanted(raw: bytes | str) -> str:
+    """Type of a browser's message if the page needs it, otherwise an empty text.
+
+    Raises:
+        ValueError: if it is no message of a browser.
+    """
+    if isinstance(raw, str):
+        raise ValueError("a text, where browsers send bytes")
+    message = msgspec.msgpack.decode(raw)
+    if not isinstance(message, dict) or not isinstance(message.get("type"), str):
+        raise ValueError("a message without a type")
+    kind = message["type"]
+    if kind == "GuiUpdateMessage":
+        return kind if _is_value(message.get("updates")) else ""
+    if kind == "ViewerCameraMessage":
+        sizes = (message.get("image_width"), message.get("image_height"))
+        fits = all(isinstance(size, int) and 0 < size < _LARGEST_WINDOW for size in sizes)
+        return kind if fits and _is_finite([v for v in message.values() if not isinstance(v, str)]) else ""
+    if kind == "FileTransferStartUpload":
+        size, pieces = message.get("size_bytes"), message.get("part_count")
+        fits = isinstance(size, int) and isinstance(pieces, int) and 0 <= size <= _UPLOADED and 0 <= pieces <= _PIECES
+        return kind if fits else ""
+    return kind if kind in ("FileTransferPart", "GuiFormSubmitMessage") else ""
+
+
+def _is_value(updates: Any) -> bool:
+    """Whether a widget's value is set, and nothing else of it."""
+    if not isinstance(updates, dict) or set(updates) != {"value"}:
+        return False
+    value = updates["value"]
+    return isinstance(value, bool | int | float) or (isinstance(value, str) and len(value) <= _LONGEST_TEXT)
+
+
+def _is_finite(value: Any) -> bool:
+    if isinstance(value, list):
+        return all(map(_is_finite, value))
+    return isinstance(value, int | float) and math.isfinite(value)
+
+
+def _is_upgrade(headers: Headers) -> bool:
+    return headers.get("Upgrade", "").lower() == "websocket"
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def _refused(status: http.HTTPStatus, reason: str) -> Response:
+    body = f"Refused: {reason}.\n".encode()
+    headers = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))})
+    return Response(status.value, status.phrase, headers, body)
+
+
+def _protection(host: str) -> dict[str, str]:
+    """Headers by which a browser shows the page in no other page's frame, and lets it talk to this server only."""
+    policy = (
+        "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; "
+        f"connect-src 'self' ws://{host} data: blob:; frame-ancestors 'none'"
+    )
+    return {
+        "Content-Security-Policy": policy,
+        "Cross-Origin-Resource-Policy": "same-origin",
+        "X-Content-Type-Options": "nosniff",
+        "X-Frame-Options": "DENY",
+    }
+
+
+def _note(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """An error in a handler of viser's, which a message may cause: noted, and no traceback."""
+    _log.warning("a message was not carried out: %s", context.get("exception") or context["message"])

@@ -1,0 +1,24 @@
+"""The optional parts of an installation, and how each is installed."""
+
+__all__ = ["EXTRAS", "how_to_install"]
+
+# By name of the extra: the distributions that it brings.
+EXTRAS = {
+    "ui": ("viser", "mjviser"),
+    "video": ("av",),
+    "export": ("onnx", "onnxruntime", "onnxscript"),
+    "explain": ("captum",),
+    "gym": ("gymnasium",),
+}
+
+
+def how_to_install(extra: str) -> str:
+    """Return the commands that install an extra, for an installed package and for a clone of the repository.
+
+    Example:
+        >>> how_to_install("ui")
+        "pip install 'coachable[ui]' (in a clone: pip install -e '.[ui]')"
+    """
+    if extra not in EXTRAS:
+        raise ValueError(f"there is no extra {extra!r}: expected one of {list(EXTRAS)}")
+    return f"pip install 'coachable[{extra}]' (in a clone: pip install -e '.[{extra}]')"

@@ -1,0 +1,223 @@
+"""Files that may come from anybody: read without executing anything of them, checked for damage, written completely."""
+
+import contextlib
+import os
+import shutil
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+__all__ = [
+    "CheckpointError",
+    "check_contained",
+    "check_finite",
+    "load_state",
+    "refusing",
+    "save_state",
+    "space_named",
+    "sync_folder",
+    "tensor_bytes",
+    "write_text",
+]
+
+_PLAIN = (bool, int, float, str, type(None))
+
+
+class CheckpointError(RuntimeError):
+    """A checkpoint or a weights file is missing, damaged, or does not fit what wants to use it."""
+
+
+@contextlib.contextmanager
+def refusing(source: Path | str, what: str) -> Iterator[None]:
+    """Turn errors met while something from a file is used into one sentence that names the file.
+
+    Args:
+        source: The file or folder.
+        what: What was taken from it, for the message ("a style space").
+
+    Raises:
+        CheckpointError: For anything but a `CheckpointError`, `OSError`, `ImportError` or a warning, which pass.
+    """
+    try:
+        yield
+    except (CheckpointError, OSError, ImportError, Warning):
+        raise
+    except Exception as error:
+        lines = str(error).strip().splitlines() or ["no reason given"]
+        reason = f"{lines[0]} is missing" if isinstance(error, KeyError) else f"{type(error).__name__}: {lines[0]}"
+        raise CheckpointError(
+            f"{source} holds {what} that cannot be used: {reason}. Expected what this version of coachable writes."
+        ) from error
+
+
+@contextlib.contextmanager
+def space_named(target: Path, required_bytes: int) -> Iterator[None]:
+    """Say of a failed write how much space it needs and how much there is.
+
+    Args:
+        target: What is written; its folder exists.
+        required_bytes: What it takes.
+
+    Raises:
+        OSError: With one sentence, for any `OSError`.
+    """
+    try:
+        yield
+    except OSError as error:
+        free = shutil.disk_usage(target.parent).free
+        raise OSError(
+            f"cannot write {target}: it needs about {required_bytes / 1e6:,.1f} MB, {free / 1e6:,.1f} MB are free "
+            f"({error.strerror or error})"
+        ) from error
+
+
+def tensor_bytes(value: Any) -> int:
+    """Size of all tensors in nested containers."""
+    if isinstance(value, Tensor):
+        return value.numel() * value.element_size()
+    if isinstance(value, Mapping):
+        return sum(map(tensor_bytes, value.values()))
+    return sum(map(tensor_bytes, value)) if isinstance(value, list | tuple) else 0
+
+
+def save_state(state: Mapping[str, Any], file: Path) -> None:
+    """Write nested containers of tensors, numbers and strings, and sync them to disk.
+
+    The file is a zip archive, which has a checksum of every member.
+
+    Raises:
+        CheckpointError: If there is anything else in `state`, which could not be read back.
+        OSError: If writing fails.
+    """
+    _check_plain(state, file.name)
+    try:
+        with file.open("wb") as stream:
+            torch.save(dict(state), stream)
+            stream.flush()
+            os.fsync(stream.fileno())
+    except RuntimeError as error:  # torch's zip writer reports a failed write this way
+        raise OSError("torch could not write all of it") from error
+
+
+def load_state(file: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
+    """Read what `save_state` wrote, without executing anything from it.
+
+    Args:
+        file: The file.
+        device: Where tensors go.
+
+    Raises:
+        CheckpointError: If it is missing, damaged, of another kind, or would need pickle.
+    """
+    if not file.is_file():
+        raise CheckpointError(f"no such file: {file}")
+    with refusing(file, "data"):
+        _check_archive(file)
+        try:
+            state = torch.load(file, map_location=device, weights_only=True)
+        except Exception as error:
+            raise CheckpointError(
+                f"cannot read {file}: it holds something else than tensors, numbers, strings and containers of these, "
+                "which is not loaded because loading could run code"
+            ) from error
+        _check_plain(state, str(file))
+        if not isinstance(state, dict):
+            raise CheckpointError(f"{file} holds a {type(state).__name__}: expected a dictionary")
+        return state
+
+
+def check_finite(values: Any, source: Path | str, name: str = "") -> None:
+    """Refuse NaN and infinity in the tensors of nested containers.
+
+    Args:
+        values: Containers, tensors and anything else.
+        source: Where they are from, for the message.
+        name: Of `values` in the source.
+
+    Raises:
+        CheckpointError: Naming the tensor.
+    """
+    if isinstance(values, Tensor):
+        finite = torch.isfinite(values)
+        if not finite.all():
+            raise CheckpointError(
+                f"{source} is not usable: {int((~finite).sum())} of {values.numel()} values of {name} are NaN or "
+                "infinite, expected finite ones"
+            )
+    elif isinstance(values, Mapping):
+        for key, value in values.items():
+            check_finite(value, source, f"{name}.{key}" if name else str(key))
+    elif isinstance(values, list | tuple):
+        for i, value in enumerate(values):
+            check_finite(value, source, f"{name}.{i}")
+
+
+def check_contained(folder: Path) -> None:
+    """Refuse links in a folder that lead out of it: what is read and written there must lie there.
+
+    Raises:
+        CheckpointError: Naming the link.
+    """
+    home = folder.resolve()
+    for place, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            path = Path(place, name)
+            if path.is_symlink() and not path.resolve().is_relative_to(home):
+                raise CheckpointError(
+                    f"{path} is a link to {path.resolve()}, outside of {folder}: expected a run whose files all lie in "
+                    "its own folder"
+                )
+
+
+def write_text(file: Path, text: str) -> None:
+    """Write a text file and sync it to disk."""
+    with file.open("w", encoding="utf-8") as stream:
+        stream.write(text)
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+def sync_folder(folder: Path) -> None:
+    """Sync a folder's list of files to disk."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _check_archive(file: Path) -> None:
+    """Compare the archive with its checksums, which torch does not read."""
+    size = file.stat().st_size
+    whole = False
+    with contextlib.suppress(Exception), zipfile.ZipFile(file) as archive:  # it raises errors of many kinds
+        members = archive.infolist()
+        stored = all(member.compress_type == zipfile.ZIP_STORED for member in members)  # as torch does
+        whole = stored and sum(member.file_size for member in members) <= size and archive.testzip() is None
+    if not whole:
+        raise CheckpointError(
+            f"{file} is damaged, cut short or of another kind ({size:,} bytes): expected an uncompressed archive as "
+            "written by coachable, whose content agrees with its checksums"
+        )
+
+
+def _check_plain(value: Any, name: str) -> None:
+    if isinstance(value, dict):
+        for key, entry in value.items():
+            _check_plain(entry, f"{name}, {key}")
+            if type(key) not in (str, int):
+                raise CheckpointError(f"{name} has the key {key!r}: expected a string or an integer")
+    elif isinstance(value, list | tuple):
+        for i, entry in enumerate(value):
+            _check_plain(entry, f"{name}, {i}")
+    elif isinstance(value, Tensor):
+        if value.layout != torch.strided or value.is_meta or value.is_quantized:
+            raise CheckpointError(f"{name} is a tensor of an unusual kind: expected a dense one")
+    elif type(value) not in _PLAIN:
+        raise CheckpointError(
+            f"{name} is a {type(value).__name__}: expected tensors, numbers, strings and containers of these"
+        )

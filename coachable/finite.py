@@ -1,0 +1,64 @@
+"""Numbers that would ruin a training are refused before they reach the replay buffer or a weight."""
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+__all__ = ["LARGEST", "NonFiniteError", "require_finite", "require_finite_action"]
+
+LARGEST = 1e18  # float32 ends at 3.4e38: squares of larger numbers, summed over a batch, are infinite
+
+
+class NonFiniteError(ValueError):
+    """A number is NaN, infinite, or so large that its square is."""
+
+
+def require_finite(data: TensorDictBase) -> None:
+    """Refuse collected transitions that would poison the replay buffer and then the weights.
+
+    Args:
+        data: `(environments, steps)` or `(steps,)`; every floating-point entry is looked at, nested ones included.
+
+    Raises:
+        NonFiniteError: If a number is NaN, infinite or beyond `LARGEST`; names the first step at which one is, the
+            environment and the entries.
+    """
+    steps = data.batch_size[-1]
+    floats = {key: value for key, value in data.items(True, True) if value.is_floating_point() and value.numel()}
+    bad = {key: value.reshape(-1, steps, value.numel() // data.numel()) for key, value in floats.items() if _bad(value)}
+    if not bad:
+        return
+    # The first step counts, and there the first environment.
+    marked = torch.stack([_beyond(value).any(-1).T for value in bad.values()]).any(0)
+    step, row = marked.nonzero()[0].tolist()
+    at_fault = {key: value[row, step][_beyond(value[row, step])] for key, value in bad.items()}
+    found = [f"{key if isinstance(key, str) else '/'.join(key)} is {v[0]:g}" for key, v in at_fault.items() if len(v)]
+    raise NonFiniteError(
+        f"{', '.join(found)} in environment {row}, step {step + 1} of {steps} of the last batch, of which nothing was "
+        f"stored: expected finite numbers up to {LARGEST:g}. Look at the environment's step function and at the style "
+        "terms; an episode whose physics explode has to end."
+    )
+
+
+def require_finite_action(action: Tensor) -> None:
+    """Refuse to simulate a NaN.
+
+    Args:
+        action: `(environments, components)`.
+
+    Raises:
+        NonFiniteError: Naming the first environment whose action contains NaN.
+    """
+    missing = action.isnan()
+    if missing.any():
+        row = missing.flatten(1).any(1).nonzero()[0].item()
+        raise NonFiniteError(f"action contains NaN in environment {row}: the policy has diverged.")
+
+
+def _bad(value: Tensor) -> bool:
+    low, high = value.aminmax()  # NaN if any entry is, and then no comparison holds
+    return not (bool(low >= -LARGEST) and bool(high <= LARGEST))
+
+
+def _beyond(value: Tensor) -> Tensor:
+    return ~(value.abs() <= LARGEST)

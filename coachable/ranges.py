@@ -1,0 +1,75 @@
+"""Ranges of numbers, and the sentence that refuses a number outside of them."""
+
+from __future__ import annotations
+
+import math
+import numbers
+from dataclasses import dataclass
+from typing import Any
+
+__all__ = ["AMOUNT", "COUNT", "FINITE", "NOT_NEGATIVE", "POSITIVE", "SHARE", "Range"]
+
+
+@dataclass(frozen=True)
+class Range:
+    """Numbers that make sense for one quantity; never NaN, and infinite only if a closed bound is.
+
+    Args:
+        interval: Such as `"[0, 1]"`, `"(0, 1]"` or `"[1, inf)"`; a round bracket leaves the bound out.
+        whole: Whether only whole numbers make sense.
+        optional: Whether `None` does, too.
+
+    Example:
+        >>> Range("(0, 1]").check("tau", 0.005)
+        >>> Range("(0, 1]").check("tau", 2)
+        Traceback (most recent call last):
+            ...
+        ValueError: tau is 2: expected a number in (0, 1]
+    """
+
+    interval: str
+    whole: bool = False
+    optional: bool = False
+
+    def holds(self, value: Any) -> bool:
+        """Whether a value is a number of this range."""
+        if value is None:
+            return self.optional
+        if isinstance(value, bool) or not isinstance(value, numbers.Real):
+            return False
+        number, (low, high) = float(value), self._bounds()
+        above = number > low if self.interval[0] == "(" else number >= low
+        below = number < high if self.interval[-1] == ")" else number <= high
+        return above and below and (not self.whole or number.is_integer())
+
+    def check(self, name: str, value: Any) -> None:
+        """Refuse a value that is not in the range.
+
+        Raises:
+            ValueError: Naming the quantity, what was given and what was expected.
+        """
+        if not self.holds(value):
+            raise ValueError(f"{name} is {value!r}: expected {self}")
+
+    def __str__(self) -> str:
+        low, high = self._bounds()
+        kind = "a whole number" if self.whole else "a number"
+        if math.isinf(low) and math.isinf(high):
+            where = "that is finite"
+        elif math.isinf(high):
+            where = f"{'above' if self.interval[0] == '(' else 'of at least'} {low:g}"
+        else:
+            where = f"in {self.interval}"
+        return f"{kind} {where}{', or None' if self.optional else ''}"
+
+    def _bounds(self) -> tuple[float, float]:
+        low, high = self.interval[1:-1].split(",")
+        return float(low), float(high)
+
+
+FINITE = Range("(-inf, inf)")
+POSITIVE = Range("(0, inf)")
+NOT_NEGATIVE = Range("[0, inf)")
+SHARE = Range("[0, 1]")
+COUNT = Range("[1, inf)", whole=True)
+AMOUNT = Range("[0, inf)", whole=True)

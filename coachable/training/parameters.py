@@ -1,0 +1,133 @@
+"""The trained parameters of a loss, and how optimisers keep hold of them when others take their place."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictParams
+from torch import Tensor, nn
+from torch.autograd.graph import increment_version
+from torchrl.objectives import LossModule
+
+__all__ = ["Watch", "adopt_actor", "follow", "loaded", "share_actor", "trained_parameters"]
+
+
+def trained_parameters(loss_module: LossModule) -> dict[str, list[str]]:
+    """Return the names of the trained parameters: `"actor"` of the policy, `"critic"`, and `"alpha"`, the temperature.
+
+    Raises:
+        ValueError: If the policy or the critics have none.
+    """
+    groups: dict[str, list[str]] = {"actor": [], "critic": [], "alpha": []}
+    for name, parameter in loss_module.named_parameters():
+        if parameter.requires_grad:
+            kind = "actor" if name.startswith("actor_network_params") else "alpha" if name == "log_alpha" else "critic"
+            groups[kind].append(name)
+    if not groups["actor"] or not groups["critic"]:
+        missing = "critics" if groups["actor"] else "a policy (actor_network_params)"
+        raise ValueError(
+            f"{type(loss_module).__name__} has no trainable parameters of {missing}: the learner needs both"
+        )
+    return groups
+
+
+class Watch:
+    """Notices when a loss has other parameters, or the same ones with other memory or of another dtype.
+
+    Memory that moves with everybody who uses it, as in `share_memory_()`, counts as the same. Memory that is exchanged,
+    as in `tensor.data = other`, `.to(dtype)` or `load_state_dict(assign=True)`, does not.
+
+    Args:
+        loss_module: The loss.
+    """
+
+    def __init__(self, loss_module: LossModule) -> None:
+        self._loss = loss_module
+        self._seen: list[tuple[Tensor, Tensor]] = []
+
+    def look(self) -> None:
+        """Take note of the parameters as they are now."""
+        self._seen = [(tensor, tensor.detach()) for tensor in self._tensors()]
+
+    def changed(self) -> bool:
+        """Whether the parameters are others than at the last look."""
+        tensors = self._tensors()
+        return len(tensors) != len(self._seen) or not all(
+            tensor is seen and tensor.is_set_to(alias)
+            for tensor, (seen, alias) in zip(tensors, self._seen, strict=True)
+        )
+
+    def forget_copies(self) -> None:
+        """Drop the detached and batched copies of parameters that TorchRL and tensordict keep."""
+        loss: Any = self._loss
+        loss._erase_cache()
+        for params in _sets(loss):
+            _erase_caches(params)
+
+    def _tensors(self) -> list[Tensor]:
+        sets = _sets(self._loss)
+        return [*self._loss.parameters(), *(tensor for params in sets for tensor in params.buffers())]
+
+
+def _sets(loss_module: LossModule) -> list[TensorDictParams]:
+    return [child for child in loss_module.children() if isinstance(child, TensorDictParams)]
+
+
+def _erase_caches(params: Any) -> None:
+    params._erase_cache()
+    if isinstance(params, TensorDictParams):
+        return _erase_caches(params._param_td)
+    for value in params.values():
+        if isinstance(value, TensorDictBase):
+            _erase_caches(value)
+
+
+def share_actor(loss_module: LossModule) -> None:
+    """Give the loss's policy the parameters that the loss trains; in a copy of a loss it has its own.
+
+    This also happens each time that the loss loads a state.
+    """
+    if _apart(loss_module):
+        loss: Any = loss_module
+        loss.actor_network_params.to_module(loss.actor_network)
+
+
+def adopt_actor(loss_module: LossModule) -> None:
+    """Let the loss train the parameters that its policy has now, if `load_state_dict(assign=True)` replaced them."""
+    if _apart(loss_module):
+        loss: Any = loss_module
+        loss.actor_network_params = TensorDict.from_module(loss.actor_network, as_module=True)
+
+
+def loaded(loss_module: LossModule, _: Any) -> None:
+    """Hook after the loss loaded a state, which goes through `.data`, so that versions do not tell of it.
+
+    It knows nothing but its arguments, so that a copy of the loss has one of its own.
+    """
+    share_actor(loss_module)
+    increment_version([*loss_module.parameters(), *loss_module.buffers()])
+
+
+def follow(optimizer: torch.optim.Optimizer, params: list[nn.Parameter]) -> None:
+    """Let an optimiser of one group go on with `params` in place of its own, in their dtype, with the state it has."""
+    (group,) = optimizer.param_groups
+    moment = optimizer.state[params[0]].get("exp_avg") if params[0] in optimizer.state else None
+    same = all(new is old for new, old in zip(params, group["params"], strict=True))
+    if same and (moment is None or moment.dtype == params[0].dtype):
+        return
+    saved = optimizer.state_dict()
+    group["params"] = params
+    optimizer.state.clear()
+    optimizer.load_state_dict(saved)
+
+
+def _apart(loss_module: LossModule) -> bool:
+    """Whether the loss's policy has other parameters than those that the loss trains."""
+    loss: Any = loss_module
+    actor = getattr(loss, "actor_network", None)
+    if not isinstance(actor, nn.Module):
+        return False
+    own, trained = dict(actor.named_parameters()), dict(loss.actor_network_params.named_parameters())
+    return own.keys() == trained.keys() and any(own[name] is not trained[name] for name in own)

@@ -1,0 +1,117 @@
+"""Every recipe with its simulators in processes of their own, and one on Ray."""
+
+import multiprocessing
+import os
+import signal
+from importlib import import_module
+
+import pytest
+import torch
+from recipe_config import compose_config
+
+from tests.recipes.test_every_combination import RECIPES, TINY
+
+
+@pytest.fixture
+def quick_starts():
+    """Workers start in a moment as copies of a process that has imported what they need; by default each imports it."""
+    before = multiprocessing.get_start_method(allow_none=True)
+    multiprocessing.set_start_method("forkserver", force=True)
+    multiprocessing.set_forkserver_preload(["coachable.training.loop", "torchrl.collectors", "gymnasium", *RECIPES])
+    yield
+    multiprocessing.set_start_method(before, force=True)
+
+
+def build(recipe, run_dir, *arguments):
+    process = ["collector=process", "collector.num_collectors=1", "train.utd_ratio=0.5", f"run_dir={run_dir}"]
+    return import_module(recipe).build(compose_config(recipe, [*TINY, *process, *arguments]))
+
+
+def watch_actions(train, visit=lambda: None):
+    """Lists how far the actions that arrive are from what the policy would do now; `visit` is called at each batch."""
+    actor, store, distances = train.learner.loss_module.actor_network, train._store, []
+    key = next(key for key in ("loc", "preferences") if key in actor.out_keys)
+
+    def watch(data):
+        arrived = data.contiguous().reshape(-1)
+        with torch.no_grad():
+            expected = actor[0](arrived.select(*actor[0].in_keys))[key]
+        distances.append((expected - arrived[key]).abs().max().item())
+        visit()
+        store(data)
+
+    train._store = watch
+    return distances
+
+
+def require_trained(train, distances):
+    assert train.learner.updates >= 2
+    assert max(distances[-2:]) < 1e-4, "the workers act with the weights of the last update"
+    for name, value in train.learner.loss_module.named_parameters():
+        assert torch.isfinite(value).all(), name
+
+
+def start_of(module):
+    return torch.cat([p.detach().flatten() for p in module.parameters()])
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_every_recipe_trains_with_a_worker(recipe, tmp_path, quick_starts):
+    train = build(recipe, tmp_path)
+    actor = train.learner.loss_module.actor_network
+    before, distances = start_of(actor), watch_actions(train)
+    train.run()
+    require_trained(train, distances)
+    assert not torch.equal(start_of(actor), before)
+    assert not multiprocessing.active_children()
+
+
+def test_ctrl_c_ends_workers_and_training(tmp_path, quick_starts):
+    """It reaches the workers, too, who leave it to the training process."""
+    train = build("humanoid_sac", tmp_path, "collector.num_collectors=2", "train.total_frames=10_000")
+    workers = [worker.pid for worker in train.collector.procs]
+
+    def interrupt():
+        if train.learner.updates >= 4:
+            for process in (*workers, os.getpid()):
+                os.kill(process, signal.SIGINT)
+
+    distances = watch_actions(train, interrupt)
+    train.run()
+    assert train.frames < 100
+    require_trained(train, distances)
+    assert (tmp_path / "checkpoints" / "LATEST").exists()
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sync", [True, False])
+def test_workers_start_as_by_default(sync, tmp_path):
+    train = build("humanoid_sac", tmp_path, "collector.num_collectors=2", f"collector.sync={sync}")
+    distances = watch_actions(train)
+    train.run()
+    if sync:
+        require_trained(train, distances)
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.ray
+def test_ray_workers_train(tmp_path):
+    """Two local workers: every batch comes from both, with the weights of the last update."""
+    ray = pytest.importorskip("ray")
+    train = build("humanoid_sac", tmp_path, "collector=ray", "collector.num_collectors=2", "train.total_frames=80")
+    trajectories = []
+    store = train._store
+
+    def keep(data):
+        trajectories.append(data["collector", "traj_ids"].flatten(1).unique(dim=1))
+        store(data)
+
+    train._store = keep
+    distances = watch_actions(train)
+    train.run()
+    assert train.frames == 80
+    require_trained(train, distances)
+    first, second = torch.cat(trajectories, 1)
+    assert not set(first.tolist()) & set(second.tolist()), "a trajectory belongs to one worker"
+    assert not ray.is_initialized()

@@ -1,0 +1,144 @@
+"""Numbers of a configuration that lie outside their range: refused before anything is allocated."""
+
+import math
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import recipe_config
+import yaml
+from recipe_config import compose_config
+from recipe_ranges import RANGES, checked_numbers, range_of
+
+from coachable.finite import NonFiniteError
+
+CONFIGS = Path(recipe_config.CONFIGS)
+FREE = {"critic_support", "network.critic.initial_value", "env.conditions"}  # any finite number
+
+
+def _numbers(value, path=()):
+    if isinstance(value, dict):
+        for key, entry in value.items():
+            yield from _numbers(entry, (*path, str(key)))
+    elif isinstance(value, list):
+        for entry in value:
+            yield from _numbers(entry, (*path, "*"))
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        yield path
+
+
+def _every_number():
+    for file in sorted(CONFIGS.rglob("*.yaml")):
+        text = file.read_text(encoding="utf-8")
+        shared = file.parent == CONFIGS or "# @package _global_" in text
+        for path in _numbers(yaml.safe_load(text) or {}, () if shared else (file.parent.name,)):
+            if path[0] not in ("hydra", "defaults"):
+                yield file.stem, path
+
+
+def test_every_number_of_the_configurations_has_a_range():
+    found = list(_every_number())
+    assert len(found) > 100
+    lacking = {".".join(path) for _, path in found if range_of(path) is None}
+    assert {name for name in lacking if not any(name.startswith(free) for free in FREE)} == set()
+
+
+def _outside(range_):
+    low, high = (float(part) for part in range_.interval[1:-1].split(","))
+    below = low if range_.interval[0] == "(" else low - 1
+    above = high if range_.interval[-1] == ")" else high + 1
+    return [below, above, math.nan, math.inf, "many", True] + [1.5] * range_.whole + [None] * (not range_.optional)
+
+
+@pytest.mark.parametrize("key", RANGES)
+def test_what_lies_outside_is_named_with_the_range(key):
+    parts = [part if part != "*" else "any" for part in key.split(".")]
+    for value in _outside(RANGES[key]):
+        config = value
+        for part in reversed(["group", *parts]):
+            config = {part: config}
+        with pytest.raises(ValueError, match=rf"^group\.{'.'.join(parts)}=.*: expected a .*number "):
+            checked_numbers(config)
+
+
+@pytest.mark.parametrize(
+    "argument, message",
+    [
+        ("gamma=1.5", r"gamma=1.5: expected a number in \[0, 1\]"),
+        ("alpha=-0.1", r"alpha=-0.1: expected a number above 0"),
+        ("learner.tau=2", r"learner.tau=2: expected a number in \(0, 1\]"),
+        ("train.batch_size=0", r"train.batch_size=0: expected a whole number of at least 1"),
+        ("train.throttle=fast", r"train.throttle=fast: expected a number above 0, or null"),
+        ("gamma=null", r"gamma=null: expected a number in \[0, 1\]"),
+        ("mirror=1.2", r"mirror=1.2: expected a number in \[0, 1\]"),
+        ("network.actor.widths=[32,0]", r"network.actor.widths=0: expected a whole number of at least 1"),
+        ("network.critic.widths=[]", r"network.critic.widths=\[\]: expected the width of one layer"),
+        ("critic_support.v_min=700", r"critic_support.v_min=700.*: expected less than v_max, which is 650.0"),
+        ("replay.gamma=-1", r"replay.gamma=-1: expected a number in \[0, 1\]"),
+        ("style_reward.pose_scale=nan", r"style_reward.pose_scale=nan: expected a number of at least 0"),
+    ],
+)
+def test_on_the_command_line(argument, message):
+    with pytest.raises(ValueError, match=message):
+        compose_config("humanoid_sac", ["preset=smoke", argument])
+
+
+def test_shares_above_one():
+    for argument in ("event_share=1.1", "replay.event_share=1", "+replay.table_proportions={default: 1.5}"):
+        with pytest.raises(ValueError, match="expected a number in"):
+            compose_config("rare_targets", ["preset=smoke", argument])
+    with pytest.raises(ValueError, match=r"sampler.share=2: expected a number in \[0, 1\]"):
+        compose_config("racing_qr_sac", ["preset=smoke", "sampler=with_extremes", "+sampler.share=2"])
+
+
+def test_whole_numbers_may_be_written_with_an_exponent():
+    config = compose_config("humanoid_sac", ["preset=smoke", "train.total_frames=1e6", "replay_capacity=2e3"])
+    for value in (config["train"]["total_frames"], config["replay"]["table_capacities"]["default"]):
+        assert isinstance(value, int)
+
+
+@pytest.mark.parametrize(
+    "recipe, arguments, message",
+    [
+        ("humanoid_sac", ["train.utd_ratio=null"], "needs a throttle"),
+        ("humanoid_sac", ["n_steps=3", "impersonation.n=1"], "not linear"),
+        (
+            "rare_targets",
+            ["+sampler.neutral=0.9", "sampler=independent", "+sampler.independent=0.9"],
+            "exceed 1 together",
+        ),
+        ("rare_targets", ["event_horizon=5000"], "less than event_horizon"),
+        ("rare_targets", ["train.batch_size=2"], "train.batch_size=2: every batch"),
+    ],
+)
+def test_contradictions_are_refused_before_anything_is_written_or_allocated(
+    recipe, arguments, message, tmp_path, monkeypatch
+):
+    def refuse(*_, **__):
+        raise AssertionError("a network was built")
+
+    monkeypatch.setattr("coachable.networks.make_gaussian_actor", refuse)
+    run_dir = tmp_path / "run"
+    config = compose_config(recipe, ["preset=smoke", f"run_dir={run_dir}", *arguments])
+    with pytest.raises(ValueError, match=message):
+        import_module(recipe).build(config)
+    assert not run_dir.exists()
+
+
+def test_a_training_that_is_stopped_by_a_number_ends_with_one_sentence(monkeypatch, tmp_path):
+    """At the command line: no traceback, exit code 1 (a message makes it so)."""
+
+    class Stopped:
+        def run(self):
+            raise NonFiniteError("next/reward is nan in environment 1.")
+
+    monkeypatch.setattr(sys, "argv", ["rare_targets.py", "preset=smoke", f"run_dir={tmp_path}"])
+    monkeypatch.setattr(recipe_config, "announce", lambda *_: None)
+    with pytest.raises(SystemExit) as stopped:
+        recipe_config.run_recipe("rare_targets", lambda config: Stopped())
+    assert stopped.value.code == "error: next/reward is nan in environment 1."
+    monkeypatch.setattr(sys, "argv", ["rare_targets.py", "preset=smoke", "gamma=1.5"])
+    with pytest.raises(SystemExit) as refused:
+        recipe_config.run_recipe("rare_targets", lambda config: Stopped())
+    assert refused.value.code == "error: gamma=1.5: expected a number in [0, 1]"
