@@ -541,8 +541,8 @@ def test_in_a_narrow_window_the_picture_lies_above_the_panel(server, monkeypatch
 
 
 def test_in_a_narrow_window_the_camera_shows_the_agent_above_the_panel():
-    camera = SimpleNamespace(image_width=400)
-    views._above_the_panel(SimpleNamespace(camera=camera))
+    camera = SimpleNamespace(image_width=400, position=views._START)
+    views._raise_agent(camera)
     position, target = np.array(camera.position), np.array(camera.look_at)
     ahead = (target - position) / np.linalg.norm(target - position)
     right = np.cross(ahead, [0.0, 0.0, 1.0])
@@ -551,9 +551,12 @@ def test_in_a_narrow_window_the_camera_shows_the_agent_above_the_panel():
         seen = np.array([0.0, 0.0, height]) - position
         share = (seen @ up) / (seen @ ahead) / np.tan(np.deg2rad(75.0) / 2)  # -1 below, 1 above
         assert 0.2 < share < 1.0, "above the panel's 60 %"
-    wide = SimpleNamespace(image_width=1280)
-    views._above_the_panel(SimpleNamespace(camera=wide))
-    assert not hasattr(wide, "look_at")
+    for other in (
+        SimpleNamespace(image_width=1280, position=views._START),
+        SimpleNamespace(image_width=400, position=(1.0, 1.0, 1.0)),  # the user has moved it
+    ):
+        views._raise_agent(other)
+        assert not hasattr(other, "look_at")
 
 
 def test_the_humanoid_stays_in_the_middle_of_the_scene(server):
