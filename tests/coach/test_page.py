@@ -240,7 +240,7 @@ def test_the_agent_acts_while_a_phrase_is_read(page, monkeypatch):
     count = page.session.step_count
     wait_for(lambda: page.session.step_count > count + 5)
     page.run_plan.value = True
-    wait_for(lambda: "still being read" in page.status.content)
+    wait_for(lambda: "was given before is still being read" in page.status.content)
     finish.set()
     wait_for(lambda: page.session.style["target"] == pytest.approx(0.4))
 
@@ -306,8 +306,9 @@ def test_the_chart_has_a_fixed_axis_of_time_and_says_when_nothing_was_measured(p
     assert page.chart.plot.scales["x"]["range"] == (-30.0, 0.0)
     ago, asked, measured = page.chart.plot.data
     assert ago == pytest.approx([-0.05, 0.0]) and measured == pytest.approx(asked)
+    assert not page.chart.note.visible
     page.chart.choice.value = "mood"
-    wait_for(lambda: "mood: nothing was measured" in page.chart.note.content)
+    wait_for(lambda: "mood: nothing was measured" in page.chart.note.content and page.chart.note.visible)
     assert len(page.chart.plot.data) == 2, "what was asked for only"
 
 
