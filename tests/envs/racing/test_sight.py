@@ -168,5 +168,5 @@ def test_a_driver_sees_the_scaled_state():
     torch.testing.assert_close(block("fuel")[0], s.fuel / 100.0)
     rpm, gear, torque = block("powertrain")
     torch.testing.assert_close(gear, s.gear / 8.0)
-    assert ((0 <= rpm) & (rpm <= 1.1)).all() and ((0 <= torque) & (torque <= 1.0)).all()
+    assert ((rpm >= 0) & (rpm <= 1.1)).all() and ((torque >= 0) & (torque <= 1.0)).all()
     assert (block("tyre_load").sum(0) * 5000.0 > 1000.0 * 9.81).all()
