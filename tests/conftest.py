@@ -1,5 +1,6 @@
 """Fixtures that several test folders share."""
 
+import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -8,6 +9,15 @@ from typing import Any
 import pytest
 
 # Imported inside the fixtures: a test that needs none of this should not pay for it.
+
+if os.environ.get("COACHABLE_SANITIZE") == "1":  # see CONTRIBUTING.md
+    import torch
+
+    from coachable.networks import memory, native
+
+    native._FLAGS += ("-fsanitize=address,undefined", "-fno-sanitize-recover=undefined", "-g")
+    # Each tensor's memory of its own, so that what lies beyond its end is known to be nobody's.
+    memory.Arena.empty = lambda _, *shape, dtype=torch.float32: torch.empty(shape, dtype=dtype)
 
 
 @pytest.fixture

@@ -22,6 +22,7 @@ LAYERS = {
     "gl": 0,
     "keys": 0,
     "ranges": 0,
+    "third_party": 0,
     "styles": 0,
     "losses": 1,
     "networks": 1,

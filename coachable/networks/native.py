@@ -8,6 +8,7 @@ import hashlib
 import logging
 import os
 import shutil
+import stat
 import subprocess
 import tempfile
 from dataclasses import dataclass
@@ -55,6 +56,9 @@ class Kernels:
 def load_kernels() -> dict[torch.dtype, Kernels]:
     """Compile (once per machine, about a second) and load the kernels.
 
+    The library is kept in `coachable` below `XDG_CACHE_HOME` or `~/.cache`, and only loaded from there if nobody else
+    can write to the folder or the file.
+
     Returns:
         The kernels by dtype of the matrix products, or none without a working C compiler, or if `COACHABLE_NATIVE=0`
         is set. Everything works without them: an update takes about 1.2 times as long at float32 (measured on a Zen 5
@@ -69,37 +73,61 @@ def load_kernels() -> dict[torch.dtype, Kernels]:
         )
         return {}
     try:
-        return _bind(ctypes.CDLL(str(_build(compiler))))
+        return _bind(_library(compiler))
     except (OSError, subprocess.SubprocessError) as error:
         detail = getattr(error, "stderr", "") or error
         _LOG.warning("building %s with %s failed; the learner goes without: %s", _SOURCE.name, compiler, detail)
         return {}
 
 
-def _build(compiler: str) -> Path:
+def _library(compiler: str) -> ctypes.CDLL:
+    """Load the library of this source from the user's cache, where it is built first if need be.
+
+    Without a cache that only the user can write to, it is built in a folder that goes away again.
+    """
     source = _SOURCE.read_bytes()
     machine = repr(sorted(torch.cpu.get_capabilities().items()))  # the cache may be shared between machines
     key = hashlib.sha256(b"\0".join((source, machine.encode(), compiler.encode(), repr(_FLAGS).encode()))).hexdigest()
-    library = _cache() / f"kernels-{key[:20]}.so"
-    if not library.exists():
-        with tempfile.TemporaryDirectory(dir=library.parent) as folder:
-            built = Path(folder) / library.name
-            command = [compiler, *_FLAGS, "-o", str(built), str(_SOURCE), "-lm"]
-            subprocess.run(command, check=True, capture_output=True, text=True, timeout=120)
-            built.replace(library)  # atomic: several processes may build at once
+    name = f"kernels-{key[:20]}.so"
+    folder = _cache()
+    if folder is None:
+        with tempfile.TemporaryDirectory(prefix="coachable-") as private:
+            return ctypes.CDLL(str(_build(compiler, Path(private) / name)))
+    library = folder / name
+    if not library.exists() or not _only_ours(library):
+        with tempfile.TemporaryDirectory(dir=folder) as private:
+            _build(compiler, Path(private) / name).replace(library)  # atomic: several processes may build at once
+    return ctypes.CDLL(str(library))
+
+
+def _build(compiler: str, library: Path) -> Path:
+    command = [compiler, *_FLAGS, "-o", str(library), str(_SOURCE), "-lm"]
+    subprocess.run(command, check=True, capture_output=True, text=True, timeout=120)
+    library.chmod(0o700)
     return library
 
 
-def _cache() -> Path:
-    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    folder = base / "coachable"
+def _cache() -> Path | None:
+    """Folder for libraries, or `None` if it cannot be written to, or could be by others."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if os.access(folder, os.W_OK):
-            return folder
-    except OSError:
-        pass
-    return Path(tempfile.mkdtemp(prefix="coachable-"))
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "coachable"
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not _only_ours(folder):
+            _LOG.warning(
+                "%s belongs to somebody else or others can write to it: the learner's kernels are built afresh in a "
+                "private folder (a second at each start); set XDG_CACHE_HOME to a folder of yours, or chmod go-w it",
+                folder,
+            )
+            return None
+        return folder if os.access(folder, os.W_OK) else None
+    except (OSError, RuntimeError):  # no home
+        return None
+
+
+def _only_ours(path: Path) -> bool:
+    """Whether `path`, which is no link, belongs to this user and nobody else can write to it."""
+    status = path.lstat()
+    return status.st_uid == os.geteuid() and not status.st_mode & 0o022 and not stat.S_ISLNK(status.st_mode)
 
 
 def _products(library: ctypes.CDLL) -> Products | None:

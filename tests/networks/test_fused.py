@@ -39,6 +39,23 @@ def build(kind, members, low=None, trained=True):
     return nets, buffers, make_plan(nets[0], "", triples, members, trained)
 
 
+def plan_of(in_features, width, low, passes_of_torch):
+    """Buffers and plan of an ensemble of two whose parameters all lie off the alignment."""
+    torch.manual_seed(0)
+    network = ResidualMLP(in_features, 3, (width, width, width + 1))
+    tensors = {}
+    for name, parameter in network.named_parameters():
+        memory = torch.empty(2 * parameter.numel() + 1)
+        tensors[name] = memory[1:].view(2, *parameter.shape).normal_(std=0.3)
+    buffers = FlatBuffers(list(tensors.values()), low, True)
+    buffers.refresh()
+    triples = dict(zip(tensors, zip(buffers.tensors, buffers.low, buffers.grads, strict=True), strict=True))
+    plan = make_plan(network, "", triples, 2, True)
+    if passes_of_torch:
+        plan._kernel_threads = 0
+    return buffers, plan
+
+
 def inputs_of(kind, rows=40, **options):
     width = SHAPES[kind][0]
     return [torch.randn(rows, width - 7), torch.randn(rows, 7, **options)]
@@ -101,6 +118,46 @@ def test_products_of_torch_and_of_our_own_agree(kind, monkeypatch):
         results.append([y.grad, *buffers.grads])
     for got, want in zip(*results, strict=True):
         assert torch.cosine_similarity(got.flatten(), want.flatten(), dim=0) > 0.99
+
+
+@pytest.mark.skipif(not KERNELS, reason="no cc")
+@pytest.mark.parametrize("low", [None, torch.bfloat16])
+@pytest.mark.parametrize("rows", [1, 3, 257])
+@pytest.mark.parametrize(("in_features", "width"), [(2, 1), (17, 17), (255, 17), (18, 255)])
+def test_odd_sizes_give_what_torch_gives(in_features, width, rows, low):
+    results = []
+    for passes_of_torch in (True, False):
+        buffers, plan = plan_of(in_features, width, low, passes_of_torch)
+        torch.manual_seed(1)
+        x, y = torch.randn(rows, in_features - 1), torch.randn(rows, 1, requires_grad=True)
+        out = fused.residual_network(plan, [x, y])
+        (out * torch.randn_like(out)).sum().backward()
+        results.append([out, y.grad, *buffers.grads])
+    tolerance = 1e-4 if low is None else 0.2  # masks of rectifiers flip
+    for want, got in zip(*results, strict=True):
+        assert (got - want).norm() <= tolerance * (want.norm() + 1.0)
+
+
+@pytest.mark.parametrize("low", [None, torch.bfloat16])
+def test_parameters_may_move_between_passes(low):
+    """Storage that is shared with other processes goes elsewhere, with everybody who uses it."""
+    results = []
+    for moves in (False, True):
+        _, buffers, plan = build("equal", 2, low)
+        torch.manual_seed(1)
+        x, y = inputs_of("equal", requires_grad=True)
+        for _ in range(2):
+            plan.begin()
+            out = fused.residual_network(plan, [x, y])
+            if moves:
+                addresses = [tensor.data_ptr() for tensor in buffers.tensors]
+                for tensor in (*buffers.tensors, *buffers.low, *buffers.grads):
+                    tensor.share_memory_()
+            out.float().square().sum().backward()
+        results.append([y.grad, buffers.grad, *buffers.grads])
+    assert addresses != [tensor.data_ptr() for tensor in build("equal", 2, low)[1].tensors]
+    for got, want in zip(*results, strict=True):
+        assert torch.equal(got, want)
 
 
 @pytest.mark.parametrize("low", [None, torch.bfloat16])

@@ -1,4 +1,5 @@
 import logging
+import subprocess
 
 import pytest
 import torch
@@ -11,6 +12,24 @@ needs_compiler = pytest.mark.skipif(not kernels, reason="no C compiler")
 DTYPES = {torch.bfloat16: {"rtol": 8e-3, "atol": 1e-3}, torch.float32: {"rtol": 1e-4, "atol": 1e-5}}
 
 
+def slanted(tensor):
+    """The same values one element behind an allocation's beginning, up to its end."""
+    memory = torch.empty(tensor.numel() + 1, dtype=tensor.dtype)
+    return memory[1:].view(tensor.shape).copy_(tensor)
+
+
+def rounded(*shape, dtype=torch.bfloat16):
+    return slanted(torch.randn(shape).to(dtype))
+
+
+def normal(*shape):
+    return rounded(*shape, dtype=torch.float32)
+
+
+def ones(*shape):
+    return slanted(torch.ones(shape))
+
+
 @pytest.fixture
 def fresh():
     native.load_kernels.cache_clear()
@@ -20,13 +39,14 @@ def fresh():
 
 @needs_compiler
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("n", [1, 63, 64, 200, 512])
-def test_layer_forward(n, dtype):
+@pytest.mark.parametrize("rows", [1, 3, 257])
+@pytest.mark.parametrize("n", [1, 17, 63, 64, 200, 255, 512])
+def test_layer_forward(n, rows, dtype):
     torch.manual_seed(0)
-    rows, width, start, to = 5, max(n // 2, 1), 3, n - max(n // 2, 1)
-    z, skip = torch.randn(rows, n).to(dtype), torch.randn(rows, n + 3).to(dtype)
-    bias, gamma, beta = torch.randn(3, n)
-    out, mean, rstd, scratch = torch.empty_like(z), torch.empty(rows), torch.empty(rows), torch.empty(n)
+    width, start, to = max(n // 2, 1), 3, n - max(n // 2, 1)
+    z, skip = rounded(rows, n, dtype=dtype), rounded(rows, n + 3, dtype=dtype)
+    bias, gamma, beta = (normal(n) for _ in range(3))
+    out, mean, rstd, scratch = rounded(rows, n, dtype=dtype), ones(rows), ones(rows), ones(n)
     addresses = [t.data_ptr() for t in (z, bias, gamma, beta, skip)]
     kernels[dtype].layer_forward(
         *addresses, n + 3, start, to, width, 1e-5, rows, n, *[t.data_ptr() for t in (out, mean, rstd, scratch)]
@@ -41,22 +61,25 @@ def test_layer_forward(n, dtype):
 
 @needs_compiler
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("rows", [None, [4, 0, 4, 2]])
-@pytest.mark.parametrize("n", [63, 200, 512])
-def test_layer_backward(n, rows, dtype):
+@pytest.mark.parametrize(
+    ("count", "rows"), [(5, None), (5, [4, 0, 4, 2]), (1, None), (3, [2]), (257, None), (257, [256, 0])]
+)
+@pytest.mark.parametrize("n", [1, 17, 63, 200, 255, 512])
+def test_layer_backward(n, count, rows, dtype):
     torch.manual_seed(0)
-    z = torch.randn(5, n).to(dtype)
-    bias, gamma, beta = torch.randn(3, n)
-    index = None if rows is None else torch.tensor(rows)
+    z = rounded(count, n, dtype=dtype)
+    bias, gamma, beta = (normal(n) for _ in range(3))
+    index = None if rows is None else slanted(torch.tensor(rows))
     chosen = z if index is None else z[index]
-    grad = torch.randn_like(chosen)
+    grad = rounded(*chosen.shape, dtype=dtype)
     u = (chosen.float() + bias).requires_grad_()
     scale, shift = gamma.clone().requires_grad_(), beta.clone().requires_grad_()
     F.relu(F.layer_norm(u, (n,), scale, shift)).backward(grad.float())
 
     every = z.float() + bias
-    mean, rstd = every.mean(-1), (every.var(-1, unbiased=False) + 1e-5).rsqrt()
-    dz, dgamma, dbeta, dbias, scratch = torch.empty_like(chosen), *torch.ones(3, n), torch.empty(2 * n)
+    mean, rstd = slanted(every.mean(-1)), slanted((every.var(-1, unbiased=False) + 1e-5).rsqrt())
+    dz, scratch = rounded(*chosen.shape, dtype=dtype), ones(2 * n)
+    dgamma, dbeta, dbias = (ones(n) for _ in range(3))
     first = [t.data_ptr() for t in (grad, z, bias, gamma, beta, mean, rstd)]
     last = [t.data_ptr() for t in (dz, dgamma, dbeta, dbias, scratch)]
     for trained, add in ((0, 0), (1, 1), (1, 0)):
@@ -70,17 +93,18 @@ def test_layer_backward(n, rows, dtype):
 
 @needs_compiler
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("n", [63, 512])
-def test_small_head(n, dtype):
+@pytest.mark.parametrize("rows", [1, 3, 257])
+@pytest.mark.parametrize("n", [1, 17, 63, 255, 512])
+def test_small_head(n, rows, dtype):
     torch.manual_seed(0)
-    x, weight, bias, grad = torch.randn(5, n).to(dtype), torch.randn(3, n), torch.randn(3), torch.randn(5, 3)
-    y, dx, dweight, dbias, scratch = torch.empty(5, 3), torch.empty_like(x), *map(torch.ones, ((3, n), 3, n))
+    x, weight, bias, grad = rounded(rows, n, dtype=dtype), normal(3, n), normal(3), normal(rows, 3)
+    y, dx, dweight, dbias, scratch = ones(rows, 3), rounded(rows, n, dtype=dtype), ones(3, n), ones(3), ones(n)
     address, functions = [t.data_ptr() for t in (x, weight, bias)], kernels[dtype]
-    functions.head_forward(*address, 5, n, 3, y.data_ptr())
+    functions.head_forward(*address, rows, n, 3, y.data_ptr())
     torch.testing.assert_close(y, F.linear(x.float(), weight, bias), rtol=1e-4, atol=1e-4)
     last = [t.data_ptr() for t in (dx, dweight, dbias, scratch)]
     for add in (1, 0):
-        functions.head_backward(grad.data_ptr(), *address[:2], 5, n, 3, 1, add, *last)
+        functions.head_backward(grad.data_ptr(), *address[:2], rows, n, 3, 1, add, *last)
         torch.testing.assert_close(dx.float(), grad @ weight, **DTYPES[dtype])
         torch.testing.assert_close(dweight, add + grad.t() @ x.float(), rtol=1e-4, atol=1e-4)
         torch.testing.assert_close(dbias, add + grad.sum(0), rtol=1e-4, atol=1e-4)
@@ -90,24 +114,18 @@ products = kernels[torch.bfloat16].products if kernels else None
 needs_products = pytest.mark.skipif(products is None, reason="no bfloat16 products in vector registers")
 
 
-def rounded(*shape):
-    return torch.randn(shape).to(torch.bfloat16)
-
-
 @needs_products
-@pytest.mark.parametrize(("rows", "inner", "n"), [(1, 2, 1), (7, 33, 70), (13, 109, 128), (64, 128, 200)])
+@pytest.mark.parametrize(
+    ("rows", "inner", "n"),
+    [(1, 2, 1), (7, 33, 70), (13, 109, 128), (64, 128, 200), (1, 1, 17), (3, 17, 255), (257, 255, 1)],
+)
 def test_product_of_the_forward_pass(rows, inner, n):
     torch.manual_seed(0)
     stride = inner + inner % 2
-    x, weight, z, out = (
-        torch.zeros(rows, stride).to(torch.bfloat16),
-        rounded(n, inner),
-        rounded(rows, n),
-        rounded(rows, n),
-    )
-    x[:, :inner] = rounded(rows, inner)
-    (bias, gamma, beta), (mean, rstd) = torch.randn(3, n), torch.empty(2, rows)
-    width, scratch = min(inner, n), torch.empty(n)
+    x, weight, z, out = (rounded(*shape) for shape in ((rows, stride), (n, inner), (rows, n), (rows, n)))
+    x[:, inner:] = 0
+    (bias, gamma, beta), (mean, rstd) = (normal(n) for _ in range(3)), (ones(rows) for _ in range(2))
+    width, scratch = min(inner, n), ones(n)
     first = [t.data_ptr() for t in (weight, z, bias, gamma, beta, x)]
     last = [t.data_ptr() for t in (out, mean, rstd, scratch)]
     products.dense_forward(inner, *first, stride, 0, 0, width, 1e-5, rows, n, *last)
@@ -119,7 +137,8 @@ def test_product_of_the_forward_pass(rows, inner, n):
 
 @needs_products
 @pytest.mark.parametrize(
-    ("rows", "inner", "n", "to"), [(1, 2, 1, 0), (7, 64, 71, 0), (13, 128, 109, 19), (64, 200, 128, 72)]
+    ("rows", "inner", "n", "to"),
+    [(1, 2, 1, 0), (7, 64, 71, 0), (13, 128, 109, 19), (64, 200, 128, 72), (3, 18, 17, 1), (257, 2, 255, 0)],
 )
 def test_products_of_the_backward_pass(rows, inner, n, to):
     """Gradient of some columns of the input, and of the weight."""
@@ -133,23 +152,21 @@ def test_products_of_the_backward_pass(rows, inner, n, to):
         place = weight[:, start:].data_ptr(), n, n - start, grad.data_ptr(), -start, to, width, below.data_ptr()
         products.dense_backward(dz.data_ptr(), rows, inner, *place)
         torch.testing.assert_close(below.float(), expected[:, start:], rtol=1e-2, atol=1e-2)
-    into = torch.ones(inner, n)
+    into = ones(inner, n)
     for add in (1, 0):
         products.weight_gradient(dz.data_ptr(), inner, x.data_ptr(), n, n, rows, add, into.data_ptr())
         torch.testing.assert_close(into, add + dz.float().t() @ x.float(), rtol=1e-3, atol=1e-3)
 
 
 @needs_products
-@pytest.mark.parametrize(("rows", "n", "outputs"), [(1, 1, 5), (7, 70, 13), (33, 512, 42), (13, 128, 255)])
+@pytest.mark.parametrize(
+    ("rows", "n", "outputs"),
+    [(1, 1, 5), (7, 70, 13), (33, 512, 42), (13, 128, 255), (3, 17, 17), (257, 255, 5), (257, 1, 255)],
+)
 def test_head_of_many_outputs(rows, n, outputs):
     torch.manual_seed(0)
-    x, weight, bias, grad = (
-        rounded(rows, n),
-        torch.randn(outputs, n),
-        torch.randn(outputs),
-        torch.randn(rows, outputs),
-    )
-    y, dx, dweight, dbias = torch.empty(rows, outputs), torch.empty_like(x), torch.ones(outputs, n), torch.ones(outputs)
+    x, weight, bias, grad = rounded(rows, n), normal(outputs, n), normal(outputs), normal(rows, outputs)
+    y, dx, dweight, dbias = ones(rows, outputs), rounded(rows, n), ones(outputs, n), ones(outputs)
     address, last = [t.data_ptr() for t in (x, weight, bias)], [t.data_ptr() for t in (dx, dweight, dbias)]
     products.wide_head_forward(*address, rows, n, outputs, y.data_ptr())
     torch.testing.assert_close(y, F.linear(x.float(), weight, bias), rtol=1e-4, atol=1e-4)
@@ -179,6 +196,104 @@ def test_a_failing_build_is_reported_and_survived(fresh, monkeypatch, tmp_path, 
     with caplog.at_level(logging.WARNING):
         assert native.load_kernels() == {}
     assert "building broken.c" in caplog.text
+
+
+def cached(folder):
+    return sorted(folder.glob("coachable/kernels-*.so"))
+
+
+@pytest.fixture
+def builds(fresh, monkeypatch, tmp_path):
+    """A small library in place of the kernels, a cache in `tmp_path`, and a list of what was built and loaded."""
+    small = tmp_path / "small.c"
+    small.write_text("int answer(void) { return 42; }")
+    built = []
+    build = native._build
+
+    def record(compiler, library):
+        built.append(library)
+        return build(compiler, library)
+
+    monkeypatch.setattr(native, "_SOURCE", small)
+    monkeypatch.setattr(native, "_FLAGS", ("-shared", "-fPIC"))
+    monkeypatch.setattr(native, "_build", record)
+    monkeypatch.setattr(native, "_bind", lambda library: {torch.float32: library.answer()})
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv("COACHABLE_NATIVE", raising=False)
+
+    def load():
+        native.load_kernels.cache_clear()
+        return native.load_kernels()[torch.float32]
+
+    return built, load
+
+
+PLANTED = "int answer(void) { return 666; }"
+
+
+def plant(library):
+    """Another library under the name of ours."""
+    source = library.with_suffix(".c")
+    source.write_text(PLANTED)
+    library.unlink(missing_ok=True)
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", str(library), str(source)], check=True)
+
+
+@needs_compiler
+def test_libraries_are_kept_where_only_the_user_can_write(builds, tmp_path):
+    built, load = builds
+    assert load() == 42 and load() == 42
+    assert len(built) == 1
+    (library,) = cached(tmp_path)
+    assert library.parent.stat().st_mode & 0o777 == 0o700
+    assert library.stat().st_mode & 0o077 == 0
+
+
+@needs_compiler
+@pytest.mark.parametrize("weakness", ["folder for all", "folder for the group", "folder of another", "link"])
+def test_a_cache_that_others_can_write_to_is_left_alone(weakness, builds, tmp_path, monkeypatch, caplog):
+    built, load = builds
+    assert load() == 42
+    (library,) = cached(tmp_path)
+    plant(library)
+    folder = library.parent
+    if weakness == "link":
+        folder.rename(tmp_path / "theirs")
+        folder.symlink_to(tmp_path / "theirs")
+    elif weakness == "folder of another":
+        monkeypatch.setattr(native.os, "geteuid", lambda: folder.stat().st_uid + 1)
+    else:
+        folder.chmod(0o777 if weakness == "folder for all" else 0o770)
+    assert load() == 42
+    assert len(built) == 2
+    assert built[1].parent.parent != folder and not built[1].exists()
+    assert f"{folder} belongs to somebody else or others can write to it" in caplog.text
+
+
+@needs_compiler
+@pytest.mark.parametrize("weakness", ["writable", "link"])
+def test_a_library_that_others_can_write_to_is_built_again(weakness, builds, tmp_path):
+    built, load = builds
+    assert load() == 42
+    (library,) = cached(tmp_path)
+    plant(library)
+    if weakness == "link":
+        library.rename(tmp_path / "planted.so")
+        library.symlink_to(tmp_path / "planted.so")
+    else:
+        library.chmod(0o777)
+    assert load() == 42
+    assert len(built) == 2
+    assert library.stat().st_mode & 0o077 == 0 and not library.is_symlink()
+
+
+@needs_compiler
+def test_without_a_cache_the_kernels_are_built_elsewhere(builds, tmp_path, monkeypatch):
+    built, load = builds
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    assert load() == 42
+    assert not built[0].parent.exists()
 
 
 def test_kernels_can_be_switched_off(fresh, monkeypatch):

@@ -8,7 +8,9 @@ from importlib import import_module
 import pytest
 import torch
 from recipe_config import compose_config
+from tensordict import TensorDict
 
+from coachable.training.collection import _ray_options, make_collector
 from tests.recipes.test_every_combination import RECIPES, TINY
 
 
@@ -93,6 +95,24 @@ def test_workers_start_as_by_default(sync, tmp_path):
     if sync:
         require_trained(train, distances)
     assert not multiprocessing.active_children()
+
+
+def test_without_ray_the_error_names_the_extra(monkeypatch):
+    monkeypatch.setattr("coachable.training.collection.find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r"collector=ray needs Ray: pip install 'coachable\[cluster\]'"):
+        make_collector(lambda seed: None, None, frames_per_batch=4, backend="ray")
+
+
+def test_ray_workers_number_their_trajectories_apart():
+    """And `RayCollector`, which stops at a number of frames, is given one that nobody reaches."""
+    options = _ray_options(3, {"auto_register_policy_transforms": False})
+    assert options["total_frames"] > 10**15
+    numbers = []
+    for worker in options["collector_kwargs"]:
+        assert worker["auto_register_policy_transforms"] is False
+        data = TensorDict({"collector": {"traj_ids": torch.tensor([0, 1, 5])}}, [3])
+        numbers += worker["postproc"](data)["collector", "traj_ids"].tolist()
+    assert len(set(numbers)) == 9
 
 
 @pytest.mark.ray

@@ -8,13 +8,16 @@ from coachable.networks.native import load_kernels
 from coachable.training import adam
 from coachable.training.adam import FlatAdam
 
-SHAPES = [(2, 70, 33), (1,), (5,), (90, 100)]
+SHAPES = [(2, 70, 33), (1,), (5,), (90, 100), (17, 255)]
 needs_compiler = pytest.mark.skipif(not load_kernels(), reason="no C compiler")
 
 
 def parameters(seed):
+    """Every other one lies off the alignment."""
     torch.manual_seed(seed)
-    return [torch.nn.Parameter(torch.randn(shape)) for shape in SHAPES]
+    values = [torch.randn(shape) for shape in SHAPES]
+    memory = [torch.empty(value.numel() + i % 2)[i % 2 :].view(value.shape) for i, value in enumerate(values)]
+    return [torch.nn.Parameter(place.copy_(value)) for place, value in zip(memory, values, strict=True)]
 
 
 def flat_adam(params, low=None, target=None, tau=0.1):
@@ -57,6 +60,27 @@ def test_steps_are_those_of_adam(low, compiled, monkeypatch):
         torch.testing.assert_close(buffers.low, rounded, rtol=0, atol=0)
     for ours, other in zip(params, reference, strict=True):
         torch.testing.assert_close(optimizer.state[ours], theirs.state[other])
+
+
+@needs_compiler
+def test_everything_may_move_between_steps():
+    """Parameters and moments that are shared with other processes go elsewhere, with everybody who uses them."""
+    params, still = parameters(0), parameters(0)
+    optimizer, _ = flat_adam(params, torch.bfloat16)
+    reference, _ = flat_adam(still, torch.bfloat16)
+    for step in range(3):
+        for which in (params, still):
+            fill(which, step)
+        optimizer.step()
+        reference.step()
+        for parameter in params:
+            state = optimizer.state[parameter]
+            for tensor in (parameter.data, parameter.grad, *state.values()):
+                tensor.share_memory_()
+            state["exp_avg"] = state["exp_avg"].clone()
+    for moved, expected in zip(params, still, strict=True):
+        assert torch.equal(moved, expected)
+        torch.testing.assert_close(optimizer.state[moved], reference.state[expected], rtol=0, atol=0)
 
 
 def test_state_is_that_of_adam():
