@@ -88,6 +88,16 @@ class RareTargets(EnvBase):
             batch_size=self.batch_size,
         )
 
+    def simulator_state(self) -> dict[str, Any]:
+        """Everything that the next step depends on, so that a resumed training goes on exactly."""
+        tensors = {"position": self.position.clone(), "age": self.age.clone()}
+        return {**tensors, "generator": self.generator.get_state()}
+
+    def load_simulator_state(self, state: dict[str, Any]) -> None:
+        """Restores what `simulator_state` returned."""
+        self.position, self.age = state["position"].clone(), state["age"].clone()
+        self.generator.set_state(state["generator"])
+
 
 def target_space() -> StyleSpace:
     """What each target is worth; mostly one at a time."""

@@ -54,6 +54,8 @@ def build_training(
 
     # Environment
     threads = share_threads(**config["threads"])
+    # The learner's sums are rounded as their number of threads says: a resumed training takes as many.
+    config = {**config, "threads": {**config["threads"], "learner": threads.learner}}
     torch.set_num_threads(threads.learner)
     seed_everything(config["seed"])
     device = pick_device(config["device"])

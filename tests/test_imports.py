@@ -1,6 +1,7 @@
 """Imports point one way, domains do not know each other, and the core stays light (architecture, section 4)."""
 
 import ast
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -21,6 +22,7 @@ LAYERS = {
     "gl": 0,
     "keys": 0,
     "ranges": 0,
+    "third_party": 0,
     "styles": 0,
     "losses": 1,
     "networks": 1,
@@ -42,6 +44,7 @@ TORCH_ONLY = ["coachable.styles", "coachable.losses.functional"]
 HEAVY = ["torch", "tensordict", "torchrl", "mujoco", "dm_control", "hydra", "omegaconf", "wandb", "matplotlib", "viser"]
 
 
+@functools.cache
 def imported(path: Path, type_checking: bool = False) -> set[str]:
     """Absolute names of all imports of a file, those inside functions included, `TYPE_CHECKING` blocks excluded."""
     found: set[str] = set()
@@ -132,29 +135,32 @@ def test_numerics_need_torch_only(prefix):
     assert checked
 
 
-def loaded_by(statement: str) -> set[str]:
-    """Which heavy packages a fresh interpreter has loaded after a statement."""
-    report = f"{statement}\nimport sys\nprint(*[m for m in {HEAVY} if m in sys.modules])"
+def loaded_by(*statements: str) -> list[set[str]]:
+    """Which heavy packages a fresh interpreter has loaded after each of some statements, one after the other."""
+    report = "import sys\n"
+    report += "".join(f"{one}\nprint(*[m for m in {HEAVY} if m in sys.modules])\n" for one in statements)
     done = subprocess.run(
         [sys.executable, "-c", report], cwd=PACKAGE.parent, capture_output=True, text=True, timeout=120
     )
     assert done.returncode == 0, done.stderr
-    return set(done.stdout.split())
+    return [set(line.split()) for line in done.stdout.splitlines()]
 
 
 def test_importing_the_package_loads_nothing_heavy():
-    assert loaded_by("import coachable") == set()
-    assert loaded_by("import coachable.keys; coachable.__version__; dir(coachable)") == set()
+    assert loaded_by("import coachable", "import coachable.keys; coachable.__version__; dir(coachable)") == [
+        set(),
+        set(),
+    ]
 
 
 def test_styles_load_torch_alone():
-    assert loaded_by("import coachable.styles; from coachable import StyleSpace") == {"torch"}
-
-
-def test_core_modules_load_no_simulator_logger_or_page():
-    """TorchRL itself imports mujoco where it is installed, so mujoco cannot be on this list."""
-    statement = "import coachable.transforms.style_sampler, coachable.transforms.style_reward"
-    assert not loaded_by(statement) & {"dm_control", "hydra", "omegaconf", "wandb", "matplotlib", "viser"}
+    """And the core modules load no simulator, logger or page. TorchRL itself imports mujoco where it is installed."""
+    styles, core = loaded_by(
+        "import coachable.styles; from coachable import StyleSpace",
+        "import coachable.transforms.style_sampler, coachable.transforms.style_reward",
+    )
+    assert styles == {"torch"}
+    assert not core & {"dm_control", "hydra", "omegaconf", "wandb", "matplotlib", "viser"}
 
 
 def test_public_names_resolve():

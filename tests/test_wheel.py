@@ -94,15 +94,15 @@ def test_commands_work_outside_of_the_repository(installed, command, expected):
 @pytest.mark.slow
 def test_the_page_is_served_outside_of_the_repository(installed):
     pytest.importorskip("viser")
-    process = _outside(installed, "coachable", "coach", "humanoid", "--port=18080")
-    assert process.stdout is not None
-    try:
-        address = re.search(r"http://[\w.:]+", process.stdout.readline())
-        assert address, process.stdout.read()
-        with urllib.request.urlopen(address[0], timeout=60) as answer:
-            assert answer.status == 200
-        time.sleep(20.0)  # the agent is loaded meanwhile
-        assert process.poll() is None, process.stdout.read()
-    finally:
-        process.send_signal(signal.SIGINT)
-        process.wait(60)
+    with _outside(installed, "coachable", "coach", "humanoid", "--port=18080") as process:
+        assert process.stdout is not None
+        try:
+            address = re.search(r"http://[\w.:]+", process.stdout.readline())
+            assert address
+            with urllib.request.urlopen(address[0], timeout=60) as answer:
+                assert answer.status == 200
+            time.sleep(20.0)  # the agent is loaded meanwhile
+            assert process.poll() is None
+        finally:
+            process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 0, process.stdout.read()

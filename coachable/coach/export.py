@@ -56,8 +56,9 @@ def export(source: str | Path, out: Path) -> float:
     onnx = _import_onnx()
     agent = load_policy(source)
     plain = DeterministicAction(agent.actor).eval()
+    metadata = metadata_of(agent, plain)
     model = _trace(plain).model_proto
-    onnx.helper.set_model_props(model, metadata_of(agent, plain))
+    onnx.helper.set_model_props(model, metadata)
     onnx.checker.check_model(model)
     out.parent.mkdir(parents=True, exist_ok=True)
     partial = out.with_name(out.name + ".partial")

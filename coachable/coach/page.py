@@ -29,6 +29,8 @@ _FILM_SECONDS = 10.0
 _SPEEDS = (0.1, 4.0)
 _LONGEST_PHRASE, _LONGEST_PLAN, _LONGEST_NAME = 200, 2000, 40  # characters
 _PRESETS = 50
+_LARGEST_FILE = 8 << 20  # [byte]
+_S = TypeVar("_S", str, bytes)
 _T = TypeVar("_T")
 _PAUSE, _RESUME, _STEP, _RESET = "Pause", "Resume", "Step", "Reset"
 
@@ -129,16 +131,17 @@ class CoachPage:
             self.chart.follow(asked)
 
     def _aside(
-        self, what: str, text: str, longest: int, read: Callable[[str], _T], then: Callable[[CoachSession, _T], None]
+        self, what: str, given: _S, longest: int, read: Callable[[_S], _T], then: Callable[[CoachSession, _T], None]
     ) -> None:
-        """Reads what was typed in viser's thread, so that the agent does not wait; the loop gets what it means."""
-        if len(text) > longest:
-            self.loop.refuse(f"the {what} has {len(text):,} characters: at most {longest:,} are read")
+        """Reads what somebody gave in viser's thread, so that the agent does not wait; the loop gets what it means."""
+        if len(given) > longest:
+            unit = "characters" if isinstance(given, str) else "bytes"
+            self.loop.refuse(f"the {what} has {len(given):,} {unit}: at most {longest:,} are read")
         elif not self._reading.acquire(blocking=False):
-            self.loop.refuse("what was typed before is still being read")
+            self.loop.refuse("what was given before is still being read")
         else:
             try:
-                meant = read(text)
+                meant = read(given)
                 self.loop.submit(lambda session: then(session, meant))
             except Exception as error:  # this thread has nobody else to tell
                 self.loop.refuse(str(error))
@@ -216,7 +219,7 @@ class CoachPage:
         with gui.add_folder("Recording"):
             save = gui.add_button("Download JSON", hint="everything since the last seed; replays exactly")
             again = gui.add_button("Replay from the start")
-            load = gui.add_upload_button("Replay a JSON file", mime_type="application/json")
+            self.upload = gui.add_upload_button("Replay a JSON file", mime_type="application/json")
             stop = gui.add_button("Stop replay")
             shoot = gui.add_button(f"Film the last {_FILM_SECONDS:g} s (mp4)")
             self.film_note = gui.add_markdown("")
@@ -225,7 +228,11 @@ class CoachPage:
         reseed.on_click(lambda _: self.loop.submit(lambda session: session.reset(int(self.seed.value))))
         save.on_click(lambda event: self.loop.submit(lambda session: self._send_recording(session, event.client)))
         again.on_click(lambda _: self.loop.submit(lambda session: session.replay(session.recording())))
-        load.on_upload(lambda _: self.loop.submit(lambda session: session.replay(_read(load.value.content))))
+        self.upload.on_upload(
+            lambda _: self._aside(
+                "file", self.upload.value.content, _LARGEST_FILE, _read_recording, CoachSession.replay
+            )
+        )
         stop.on_click(lambda _: self.loop.submit(lambda session: session.cancel()))
         shoot.on_click(lambda event: self.loop.submit(lambda session: self._shoot(session, event.client)))
 
@@ -290,7 +297,7 @@ class CoachPage:
         return f"{first}\n\n{state} · episode {report.episode}, {report.episode_time:.1f} s{endings}"
 
 
-def _read(content: bytes) -> Recording:
+def _read_recording(content: bytes) -> Recording:
     try:
         return Recording.from_json(content.decode())
     except UnicodeDecodeError:

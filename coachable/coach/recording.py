@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 import math
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from torch import Tensor
+
+from coachable.coach.coaching import Control
+from coachable.styles import Choice, Parameter, StyleSpace
 
 SCHEMA_VERSION = 1
 
@@ -74,6 +78,35 @@ class Recording:
         recording.checks = [(step, checksum) for step, checksum in recording.checks]
         return recording
 
+    def check(self, domain: str, space: StyleSpace, controls: Mapping[str, Control]) -> None:
+        """Sees whether a session can replay this.
+
+        Args:
+            domain: of the session.
+            space: its styles.
+            controls: its live controls, by name.
+
+        Raises:
+            ValueError: naming what the session lacks.
+        """
+        if self.domain != domain:
+            raise ValueError(f"the recording belongs to {self.domain!r}, this session to {domain!r}")
+        check_seed(self.seed)
+        for style in (self.style, *(event.get("style", {}) for event in self.events)):
+            for name, value in style.items():
+                if name not in space:
+                    raise ValueError(
+                        f"the recording has the unknown style parameter {name!r}: {domain} has {space.names}"
+                    )
+                if not _is_trained(space[name], value):
+                    raise ValueError(f"the recording asks for {name} = {value!r}, which lies outside the trained range")
+        for steering in (self.controls, *(event.get("controls", {}) for event in self.events)):
+            for name, value in steering.items():
+                if name not in controls:
+                    raise ValueError(f"no live control named {name!r}: {domain} has {list(controls)}")
+                if controls[name].fit(value) != value:
+                    raise ValueError(f"the recording steers {name} = {value}, which lies outside its range")
+
     def save(self, file: Path | str) -> Path:
         """Writes the JSON file."""
         file = Path(file)
@@ -85,6 +118,24 @@ class Recording:
     def load(cls, file: Path | str) -> Recording:
         """Reads a JSON file; see `from_json`."""
         return cls.from_json(Path(file).read_text(encoding="utf-8"))
+
+
+def check_seed(seed: int) -> None:
+    """Sees whether every random generator takes a seed.
+
+    Raises:
+        ValueError: if not.
+    """
+    if not 0 <= seed < 2**63:
+        raise ValueError(f"seed = {seed}: expected a whole number from 0 to 2**63 - 1")
+
+
+def _is_trained(parameter: Parameter, value: float | str) -> bool:
+    if isinstance(parameter, Choice):
+        return value in parameter.options
+    return not isinstance(value, str) and bool(
+        np.float32(parameter.low) <= np.float32(value) <= np.float32(parameter.high)
+    )
 
 
 def _is_count(value: Any) -> bool:

@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 from coachable.coach.coaching import Coaching, coaching_of
 from coachable.coach.episodes import LiveEpisodes
 from coachable.coach.grammar import StyleGrammar, Understanding
-from coachable.coach.recording import Recording
+from coachable.coach.recording import Recording, check_seed
 from coachable.coach.report import MeasuredWindow, StyleReport
 from coachable.coach.timeline import Timeline
 from coachable.domain import Domain
@@ -149,7 +149,9 @@ class CoachSession:
         Raises:
             ValueError: for an unknown control or NaN.
         """
-        self._check_controls(values)
+        for name in values:
+            if name not in self._controls:
+                raise ValueError(f"no live control named {name!r}: {self.domain.name} has {list(self._controls)}")
         fitted = {name: self._controls[name].fit(float(value)) for name, value in values.items()}
         self._timeline.take_over()
         self._apply({"controls": fitted})
@@ -229,8 +231,7 @@ class CoachSession:
             self.cancel()
             self._apply({"reset": True})
             return
-        if not 0 <= seed < 2**63:
-            raise ValueError(f"seed = {seed}: expected a whole number from 0 to 2**63 - 1")
+        check_seed(seed)
         self._timeline = Timeline(
             Recording(self.domain.name, self.source, seed, self.style, self.controls, self._episodes.endless)
         )
@@ -333,17 +334,11 @@ class CoachSession:
         Any request, steering or reset in between takes over from the replay.
 
         Raises:
-            ValueError: if the recording belongs to another domain or style space, or has a control that this one lacks;
-                the session then goes on as it was.
+            ValueError: if the recording belongs to another domain, style space or set of controls; the session then
+                goes on as it was.
         """
-        if recording.domain != self.domain.name:
-            raise ValueError(f"the recording belongs to {recording.domain!r}, this session to {self.domain.name!r}")
-        theta = self.space.make(strict=True, **recording.style)
-        self._check_controls(recording.controls)
-        for event in recording.events:
-            self.space.make(strict=True, **(recording.style | event.get("style", {})))
-            self._check_controls(event.get("controls", {}))
-        self._theta, self._outside = theta, {}
+        recording.check(self.domain.name, self.space, self._controls)
+        self._theta, self._outside = self.space.make(strict=True, **recording.style), {}
         self._control_values |= recording.controls
         self._episodes.endless = recording.endless
         self.reset(recording.seed)
@@ -355,12 +350,6 @@ class CoachSession:
         return self._timeline.replayed is not None
 
     # -- inside ----------------------------------------------------------------------------------------------------
-
-    def _check_controls(self, values: Mapping[str, float]) -> None:
-        for name, value in values.items():
-            if name not in self._controls:
-                raise ValueError(f"no live control named {name!r}: {self.domain.name} has {list(self._controls)}")
-            self._controls[name].fit(float(value))
 
     def _apply(self, event: Mapping[str, Any]) -> None:
         """Carries out an event now, and records it."""

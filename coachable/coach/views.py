@@ -20,6 +20,8 @@ _DRAWING_SHARE = 0.3  # of the loop's time, at most: the agent acts in the rest
 _PICTURE_SIZE = (800, 600)  # [px]
 _BORDER = 235  # grey
 _ASPECTS = (0.25, 4.0)  # of windows that pictures are fitted to
+_START = (2.0, -2.0, 1.3)  # [m], of the camera
+_VISERS_START = (3.0, 3.0, 3.0)  # before a browser has heard of it
 _PHONE = 576  # [px]; in narrower windows viser's panel covers the lower right
 
 
@@ -55,9 +57,9 @@ class HumanoidView:
         self._scene.camera_tracking_enabled = False  # it would also follow the bobbing of the torso
         self._torso = self._model.body("torso").id
         server.scene.set_up_direction("+z")
-        server.initial_camera.position = (2.0, -2.0, 1.3)
+        server.initial_camera.position = _START
         server.initial_camera.look_at = (0.0, 0.0, 0.85)
-        server.on_client_connect(_above_the_panel)
+        server.on_client_connect(_watch_from_above_the_panel)
         self._arrow: Any = None
         self._course: float | None = None
 
@@ -85,10 +87,16 @@ class HumanoidView:
         """See `View.close`."""
 
 
-def _above_the_panel(client: viser.ClientHandle) -> None:
-    """Shows the agent in the upper part of a narrow window, by a camera that is further away and points lower."""
-    camera = client.camera
-    if camera.image_width <= _PHONE:
+def _watch_from_above_the_panel(client: viser.ClientHandle) -> None:
+    """Shows the agent in the upper part of a narrow window, also after the browser has put its camera at the start."""
+    _raise_agent(client.camera)
+    client.camera.on_update(_raise_agent)
+
+
+def _raise_agent(camera: viser.CameraHandle) -> None:
+    """Takes a narrow window's camera back and points it lower, unless the user has moved it."""
+    untouched = any(np.allclose(camera.position, start, atol=1e-3) for start in (_START, _VISERS_START))
+    if camera.image_width <= _PHONE and untouched:
         with contextlib.suppress(ValueError):  # the browser told of a camera that cannot be
             camera.up_direction = (0.0, 0.0, 1.0)
             camera.position = (3.0, -3.0, 1.3)

@@ -141,7 +141,7 @@ class Chart:
         self.shown = [*numeric, *space.names][0]
         with folder:
             self.choice = server.gui.add_dropdown("show", list(self._names), initial_value=_words(self.shown))
-            self.note = server.gui.add_markdown("")
+            self.note = server.gui.add_markdown("", visible=False)
         self.choice.on_update(lambda _: redraw())
         self.plot: Any = None
         self._drawn: tuple[str, bool] | None = None  # parameter of the plot, and whether it has anything measured
@@ -172,7 +172,9 @@ class Chart:
         measured = [row for row in rows if math.isfinite(row[2])]  # uPlot draws nothing at all if there are NaN
         columns = np.array(measured or rows, dtype=float).T
         self._plot((self.shown, bool(measured)), tuple(columns if measured else columns[:2]))
-        write(self.note, "" if measured else f"{_words(self.shown)}: nothing was measured in the last {_SPAN:g} s")
+        write(self.note, f"{_words(self.shown)}: nothing was measured in the last {_SPAN:g} s")
+        if self.note.visible == bool(measured):
+            self.note.visible = not measured
 
     def _plot(self, kind: tuple[str, bool], data: tuple[np.ndarray, ...]) -> None:
         """Draws data in a plot of their kind: for another kind a new plot, so that its settings change together."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -17,6 +18,7 @@ from coachable.gym.actions import action_components, native_action
 from coachable.gym.features import Features, checked_features, flat_observation
 from coachable.keys import STYLE_FEATURES, TASK_REWARD
 from coachable.networks.action_heads import ActionHeads
+from coachable.third_party import load_object, save_object
 
 __all__ = ["GymnasiumEnv"]
 
@@ -147,6 +149,31 @@ class GymnasiumEnv(EnvBase):
             },
             batch_size=self.batch_size,
         )
+
+    def simulator_state(self) -> dict[str, Any]:
+        """Attributes of all environments and their wrappers, for exact resumption.
+
+        Raises:
+            UnsavableError: If one of them is neither plain nor of MuJoCo; names it.
+        """
+        return {
+            "environments": [save_object(env) for env in self.envs],
+            "observation": torch.from_numpy(self._observation.copy()),
+            "finished": torch.from_numpy(self._finished.copy()),
+            "seeds": list(self._seeds),
+        }
+
+    def load_simulator_state(self, state: dict[str, Any]) -> None:
+        """Restores what `simulator_state` returned.
+
+        Raises:
+            UnsavableError: If it does not fit.
+        """
+        for env, saved in zip(self.envs, state["environments"], strict=True):
+            load_object(env, saved)
+        self._observation = state["observation"].numpy().copy()
+        self._finished = state["finished"].numpy().copy()
+        self._seeds = list(state["seeds"])
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close the environments."""

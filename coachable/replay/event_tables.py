@@ -296,7 +296,7 @@ class EventTableBuffer(TensorDictReplayBuffer):
         path = Path(path).absolute()
         path.mkdir(parents=True, exist_ok=True)
         with self._replay_lock:
-            write_records(self._storage, path)
+            write_records(self._storage, path, self.regions.unused())
             save_state({"_batch_size": self._batch_size, **self._light_state()}, path / "state.pt")
 
     def loads(self, path: Path | str) -> None:

@@ -19,17 +19,20 @@ _INDEX = "index.json"
 _CHUNK = 65_536  # records per copy: bounds the extra memory
 
 
-def write_records(storage: Any, folder: Path) -> None:
+def write_records(storage: Any, folder: Path, unused: np.ndarray | None = None) -> None:
     """Write the filled part of a `TensorStorage`.
 
     Args:
         storage: Of a replay buffer.
         folder: Exists.
+        unused: `(len(storage),)` bool, slots that were never written. They hold whatever was in memory before; zeros
+            take its place in the files, so that equal buffers have equal files.
 
     Raises:
         OSError: If writing fails.
     """
     filled = len(storage)
+    unused = np.zeros(filled, dtype=bool) if unused is None else unused
     index: dict[str, Any] = {"version": _VERSION, "filled": filled, "capacity": storage.max_size, "entries": []}
     data = storage.get(slice(0, filled)).items(include_nested=True, leaves_only=True) if filled else ()
     for key, value in data:
@@ -40,7 +43,10 @@ def write_records(storage: Any, folder: Path) -> None:
             header = {"descr": dtype, "fortran_order": False, "shape": tuple(value.shape)}
             np.lib.format.write_array_header_1_0(stream, header)
             for start in range(0, filled, _CHUNK):
-                chunk = _numpy(value[start : start + _CHUNK])
+                chunk, stray = _numpy(value[start : start + _CHUNK]), unused[start : start + _CHUNK]
+                if stray.any():
+                    chunk = chunk.copy()  # it may share the storage's memory
+                    chunk[stray] = 0
                 crc = zlib.crc32(chunk.data, crc)
                 chunk.tofile(stream)
             stream.flush()

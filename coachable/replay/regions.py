@@ -88,6 +88,13 @@ class Regions:
         size, written = int(self.sizes[table]), int(self.written[table])
         return self.offsets[table] + np.arange(written - size, written) % self.capacities[table]
 
+    def unused(self) -> np.ndarray:
+        """Slots of the used prefix that were never written, `(used_prefix,)` bool."""
+        unused = np.ones(self.used_prefix, dtype=bool)
+        for table in range(len(self)):
+            unused[self.slots(table)] = False
+        return unused
+
     def clear(self) -> None:
         """Forgets every record."""
         self.written[:] = 0

@@ -81,9 +81,9 @@ class CheckpointStore:
         self.directory.mkdir(parents=True, exist_ok=True)
         replay = replay if self.replay else None
         required_bytes = tensor_bytes(state) + (0 if replay is None else record_bytes(replay.storage))
+        self._remove_partials()  # of a process that was killed: there may be no room for another one beside them
         name = self._free_name(int(metadata["frames"]))
         partial = self.directory / f".{name}.partial"
-        shutil.rmtree(partial, ignore_errors=True)
         try:
             with space_named(self.directory / name, required_bytes):
                 partial.mkdir()
@@ -139,14 +139,23 @@ class CheckpointStore:
         return name
 
     def _prune(self, newest: str) -> None:
-        for stale in self.directory.glob(".*.partial"):
-            shutil.rmtree(stale, ignore_errors=True)
         others = [folder for folder in _complete(self.directory) if folder.name != newest]
         for folder in others[: max(0, len(others) - (self.keep - 1))]:
-            shutil.rmtree(folder, ignore_errors=True)
+            self._remove(folder)
         if (self.directory / newest / "replay").exists():
             for folder in others:
-                shutil.rmtree(folder / "replay", ignore_errors=True)
+                self._remove(folder / "replay")
+
+    def _remove(self, folder: Path) -> None:
+        """Removes a folder as a whole: a process that is killed meanwhile leaves nothing that looks complete."""
+        if folder.exists():
+            with contextlib.suppress(OSError):
+                os.rename(folder, self.directory / f".frames_removed-{folder.parent.name}-{folder.name}.partial")
+            self._remove_partials()
+
+    def _remove_partials(self) -> None:
+        for stale in self.directory.glob(".frames_*.partial"):
+            shutil.rmtree(stale, ignore_errors=True)
 
 
 def find_checkpoint(path: Path | str) -> Path:

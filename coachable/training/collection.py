@@ -5,7 +5,6 @@ import os
 import signal
 import sys
 import threading
-import warnings
 from collections.abc import Callable, Iterable
 from importlib.util import find_spec
 from typing import Any, Protocol, runtime_checkable
@@ -18,6 +17,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 
 from coachable.training.rng import preserved_rng
+from coachable.training.simulators import ResumableEnv, UnsavableError, load_simulator, save_simulator
 
 __all__ = [
     "ResumableEnv",
@@ -28,19 +28,6 @@ __all__ = [
     "make_collector",
     "simulation_env",
 ]
-
-
-@runtime_checkable
-class ResumableEnv(Protocol):
-    """An env whose running episodes can be saved and continued."""
-
-    def simulator_state(self) -> dict[str, Any]:
-        """Everything that the next step depends on, as tensors and plain values."""
-        ...
-
-    def load_simulator_state(self, state: dict[str, Any]) -> None:
-        """Restores what `simulator_state` returned."""
-        ...
 
 
 @runtime_checkable
@@ -155,62 +142,62 @@ def simulation_env(env: EnvBase) -> EnvBase:
 
 
 def collector_state(collector: BaseCollector) -> dict[str, Any]:
-    """Reads what the next iteration of a single-process collector depends on, besides policy and global generators.
+    """Reads what the next iteration of a collector depends on, besides policy and global generators.
 
     Returns:
         Tensors and plain containers: frame count, transforms' state (style generators), the simulation's own state and
-        the tensordict that the next step starts from. Empty for workers in other processes: their episodes restart.
+        the tensordict that the next step starts from. `not_saved` says why the latter two are missing. Of workers in
+        other processes only the counts.
     """
-    if not isinstance(collector, Collector):
-        return {}
-    env, base = collector.env, simulation_env(collector.env)
-    simulation = base.simulator_state() if isinstance(base, ResumableEnv) else {}
-    return {
-        "frames": int(collector._frames),
-        "iterations": int(collector._iter),
-        "trajectories": dict(collector._traj_pool.state_dict()),
-        "transforms": dict(env.state_dict()) if isinstance(env, TransformedEnv) else {},
-        "simulation": simulation,
-        # Without the simulation's state, the observation to go on from would not be the simulator's.
-        "carrier": _plain(collector._carrier) if simulation else {},
+    counts: Any = collector  # typed too narrowly in TorchRL
+    state: dict[str, Any] = {
+        "frames": int(getattr(counts, "_frames", 0)),
+        "iterations": int(getattr(counts, "_iter", 0)),
     }
+    if not isinstance(collector, Collector):
+        return state
+    env = collector.env
+    state["transforms"] = dict(env.state_dict()) if isinstance(env, TransformedEnv) else {}
+    try:
+        state["simulation"] = save_simulator(simulation_env(env))
+    except UnsavableError as error:
+        return state | {"not_saved": str(error)}
+    state["trajectories"] = dict(collector._traj_pool.state_dict())
+    state["carrier"] = _plain(collector._carrier)
+    return state
 
 
-def load_collector_state(collector: BaseCollector, state: dict[str, Any]) -> bool:
+def load_collector_state(collector: BaseCollector, state: dict[str, Any]) -> None:
     """Restores what `collector_state` read.
 
     Args:
         collector: a fresh one, made like the old one.
         state: from `collector_state`.
 
-    Returns:
-        Whether the running episodes go on. If not (the env keeps no state, or workers in other processes), they
-        restart; a warning says so.
+    Raises:
+        UnsavableError: if the running episodes cannot go on; says why. They restart then, and the rest is restored.
     """
-    if not state or not isinstance(collector, Collector):
-        warnings.warn("the collector's state was not saved or cannot be restored: episodes restart", stacklevel=2)
-        return False
-    env, base = collector.env, simulation_env(collector.env)
-    collector._frames = int(state["frames"])
-    collector._iter = int(state["iterations"])
+    counts: Any = collector  # typed too narrowly in TorchRL
+    counts._frames, counts._iter = int(state.get("frames", 0)), int(state.get("iterations", 0))
+    if not isinstance(collector, Collector):
+        counts.update_policy_weights_()  # for the first step, too
+        raise UnsavableError("environments in other processes cannot be saved (collector=direct saves its own)")
+    env = collector.env
     if isinstance(env, TransformedEnv):
         env.load_state_dict(state["transforms"])
-    if not state["carrier"] or not isinstance(base, ResumableEnv):
-        warnings.warn(f"{type(base).__name__} does not save its simulator's state: episodes restart", stacklevel=2)
-        return False
-    saved = tuple(state["carrier"]["done"].shape)
-    present = tuple(collector._carrier["done"].shape)
-    if saved != present:
-        warnings.warn(
-            f"the checkpoint holds {saved[0]} environments, this run has {present[0]} (num_envs): episodes restart",
-            stacklevel=2,
-        )
-        return False
-    base.load_simulator_state(state["simulation"])
-    carrier = TensorDict(state["carrier"], batch_size=collector._carrier.batch_size)
+    if not state.get("simulation"):
+        raise UnsavableError(state.get("not_saved", "the checkpoint does not hold their state"))
+    carrier, present = state["carrier"], collector._carrier
+    saved, expected = tuple(carrier["done"].shape), tuple(present["done"].shape)
+    if saved != expected:
+        raise UnsavableError(f"the checkpoint holds {saved[0]} environments, this run has {expected[0]} (num_envs)")
+    try:
+        load_simulator(simulation_env(env), state["simulation"])
+    except UnsavableError:
+        present.update(env.reset())  # some of it may have been restored
+        raise
     collector._traj_pool.load_state_dict(state["trajectories"])
-    collector._carrier = carrier.clone()
-    return True
+    collector._carrier = TensorDict(carrier, batch_size=present.batch_size).clone()
 
 
 def evaluate_policy(

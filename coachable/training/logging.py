@@ -21,6 +21,8 @@ _MOVE = "Move it away to go on with a new one"
 class CsvLog:
     """Rows of numbers in one CSV file that may gain columns.
 
+    A last line without its end, which a process leaves behind that is killed while it writes, is dropped.
+
     Args:
         path: the file; rows are appended when it exists.
 
@@ -36,7 +38,9 @@ class CsvLog:
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
         self.columns: list[str] = []
-        self._read()
+        rows = self._read()
+        if self._torn():
+            self._rewrite(rows)
 
     def rewind(self, limit: float, key: str = "frames") -> None:
         """Drops rows whose `key` exceeds `limit`: they belong to a course that a resumed training leaves behind."""
@@ -63,11 +67,18 @@ class CsvLog:
             return []
         try:
             with self.path.open(newline="", encoding="utf-8") as file:
-                reader = csv.DictReader(file)
+                reader = csv.DictReader(line for line in file if line.endswith("\n"))
                 self.columns = list(reader.fieldnames or [])
                 return list(reader)
         except (UnicodeDecodeError, csv.Error) as error:
             raise ValueError(f"{self.path} is no table of metrics: {error}. {_MOVE}") from error
+
+    def _torn(self) -> bool:
+        if not self.path.exists() or self.path.stat().st_size == 0:
+            return False
+        with self.path.open("rb") as file:
+            file.seek(-1, os.SEEK_END)
+            return file.read() != b"\n"
 
     def _rewrite(self, rows: list[dict[str, Any]]) -> None:
         partial = self.path.with_name(self.path.name + ".partial")

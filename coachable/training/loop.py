@@ -19,13 +19,14 @@ from coachable.finite import NonFiniteError, require_finite
 from coachable.keys import EVENTS, STYLE, STYLE_FEATURES, TASK_REWARD
 from coachable.replay import EventTableBuffer
 from coachable.training.checkpoint import CheckpointStore, find_checkpoint, read_state
-from coachable.training.collection import collector_state, load_collector_state
+from coachable.training.collection import collector_state, load_collector_state, simulation_env
 from coachable.training.episodes import EpisodeStatistics, Means
 from coachable.training.learner import Learner
 from coachable.training.logging import MetricsLog, Progress
 from coachable.training.replay_files import read_replay
 from coachable.training.rng import rng_state, set_rng_state
 from coachable.training.settings import TrainSettings
+from coachable.training.simulators import UnsavableError
 from coachable.training.stopping import stop_signals
 from coachable.training.throttle import Throttle
 from coachable.training.weights import require_same_agent
@@ -115,6 +116,7 @@ class Train:
         self._evaluations = 0
         self._filled_from = 0  # env-steps when the replay buffer was empty
         self._logged = self._saved = time.monotonic()
+        self._logged_frames = 0
 
     def run(self) -> dict[str, float]:
         """Runs the loop.
@@ -214,7 +216,7 @@ class Train:
 
     def _log(self) -> None:
         with self._timed("log"):
-            self._logged = time.monotonic()
+            self._logged, self._logged_frames = time.monotonic(), self.frames
             row = {**self._episodes.flush(), **{f"loss/{k}": v for k, v in self._losses.flush().items()}}
             row |= {f"seconds/{name}": round(spent, 3) for name, spent in self.seconds.items()}
             if isinstance(self.replay, EventTableBuffer):
@@ -234,6 +236,8 @@ class Train:
 
     def _checkpoint_if_due(self) -> None:
         if time.monotonic() - self._saved >= self.settings.checkpoint_interval:
+            if self._logged_frames < self.frames:  # a checkpoint does not hold what the next row would tell of so far
+                self._log()
             self._checkpoint()
 
     def _checkpoint(self) -> Path | None:
@@ -263,6 +267,8 @@ class Train:
             },
             "collector": collector_state(self.collector),
             "rng": rng_state(),
+            "seconds": dict(self.seconds),
+            "threads": torch.get_num_threads(),
         }
 
     def resume(self, path: Path | str) -> Path:
@@ -305,10 +311,35 @@ class Train:
                 f"the checkpoint has no replay buffer: updates go on after {self.settings.warmup_frames} new env-steps",
                 stacklevel=2,
             )
-        continued = load_collector_state(self.collector, state["collector"])
-        if not continued and isinstance(self.replay, EventTableBuffer):
-            self.replay.finish()
+        self.seconds |= state.get("seconds", {})
+        self._logged_frames = self.frames
+        self._load_episodes(state["collector"])
+        threads = state.get("threads", torch.get_num_threads())
+        if threads != torch.get_num_threads():
+            warnings.warn(
+                f"the checkpoint was written with {threads} torch threads, this run has {torch.get_num_threads()}: "
+                "sums are rounded differently, so the training does not go on bit for bit (threads.learner)",
+                stacklevel=2,
+            )
         set_rng_state(state["rng"])  # last: what is restored above draws random numbers
+
+    def _load_episodes(self, state: dict[str, Any]) -> None:
+        try:
+            load_collector_state(self.collector, state)
+        except UnsavableError as error:
+            if isinstance(self.replay, EventTableBuffer):
+                self.replay.finish()
+            warnings.warn(
+                f"the running episodes of {self._environment()} are not restored: {error}. They start anew, so the "
+                "training does not go on bit for bit; everything else that the checkpoint holds is restored",
+                stacklevel=4,
+            )
+
+    def _environment(self) -> str:
+        """Name of the environment, or of the agent's domain where the environments are in other processes."""
+        if isinstance(self.collector, Collector):
+            return type(simulation_env(self.collector.env)).__name__
+        return str(self.describe().get("domain", "the environment"))
 
     @contextmanager
     def _timed(self, part: str) -> Iterator[None]:

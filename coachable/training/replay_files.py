@@ -9,6 +9,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 
 from coachable.files import load_state, refusing, save_state
+from coachable.replay import EventTableBuffer
 from coachable.replay.files import read_records, write_records
 
 __all__ = ["read_replay", "replay_bytes", "write_replay"]
@@ -25,7 +26,7 @@ def write_replay(replay: ReplayBuffer, folder: Path) -> None:
         OSError: if writing fails.
     """
     folder.mkdir()
-    write_records(replay.storage, folder)
+    write_records(replay.storage, folder, replay.regions.unused() if isinstance(replay, EventTableBuffer) else None)
     save_state({name: value for name, value in replay.state_dict().items() if name != "_storage"}, folder / "state.pt")
 
 

@@ -136,19 +136,25 @@ def domain_of(agent: LoadedPolicy) -> Domain:
     if here != there:
         raise CheckpointError(f"{source} has the styles {', '.join(there)}: domain {name} has {', '.join(here)}")
     reads = widths_of(agent)
+    groups = sum(width for _, width in domain.observation_groups)
+    if groups:
+        _check_widths(source, reads, (groups, reads[1]), name)
 
     def make_env(*arguments: Any, **options: Any) -> Any:
         with refusing(source, "a configuration of its environment"):
             env = domain.make_env(*arguments, **options)
-        gives = (env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1])
-        if reads != gives:
-            raise CheckpointError(
-                f"{source} reads {reads[0]} observations and gives {reads[1]} actions: expected {gives[0]} and "
-                f"{gives[1]}, as domain {name} has them"
-            )
+        _check_widths(source, reads, (env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]), name)
         return env
 
     return replace(domain, make_env=make_env)
+
+
+def _check_widths(source: str, reads: tuple[int, int], gives: tuple[int, int], domain: str) -> None:
+    if reads != gives:
+        raise CheckpointError(
+            f"{source} reads {reads[0]} observations and gives {reads[1]} actions: expected {gives[0]} and {gives[1]}, "
+            f"as domain {domain} has them"
+        )
 
 
 def widths_of(agent: LoadedPolicy) -> tuple[int, int]:

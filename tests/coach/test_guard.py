@@ -247,6 +247,20 @@ def test_uploads_end(page, monkeypatch):
         assert connection.close_code == 1009
 
 
+def test_an_uploaded_recording_with_an_unknown_control_is_refused(page):
+    recording = page.session.recording()
+    recording.events.append({"step": recording.steps, "controls": {"altitude": 1.0}})
+    content = recording.to_json().encode()
+    names = {"source_component_uuid": page.upload._impl.uuid, "transfer_uuid": "t"}
+    with connect(page) as connection:
+        enter(page, connection)
+        about = {"filename": "x.json", "mime_type": "application/json", "part_count": 1, "size_bytes": len(content)}
+        send(connection, type="FileTransferStartUpload", **names, **about)
+        send(connection, type="FileTransferPart", part_index=0, content=content, **names)
+        wait_for(lambda: "no live control named" in page.loop.problem)
+    page.loop.submit(lambda _: None)
+
+
 def test_fifty_connections_are_opened_and_dropped(page):
     connections = [connect(page) for _ in range(50)]
     wait_for(lambda: len(page.server._websock_server._live_connections) >= 50)

@@ -240,7 +240,7 @@ def test_the_agent_acts_while_a_phrase_is_read(page, monkeypatch):
     count = page.session.step_count
     wait_for(lambda: page.session.step_count > count + 5)
     page.run_plan.value = True
-    wait_for(lambda: "still being read" in page.status.content)
+    wait_for(lambda: "was given before is still being read" in page.status.content)
     finish.set()
     wait_for(lambda: page.session.style["target"] == pytest.approx(0.4))
 
@@ -306,8 +306,9 @@ def test_the_chart_has_a_fixed_axis_of_time_and_says_when_nothing_was_measured(p
     assert page.chart.plot.scales["x"]["range"] == (-30.0, 0.0)
     ago, asked, measured = page.chart.plot.data
     assert ago == pytest.approx([-0.05, 0.0]) and measured == pytest.approx(asked)
+    assert not page.chart.note.visible
     page.chart.choice.value = "mood"
-    wait_for(lambda: "mood: nothing was measured" in page.chart.note.content)
+    wait_for(lambda: "mood: nothing was measured" in page.chart.note.content and page.chart.note.visible)
     assert len(page.chart.plot.data) == 2, "what was asked for only"
 
 
@@ -541,8 +542,8 @@ def test_in_a_narrow_window_the_picture_lies_above_the_panel(server, monkeypatch
 
 
 def test_in_a_narrow_window_the_camera_shows_the_agent_above_the_panel():
-    camera = SimpleNamespace(image_width=400)
-    views._above_the_panel(SimpleNamespace(camera=camera))
+    camera = SimpleNamespace(image_width=400, position=views._START)
+    views._raise_agent(camera)
     position, target = np.array(camera.position), np.array(camera.look_at)
     ahead = (target - position) / np.linalg.norm(target - position)
     right = np.cross(ahead, [0.0, 0.0, 1.0])
@@ -551,9 +552,12 @@ def test_in_a_narrow_window_the_camera_shows_the_agent_above_the_panel():
         seen = np.array([0.0, 0.0, height]) - position
         share = (seen @ up) / (seen @ ahead) / np.tan(np.deg2rad(75.0) / 2)  # -1 below, 1 above
         assert 0.2 < share < 1.0, "above the panel's 60 %"
-    wide = SimpleNamespace(image_width=1280)
-    views._above_the_panel(SimpleNamespace(camera=wide))
-    assert not hasattr(wide, "look_at")
+    for other in (
+        SimpleNamespace(image_width=1280, position=views._START),
+        SimpleNamespace(image_width=400, position=(1.0, 1.0, 1.0)),  # the user has moved it
+    ):
+        views._raise_agent(other)
+        assert not hasattr(other, "look_at")
 
 
 def test_the_humanoid_stays_in_the_middle_of_the_scene(server):

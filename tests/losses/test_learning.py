@@ -87,7 +87,7 @@ def answers(actor: Any, heads: ActionHeads) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize(("name", "kind"), SERVED)
 def test_learns_to_echo(name: str, kind: str) -> None:
     heads = HEADS[kind]
-    actor = train(name, heads, updates=300)
+    actor = train(name, heads, updates=200 if name in ("sac", "qr_sac", "rac") else 300)  # more for binned critics
     styles, said = answers(actor, heads)
     error = (said - styles).abs().mean(0)
     components = ["level"] * len(heads.categorical) + ["axis"] * heads.axes

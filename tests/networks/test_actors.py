@@ -28,6 +28,8 @@ def test_keys_and_shapes():
     assert out["action"].shape == (4, 3, 2)
     assert out["loc"].shape == out["scale"].shape == (4, 3, 2)
     assert out["action"].abs().max() <= 1
+    spec = actor.spec["action"]
+    assert (spec.shape, spec.low.tolist(), spec.high.tolist()) == ((2,), [-1.0, -1.0], [1.0, 1.0])
 
 
 def test_style_is_encoded_inside():

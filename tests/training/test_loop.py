@@ -57,10 +57,51 @@ def test_n_plus_n_equals_2n_bit_for_bit(make_train, tmp_path):
 def test_resume_without_simulator_state_restarts_episodes_and_says_so(make_train, tmp_path):
     make_train(total_frames=80, resumable=False).run()
     rest = make_train(total_frames=120, resumable=False)
-    with pytest.warns(UserWarning, match="does not save its simulator's state: episodes restart"):
+    with pytest.warns(
+        UserWarning, match="episodes of StyleEchoEnv are not restored: .* has no simulator_state"
+    ) as told:
         rest.resume(tmp_path / "run")
+    assert len(told) == 1 and "everything else that the checkpoint holds is restored" in str(told[0].message)
     rest.run()
     assert rest.frames == 120
+
+
+def test_resume_with_another_number_of_threads_says_so(make_train, tmp_path):
+    make_train(total_frames=80).run()
+    rest = make_train(total_frames=80)
+    torch.set_num_threads(2)
+    try:
+        with pytest.warns(
+            UserWarning, match="written with 1 torch threads, this run has 2: sums are rounded differently"
+        ):
+            rest.resume(tmp_path / "run")
+    finally:
+        torch.set_num_threads(1)
+
+
+def test_what_happened_before_a_checkpoint_is_in_the_metrics(make_train, tmp_path, monkeypatch):
+    """A training that ends without a last word, right after a checkpoint, has told of every episode up to it."""
+    monkeypatch.setattr(os, "fsync", lambda _: None)
+    train = make_train(total_frames=400, checkpoint_interval=0.0, log_interval=1e9, utd_ratio=0.0)
+    save = train.checkpoints.try_save
+
+    def stop_after(state, metadata, replay):
+        save(state, metadata, replay)
+        if metadata["frames"] >= 100:
+            raise KeyboardInterrupt
+
+    train.checkpoints.try_save = stop_after
+    with pytest.raises(KeyboardInterrupt):
+        train.run()
+    rest = make_train(total_frames=100)
+    rest.resume(tmp_path / "run")
+    assert rest.seconds["collect"] > 0.0
+    rest.run()
+    with (tmp_path / "run" / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    ended = int(rest.replay.storage.get(slice(0, 100))["next", "done"].sum())
+    assert sum(int(row["episode/count"]) for row in rows) == ended > 0
+    assert float(rows[-1]["seconds/collect"]) >= float(rows[-2]["seconds/collect"])
 
 
 def test_resume_with_another_number_of_environments_says_so(make_train, tmp_path):
@@ -225,6 +266,18 @@ def test_csv_gains_columns_and_forgets_an_abandoned_future(tmp_path):
     again.rewind(2)
     again.write({"frames": 3, "b": 5.0})
     assert (tmp_path / "m.csv").read_text().splitlines() == ["frames,a,b", "1,1.0,", "2,,2.0", "3,,5.0"]
+
+
+@pytest.mark.parametrize("torn", ["4,1", "40,1.0,", "40,1.0,2.0", '4"'])
+def test_a_line_that_was_not_finished_is_dropped(tmp_path, torn):
+    log = CsvLog(tmp_path / "m.csv")
+    log.write({"frames": 1, "a": 1.0, "b": 2.0})
+    with (tmp_path / "m.csv").open("a") as file:
+        file.write(torn)
+    again = CsvLog(tmp_path / "m.csv")
+    again.rewind(10)
+    again.write({"frames": 5, "a": 3.0})
+    assert (tmp_path / "m.csv").read_text().splitlines() == ["frames,a,b", "1,1.0,2.0", "5,3.0,"]
 
 
 def test_progress_writes_json_lines_without_a_terminal():

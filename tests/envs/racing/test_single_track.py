@@ -46,7 +46,7 @@ def test_trajectories_agree_to_1e_6_m_after_one_second():
     start = np.array([0, 0, 0, 18.0, 0, 0, 0, 18.0 / VEHICLE.R_w, 18.0 / VEHICLE.R_w])
     inputs = np.array([(0.15, -7.0), (0.15, 0.0), (0.15, 0.63 * 9.81)])
     rate, acceleration = torch.tensor(inputs.T)
-    end = integrate(torch.tensor(start)[:, None].repeat(1, 3), rate, acceleration, VEHICLE, 0.5e-3, 2000)
+    end = integrate(torch.tensor(start)[:, None].repeat(1, 3), rate, acceleration, VEHICLE, 1e-3, 1000)
     for given, found in zip(inputs, end[:2].T.numpy(), strict=True):
         solved = solve_ivp(lambda _, s, u=given: reference(s, u), (0, 1), start, method="LSODA", rtol=1e-11, atol=1e-11)
         assert np.hypot(*(found - solved.y[:2, -1])) < 1e-6

@@ -1,0 +1,157 @@
+"""The state of environments of other libraries, Gymnasium and dm_control, read from their attributes."""
+
+import sys
+from functools import partial
+from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+
+__all__ = ["UnsavableError", "load_object", "save_object"]
+
+# Whose attributes are their state.
+_STATEFUL = {"gymnasium": ("Env",), "dm_env": ("Environment",), "dm_control.rl.control": ("Task",)}
+
+# What is the same in every environment made alike.
+_CONSTANT = {
+    "gymnasium": ("Space",),
+    "gymnasium.envs.registration": ("EnvSpec",),
+    "gymnasium.envs.mujoco.mujoco_rendering": ("MujocoRenderer",),
+    "mujoco": ("MjModel",),
+}
+_CODE = (type, partial, FunctionType, MethodType, BuiltinFunctionType, ModuleType)
+
+
+class UnsavableError(ValueError):
+    """The state of an environment cannot be saved or restored; the message names what of it."""
+
+
+def save_object(thing: Any) -> dict[str, Any]:
+    """Reads the attributes of an environment of another library, nested wrappers, tasks, physics and generators too.
+
+    Args:
+        thing: of `gymnasium` or `dm_control`. What all environments made alike share, such as spaces, models and
+            functions, is left out.
+
+    Returns:
+        Tensors and plain containers.
+
+    Raises:
+        UnsavableError: if an attribute is neither plain, nor shared, nor of a known kind.
+    """
+    state = {}
+    for name, value in vars(thing).items():
+        if not _is_constant(value):
+            state[name] = _pack(value, f"{type(thing).__name__}.{name}")
+    return state
+
+
+def load_object(thing: Any, state: dict[str, Any]) -> None:
+    """Restores what `save_object` returned.
+
+    Raises:
+        UnsavableError: if it does not fit.
+    """
+    for name, saved in state.items():
+        vars(thing)[name] = _unpack(saved, vars(thing).get(name), f"{type(thing).__name__}.{name}")
+
+
+def _pack(value: Any, where: str) -> Any:
+    if value is None or type(value) in (bool, int, float, str):
+        return value
+    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "biuf":
+        return {"numpy": torch.from_numpy(np.array(value)), "scalar": isinstance(value, np.generic)}
+    for kind in (list, tuple):
+        if type(value) is kind:
+            return {kind.__name__: [_pack(part, where) for part in value]}
+    if type(value) is dict:
+        return {"keys": [_pack(key, where) for key in value], "values": [_pack(v, where) for v in value.values()]}
+    if isinstance(value, np.random.Generator):
+        return {"generator": _pack(value.bit_generator.state, where)}
+    if isinstance(value, np.random.RandomState):
+        return {"generator": _pack(value.get_state(legacy=False), where)}
+    if (physics := _mujoco(value)) is not None:
+        return {"mujoco": _save_mujoco(*physics)}
+    if _is_one_of(value, _STATEFUL):
+        return {"object": save_object(value)}
+    raise UnsavableError(f"{where} is of type {type(value).__name__}, which cannot be saved")
+
+
+def _unpack(saved: Any, present: Any, where: str) -> Any:
+    """Value of an attribute; what has an identity, such as a generator, is the present one, brought to its state."""
+    if isinstance(saved, str) and saved != present:  # names of files, for instance: they are not a checkpoint's to set
+        raise UnsavableError(f"{where} is text that changes, which is not restored")
+    if not isinstance(saved, dict):
+        return saved
+    if "numpy" in saved:
+        array = saved["numpy"].numpy().copy()
+        return array[()] if saved["scalar"] else array
+    if "keys" in saved:
+        keys = [_unpack(key, key, where) for key in saved["keys"]]
+        before = present if isinstance(present, dict) else {}
+        return {k: _unpack(v, before.get(k), where) for k, v in zip(keys, saved["values"], strict=True)}
+    for kind in (list, tuple):
+        if kind.__name__ in saved:
+            items, fits = saved[kind.__name__], isinstance(present, list | tuple)
+            before = present if fits and len(present) == len(items) else [None] * len(items)
+            return kind(_unpack(item, old, where) for item, old in zip(items, before, strict=True))
+    if "generator" in saved and isinstance(present, np.random.Generator):
+        present.bit_generator.state = _unpack(saved["generator"], present.bit_generator.state, where)
+    elif "generator" in saved and isinstance(present, np.random.RandomState):
+        present.set_state(_unpack(saved["generator"], present.get_state(legacy=False), where))
+    elif "mujoco" in saved and (physics := _mujoco(present)) is not None:
+        _load_mujoco(*physics, saved["mujoco"])
+    elif "object" in saved and _is_one_of(present, _STATEFUL):
+        load_object(present, saved["object"])
+    else:
+        raise UnsavableError(f"{where} is of type {type(present).__name__} here, and was of another kind when saved")
+    return present
+
+
+def _is_constant(value: Any) -> bool:
+    return isinstance(value, _CODE) or _is_one_of(value, _CONSTANT)
+
+
+def _is_one_of(value: Any, kinds: dict[str, tuple[str, ...]]) -> bool:
+    """Without an import: a value can only be of a kind whose module is loaded."""
+    modules = [(sys.modules.get(module), names) for module, names in kinds.items()]
+    return any(isinstance(value, getattr(module, name)) for module, names in modules if module for name in names)
+
+
+def _mujoco(value: Any) -> tuple[Any, Any] | None:
+    """Model and data of a MuJoCo simulation, whether MuJoCo's own or dm_control's, or None."""
+    if _is_one_of(value, {"mujoco": ("MjData",)}):
+        return value.model, value
+    if _is_one_of(value, {"dm_control.mujoco": ("Physics",)}):
+        return value.model.ptr, value.data.ptr
+    return None
+
+
+def _save_mujoco(model: Any, data: Any) -> dict[str, Any]:
+    """All that a step depends on, and what was derived from it, as rewards may read it before the next step."""
+    import mujoco
+
+    what = mujoco.mjtState.mjSTATE_INTEGRATION
+    state = np.empty(mujoco.mj_stateSize(model, what))
+    mujoco.mj_getState(model, data, state, what)
+    derived = {name: torch.from_numpy(array.copy()) for name, array in _float_arrays(data).items()}
+    return {"state": torch.from_numpy(state), "derived": derived}
+
+
+def _load_mujoco(model: Any, data: Any, saved: dict[str, Any]) -> None:
+    import mujoco
+
+    mujoco.mj_setState(model, data, saved["state"].numpy(), mujoco.mjtState.mjSTATE_INTEGRATION)
+    mujoco.mj_forward(model, data)  # contacts and constraints
+    for name, array in _float_arrays(data).items():
+        # mj_step computes positions and so on before it moves on: what it leaves behind is of the moment before.
+        if name in saved["derived"] and tuple(saved["derived"][name].shape) == array.shape:
+            array[:] = saved["derived"][name].numpy()
+
+
+def _float_arrays(data: Any) -> dict[str, np.ndarray]:
+    arrays = {name: getattr(data, name) for name in dir(data) if not name.startswith("_")}
+    return {
+        name: array for name, array in arrays.items() if isinstance(array, np.ndarray) and array.dtype == np.float64
+    }

@@ -1,0 +1,69 @@
+"""The state of running episodes: what environments save themselves, and what can be read from third-party ones."""
+
+from typing import Any, Protocol, runtime_checkable
+
+from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
+
+from coachable.third_party import UnsavableError, load_object, save_object
+
+__all__ = ["ResumableEnv", "UnsavableError", "load_simulator", "save_simulator"]
+
+_WRAPPED = ("DMControlWrapper", "GymWrapper")  # TorchRL's environments around one of another library, in `_env`
+
+
+@runtime_checkable
+class ResumableEnv(Protocol):
+    """An env whose running episodes can be saved and continued."""
+
+    def simulator_state(self) -> dict[str, Any]:
+        """Everything that the next step depends on, as tensors and plain values."""
+        ...
+
+    def load_simulator_state(self, state: dict[str, Any]) -> None:
+        """Restores what `simulator_state` returned."""
+        ...
+
+
+def save_simulator(env: EnvBase) -> dict[str, Any]:
+    """Reads the state of an environment's running episodes.
+
+    Args:
+        env: a `ResumableEnv`, one of TorchRL's wrappers of Gymnasium or dm_control, or a `SerialEnv` of them.
+
+    Returns:
+        Tensors and plain containers.
+
+    Raises:
+        UnsavableError: if it has state that cannot be saved.
+    """
+    if isinstance(env, SerialEnv):  # it passes questions for methods on to its parts
+        return {"parts": [save_simulator(part) for part in env._envs]}
+    if isinstance(env, TransformedEnv):
+        return {"transforms": dict(env.state_dict()), "base": save_simulator(env.base_env)}
+    if isinstance(env, ResumableEnv):
+        return env.simulator_state()
+    if any(kind.__name__ in _WRAPPED for kind in type(env).__mro__):
+        return {"environment": save_object(env._env)}
+    raise UnsavableError(f"{type(env).__name__} has no simulator_state() and load_simulator_state()")
+
+
+def load_simulator(env: EnvBase, state: dict[str, Any]) -> None:
+    """Restores what `save_simulator` returned.
+
+    Args:
+        env: made like the one that was saved, and reset.
+        state: from `save_simulator`.
+
+    Raises:
+        UnsavableError: if something of it is not restored; the environment has to be reset then.
+    """
+    if isinstance(env, SerialEnv):
+        for part, saved in zip(env._envs, state["parts"], strict=True):
+            load_simulator(part, saved)
+    elif isinstance(env, TransformedEnv):
+        env.load_state_dict(state["transforms"])
+        load_simulator(env.base_env, state["base"])
+    elif isinstance(env, ResumableEnv):
+        env.load_simulator_state(state)
+    else:
+        load_object(env._env, state["environment"])

@@ -1,0 +1,44 @@
+"""Every recipe's training, resumed from its middle, ends like the one that was not interrupted, bit for bit."""
+
+import os
+from importlib import import_module
+
+import pytest
+import torch
+from recipe_config import compose_config
+
+from coachable.training.checkpoint import CheckpointStore, find_checkpoint, read_state
+from tests.random_kills import RECIPES, differences
+
+TINY = ["preset=smoke", "env.num_envs=2", "threads.simulator=1", "threads.learner=1", "train.eval_interval=16"]
+TINY += ["init_random_frames=8", "train.warmup_frames=8", "train.batch_size=12", "eval.max_steps=3"]
+TINY += ["train.total_frames=64", "train.utd_ratio=0.25"]
+
+
+@pytest.mark.parametrize("recipe", sorted(file.stem for file in (RECIPES / "configs").glob("*_*.yaml")))
+def test_a_resumed_training_equals_the_uninterrupted_one(recipe, tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "fsync", lambda _: None)
+    build = import_module(recipe).build
+    train = build(compose_config(recipe, [*TINY, f"run_dir={tmp_path / 'whole'}"]))
+    middle = CheckpointStore(tmp_path / "rest" / "checkpoints")
+
+    def save_in_the_middle():
+        if train.frames == 40:
+            middle.save({**train.describe(), **train.state_dict()}, {"frames": train.frames}, train.replay)
+
+    monkeypatch.setattr(train, "_checkpoint_if_due", save_in_the_middle)
+    train.run()
+    rest = build(compose_config(recipe, [f"resume={tmp_path / 'rest'}"]))
+    assert rest.frames == 40 and 0 < rest.learner.updates < train.learner.updates
+    rest.run()
+    found = differences(tmp_path / "rest", tmp_path / "whole")
+    assert [name for name in found if not name.startswith("metrics/")] == []
+
+
+def test_a_resumed_training_takes_as_many_threads(tmp_path):
+    """How many cores are free, and so the rounding of sums, depends on the moment."""
+    arguments = [*TINY, "threads.learner=null", "train.total_frames=4", f"run_dir={tmp_path}"]
+    import_module("rare_targets").build(compose_config("rare_targets", arguments)).run()
+    threads = read_state(find_checkpoint(tmp_path))["config"]["threads"]["learner"]
+    assert threads == torch.get_num_threads()
+    assert compose_config("rare_targets", [f"resume={tmp_path}"])["threads"]["learner"] == threads
