@@ -13,6 +13,7 @@ import ast
 import importlib
 import importlib.abc
 import importlib.machinery
+import importlib.util
 import itertools
 import os
 import random
@@ -98,7 +99,7 @@ def operators() -> list[str]:
 
 
 def untouched(tree: ast.AST) -> Iterator[ast.AST]:
-    """Find the nodes whose changes nothing can notice: annotations, `__all__`, texts of errors."""
+    """Find the nodes whose changes nothing can notice: annotations, `__all__`, texts of errors, mere guards."""
     for node in ast.walk(tree):
         match node:
             case ast.arg() | ast.AnnAssign() if node.annotation:
@@ -107,6 +108,8 @@ def untouched(tree: ast.AST) -> Iterator[ast.AST]:
                 yield node.returns
             case ast.JoinedStr():
                 yield node
+            case ast.keyword() if node.arg in ("strict", "frozen"):  # guards that fire only where another fault is
+                yield node.value
             case ast.Assign() if ast.unparse(node.targets[0]) == "__all__":
                 yield node
             case ast.If() if "TYPE_CHECKING" in ast.dump(node.test):
@@ -173,10 +176,8 @@ def compiles(mutant: Mutant) -> bool:
     return True
 
 
-def test_files(mutant: Mutant) -> list[str]:
-    """List the test files of the mutant's package, those closest to its module first."""
-    package = next(name for name in PACKAGES if mutant.path.startswith(f"coachable/{name}/"))
-    path = Path(mutant.path)
+def test_files(package: str, path: Path) -> list[str]:
+    """List the test files of a package, those closest to a module first."""
     dotted = ".".join(path.with_suffix("").parts)
 
     def distance(file: Path) -> tuple[bool, bool, int]:
@@ -196,7 +197,9 @@ class Loader(importlib.machinery.SourceFileLoader, importlib.abc.MetaPathFinder)
 
     def find_spec(self, fullname: str, path: object = None, target: object = None) -> object:
         """Offer the changed module."""
-        return importlib.machinery.ModuleSpec(fullname, self, origin=self.path) if fullname == self.module else None
+        if fullname != self.module:
+            return None
+        return importlib.util.spec_from_file_location(fullname, self.path, loader=self)
 
     def get_code(self, fullname: str) -> object:
         """Compile the changed source."""
@@ -256,12 +259,19 @@ def main() -> None:
     parser.add_argument("--package", choices=PACKAGES, action="append", help="one or more of them; all by default")
     parser.add_argument("--module", help="path of the only module to change")
     parser.add_argument("--timeout", type=float, default=300.0, help="seconds per mutant")
+    parser.add_argument("--check", action=argparse.BooleanOptionalAction, default=True, help="first without a change")
     chosen = parser.parse_args()
     packages = chosen.package or list(PACKAGES)
     os.chdir(ROOT)
     for name in PRELOADED:
         importlib.import_module(name)
     assert not any(name.split(".")[0] == "coachable" for name in sys.modules)
+    if chosen.check:
+        for package in packages:
+            with tempfile.NamedTemporaryFile() as log:
+                if fork(None, test_files(package, Path(package)), 10 * chosen.timeout, Path(log.name)) != 0:
+                    text = Path(log.name).read_text(errors="replace")
+                    raise SystemExit(f"the tests of {package} fail without any change:\n{text[-2000:]}")
     shares = {
         name: chosen.count // len(packages) + (i < chosen.count % len(packages)) for i, name in enumerate(packages)
     }
@@ -271,7 +281,7 @@ def main() -> None:
     for package, mutant in filter(None, itertools.chain.from_iterable(itertools.zip_longest(*drawn))):
         start = time.monotonic()
         with tempfile.NamedTemporaryFile() as log:
-            status = fork(mutant, test_files(mutant), chosen.timeout, Path(log.name))
+            status = fork(mutant, test_files(package, Path(mutant.path)), chosen.timeout, Path(log.name))
             last = re.findall(r"^(?:FAILED|ERROR) (\S+)", Path(log.name).read_text(errors="replace"), re.MULTILINE)
         if status == 0:
             survivors[package].append(mutant)

@@ -72,7 +72,7 @@ def run_with_kills(make: Make, run_dir: Path, *, delays: Sequence[float] = (), c
         make: makes the training.
         run_dir: its folder.
         delays: [s] from a start or resumption to a kill, one after the other.
-        calls: Python and C functions called until then, instead; the moment is the same on every machine.
+        calls: Python and C functions that the loop calls until then, instead; see `count_calls`.
 
     Raises:
         RuntimeError: if it fails of its own accord.
@@ -87,6 +87,22 @@ def run_with_kills(make: Make, run_dir: Path, *, delays: Sequence[float] = (), c
     return course
 
 
+def count_calls(run: Callable[[], Any]) -> int:
+    """Python and C functions that are called by `run`, and what it calls in turn."""
+    count = 0
+
+    def another(_frame: Any, event: str, _argument: Any) -> None:
+        nonlocal count
+        count += event in ("call", "c_call")
+
+    sys.setprofile(another)
+    try:
+        run()
+    finally:
+        sys.setprofile(None)
+    return count
+
+
 def _run_once(make: Make, run_dir: Path, delay: float, call: int) -> tuple[str | None, float]:
     """Runs or resumes a training in a process of its own; returns where it was killed, and what that cost."""
     try:
@@ -98,9 +114,10 @@ def _run_once(make: Make, run_dir: Path, delay: float, call: int) -> tuple[str |
     started = time.time()
 
     def run() -> None:
+        train = _publish_part(make(resume), part)
         if call:
             _die_at(call)
-        _publish_part(make(resume), part).run()
+        train.run()
 
     child = os.fork()
     if child == 0:
@@ -131,9 +148,9 @@ def _die_at(call: int) -> None:
     """Ends this process at one of the next function calls as a kill from outside does."""
     left = call
 
-    def count(*_: Any) -> None:
+    def count(_frame: Any, event: str, _argument: Any) -> None:
         nonlocal left
-        left -= 1
+        left -= event in ("call", "c_call")
         if left == 0:
             os.kill(os.getpid(), signal.SIGKILL)
 

@@ -63,7 +63,9 @@ class PolicyReader:
             )
         _check_spec(action_spec, loss_name, heads)
         self._heads: ActionHeads | None = heads
-        self._bounds = {name: _unit_or_tensor(options.get(name, sign)) for name, sign in (("low", -1.0), ("high", 1.0))}
+        self._bounds = {
+            name: _number_or_tensor(options.get(name, sign)) for name, sign in (("low", -1.0), ("high", 1.0))
+        }
         names = getattr(head, "dist_keys", head.in_keys)
         self._parameters = list(zip(names, head.in_keys, strict=True))
         # Shares the actor's modules, so that parameters swapped into the actor are used here.
@@ -78,11 +80,11 @@ class PolicyReader:
         return MixedAction(**parameters, heads=self._heads, **self._bounds)
 
 
-def _unit_or_tensor(bound: Any) -> Any:
-    """A bound of all ±1 as the number, which needs no arithmetic; any other as a tensor."""
+def _number_or_tensor(bound: Any) -> Any:
+    """A bound that is the same everywhere as a number, because ±1 needs no arithmetic; any other as a tensor."""
     tensor = torch.as_tensor(bound, dtype=torch.float32)
     first = tensor.flatten()[0].item()
-    return first if abs(first) == 1.0 and bool((tensor == first).all()) else tensor
+    return first if bool((tensor == first).all()) else tensor
 
 
 def _check_spec(spec: TensorSpec | None, loss_name: str, heads: ActionHeads | None) -> None:

@@ -3,7 +3,7 @@
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase, is_tensor_collection
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Transform
 
@@ -159,9 +159,6 @@ class TaskImpersonation(Transform):
                 f"the sampled {self.style_key!r} has shape {tuple(stored.shape)}: expected {self.space.dim} numbers "
                 f"({', '.join(self.space.names)}). Give TaskImpersonation the space that the data was collected with."
             )
-        if is_tensor_collection(features) and features.batch_size != tensordict.batch_size:
-            features = features.copy()
-            features.batch_size = tensordict.batch_size
         return stored, features, task_reward, reward
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:

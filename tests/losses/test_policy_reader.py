@@ -3,7 +3,12 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequential
+from tensordict.nn import (
+    NormalParamExtractor,
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+)
 from torch import nn
 from torchrl.data import Bounded, OneHot, Unbounded
 from torchrl.modules import ProbabilisticActor, TanhNormal
@@ -45,16 +50,19 @@ def test_a_tanh_normal_has_the_same_density_and_mode_within_any_bounds(bounds):
     torch.testing.assert_close(ours.log_prob(action), theirs.log_prob(action), rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(ours.deterministic_sample, theirs.deterministic_sample, rtol=1e-4, atol=1e-5)
     assert list(data.keys()) == ["observation"]
+    if (low == -1.0).all() and (high == 1.0).all():
+        with torch.no_grad():
+            assert torch.equal(ours.deterministic_sample, torch.tanh(ours.loc)), "not a bit lost to a change of scale"
 
 
 def test_a_policy_of_several_modules_is_read_to_its_end():
     torch.manual_seed(0)
     first = TensorDictModule(nn.Linear(4, 5), in_keys=["observation"], out_keys=["hidden"])
     second = nn.Sequential(nn.Linear(5, 6), NormalParamExtractor())
-    actor = ProbabilisticActor(
-        TensorDictSequential(first, TensorDictModule(second, in_keys=["hidden"], out_keys=["loc", "scale"])),
-        in_keys=["loc", "scale"],
-        distribution_class=TanhNormal,
+    actor = ProbabilisticTensorDictSequential(
+        first,
+        TensorDictModule(second, in_keys=["hidden"], out_keys=["loc", "scale"]),
+        ProbabilisticTensorDictModule(in_keys=["loc", "scale"], out_keys=["action"], distribution_class=TanhNormal),
     )
     data = TensorDict({"observation": torch.randn(9, 4)}, [9])
     ours = PolicyReader(actor, "test", continuous_only=True).read(data)

@@ -117,6 +117,7 @@ def test_spec_of_one_tensor(heads: ActionHeads) -> None:
     ):
         assert isinstance(changed, MixedActionSpec) and changed.shape == shape and changed.is_in(changed.rand())
     assert spec.clone() == spec != heads.spec((3,)) and spec.to(F64).rand().dtype == F64
+    assert spec.to(F64) != spec and spec.to("meta") != spec and spec != "spec"
     assert Composite(action=spec, shape=(2,))["action"] == spec
     with pytest.raises(ValueError, match="last dimension"):
         spec.reshape(-1)

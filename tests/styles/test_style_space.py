@@ -83,6 +83,12 @@ def test_encoding_first_used_in_inference_mode_still_differentiates(space):
     space.encode(space.default.requires_grad_()).sum().backward()
 
 
+def test_encoding_follows_theta_to_another_device(space):
+    encoded = space.encode(torch.empty(4, 6, device="meta"))
+    assert encoded.device.type == "meta" and encoded.shape == (4, 6)
+    assert space.encode(space.low).device.type == "cpu"
+
+
 def test_encoding_exports_with_a_dynamic_batch(space):
     class Encoder(torch.nn.Module):
         def forward(self, theta):

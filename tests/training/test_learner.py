@@ -367,6 +367,16 @@ def test_compile_without_a_compiler_is_logged_and_left(monkeypatch, caplog):
     learner.update(make_batch(16))
 
 
+def test_compile_takes_the_losses_where_there_is_a_compiler(monkeypatch, tmp_path):
+    compiler, compiled = tmp_path / "compiler", []
+    compiler.touch(mode=0o755)
+    monkeypatch.setenv("CXX", str(compiler))
+    monkeypatch.setattr(torch, "compile", lambda function: compiled.append(function) or function)
+    loss = make_loss()
+    Learner(loss, precision="fp32", fused=False, compile=True)
+    assert compiled == [loss.forward, loss.actor_loss, loss.qvalue_v2_loss]
+
+
 def test_compile_leaves_hand_written_passes_alone(caplog):
     """They are the faster of the two."""
     learner = Learner(make_loss(), compile=True)

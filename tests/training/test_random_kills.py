@@ -9,7 +9,7 @@ import pytest
 from coachable.training.checkpoint import find_checkpoint
 from coachable.training.collection import evaluate_policy
 from coachable.training.rng import seed_everything
-from tests.random_kills import RECIPES, differences, kill_recipe, run_with_kills
+from tests.random_kills import RECIPES, count_calls, differences, kill_recipe, run_with_kills
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:De
 def _make(make_train, make_echo_env, run_dir, resume):
     """Checkpoints after every round, so that kills fall into their writes, and evaluations every few rounds."""
     seed_everything(0)
-    train = make_train(run_dir, total_frames=120, eval_interval=24, checkpoint_interval=0.0, log_interval=0.05)
+    train = make_train(run_dir, total_frames=72, eval_interval=24, checkpoint_interval=0.0, log_interval=0.05)
     env = make_echo_env(5)
 
     def evaluate():
@@ -34,11 +34,11 @@ def test_a_killed_training_ends_like_an_uninterrupted_one(make_train, make_echo_
     monkeypatch.setattr(os, "fsync", lambda _: None)  # a killed process loses nothing that it has handed over
     make = partial(_make, make_train, make_echo_env)
     whole = tmp_path / "whole"
-    make(whole, None).run()
+    total = count_calls(make(whole, None).run)
     rng = random.Random(1)
-    calls = [int(10 ** rng.uniform(3.0, 5.0)) for _ in range(6)]
+    calls = [rng.randrange(1, total // 3) for _ in range(6)]
     course = run_with_kills(partial(make, tmp_path / "killed"), tmp_path / "killed", calls=calls)
-    assert len(course.kills) >= 4 and len(set(course.kills)) >= 2
+    assert len(course.kills) >= 3
     assert differences(tmp_path / "killed", whole) == []
     assert sorted(p.name for p in (tmp_path / "killed").iterdir()) == ["checkpoints", "metrics.csv"]
     assert not [p.name for p in find_checkpoint(whole).parent.iterdir() if p.name.startswith(".")]

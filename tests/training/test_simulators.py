@@ -2,9 +2,10 @@
 
 import pytest
 import torch
-from torchrl.envs import Compose, DMControlEnv, DoubleToFloat, EnvBase, SerialEnv, TransformedEnv
+from torchrl.envs import Compose, DMControlEnv, DoubleToFloat, EnvBase, GymWrapper, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import StepCounter
 
+from coachable.training.collection import collector_state, load_collector_state
 from coachable.training.simulators import UnsavableError, load_simulator, save_simulator
 
 
@@ -48,10 +49,46 @@ def test_transforms_of_a_part_are_restored_with_it(make_echo_env):
         assert torch.equal(value, states[1][name]), name
 
 
-def test_a_state_that_does_not_fit_is_refused(make_echo_env):
-    env = SerialEnv(2, lambda: make_echo_env(3))
+def test_parts_that_cannot_be_saved_are_named():
+    gymnasium = pytest.importorskip("gymnasium")
+    env = SerialEnv(1, lambda: GymWrapper(make_dreamer(gymnasium)))
     env.reset()
-    state = save_simulator(env)
-    for damaged in ({"parts": state["parts"][:1]}, {}, {"parts": [{}, {}]}):
-        with pytest.raises(UnsavableError, match="the saved state does not fit"):
-            load_simulator(env, damaged)
+    with pytest.raises(UnsavableError, match=r"Dreamer\.dream is of type Dream, which cannot be saved"):
+        save_simulator(env)
+
+
+class Dream:
+    """Something that no file can hold."""
+
+
+def make_dreamer(gymnasium):
+    class Dreamer(gymnasium.Env):
+        observation_space = action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+
+        def reset(self, *, seed=None, options=None):
+            self.dream = Dream()
+            return self.observation_space.sample(), {}
+
+        def step(self, action):
+            return self.observation_space.sample(), 0.0, False, False, {}
+
+    return Dreamer()
+
+
+class Workers:
+    """What a collector with workers in other processes shows of itself."""
+
+    def __init__(self) -> None:
+        self._frames, self._iter, self.told = 0, 0, 0
+
+    def update_policy_weights_(self) -> None:
+        self.told += 1
+
+
+def test_workers_in_other_processes_get_the_weights_and_the_count_of_frames():
+    """Otherwise they would act at random again for `init_random_frames`, and once with the weights of a new agent."""
+    before, after = Workers(), Workers()
+    before._frames, before._iter = 480, 12
+    with pytest.raises(UnsavableError, match=r"environments in other processes cannot be saved \(collector=direct"):
+        load_collector_state(after, collector_state(before))
+    assert (after._frames, after._iter, after.told) == (480, 12, 1)

@@ -43,6 +43,7 @@ def test_canonical_is_idempotent_and_still_a_valid_action():
     assert torch.equal(canonical(once), once)
     assert GAMEPAD.spec((864,)).is_in(once)
     assert torch.equal(combination_index(once), combination_index(raw))
+    assert torch.equal(combination_index(raw.reshape(4, 216, 24)), combination_index(raw).reshape(4, 216))
 
 
 def test_the_virtual_hand_holds_in_every_combination():
@@ -63,6 +64,19 @@ def test_sticks_pass_through_while_their_thumb_is_on_them():
     resting[16:20] = torch.tensor([1.0, 0.0, 1.0, 0.0])  # both thumbs on the buttons
     assert canonical(resting)[20:].tolist() == [0.0, 0.0, 0.0, 0.0]
     assert describe(resting) == "nothing"  # L3 is out of reach, too
+
+
+def test_a_stick_cannot_be_pushed_beyond_its_rim():
+    action = press("L3", left=(0.5, 0.5), right=(0.5, 0.5))
+    action[20:] = torch.tensor([1.5, -1.7, 1.9, -1.2])
+    assert canonical(action)[20:].tolist() == [1.0, -1.0, 1.0, -1.0]
+    pad = read_pad(canonical_rows(action[:, None]))
+    assert (pad.left_stick[:, 0].tolist(), pad.right_stick[:, 0].tolist()) == ([1.0, -1.0], [1.0, -1.0])
+    assert describe(press("L3")) == "L3 | left stick (+0.00, +0.00)"
+    assert (
+        describe(press(left=(0.25, -1.0), right=(0.5, 0.75)))
+        == "left stick (+0.25, -1.00) | right stick (+0.50, +0.75)"
+    )
 
 
 def test_readable_actions():

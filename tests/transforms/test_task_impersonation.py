@@ -301,7 +301,10 @@ def test_nested_features():
     features = TensorDict({"x": torch.randn(6, 1), "y": {"z": torch.randn(6, 2)}}, [6])
     one = torch.ones(6, 1)
     td = TensorDict({"style": one, "next": {"reward": one, "task_reward": one, "style_features": features}}, [6])
-    for batch in (td, td.clone().auto_batch_size_(1)):
+    longer = td.clone()
+    longer["next", "style_features", "y"].auto_batch_size_(2)
+    assert longer["next", "style_features", "y"].batch_size == (6, 2)
+    for batch in (td, td.clone().auto_batch_size_(1), longer):
         out = TaskImpersonation(reward, n=2)(batch)
         expected = 1 + out["style"][:, 1:] * features["x"].unsqueeze(1) + features["y", "z"][:, None, 1:]
         torch.testing.assert_close(out["next", "reward"][:, 1:], expected)
