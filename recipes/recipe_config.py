@@ -214,10 +214,10 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
     config.pop("hydra", None)
     config["run_dir"] = str(Path(config["run_dir"] or _new_run_dir(config["domain"])).expanduser().absolute())
     config = {str(key): value for key, value in config.items()}
-    if not config["resume"]:
+    try:
         return checked_numbers(config)
-    with refusing(config["resume"], "a configuration"):
-        return checked_numbers(config)
+    except (AttributeError, KeyError, TypeError) as error:  # of a saved one: what is composed here has the right kinds
+        raise CheckpointError(f"{config['resume']} holds a configuration of another kind: {error}") from error
 
 
 def announce(config: dict[str, Any], train: Train) -> None:

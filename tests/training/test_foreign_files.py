@@ -214,6 +214,13 @@ def test_a_configuration_cannot_choose_the_folder(run):
                 _resume(run)
 
 
+def test_groups_of_another_kind_are_refused(run):
+    for group in ("network", "train"):
+        _changed(find_checkpoint(run) / "state.pt", lambda state, g=group: _put(state["config"], g, "text"))
+        with pytest.raises(CheckpointError, match="frames_000000000040 holds a configuration"):
+            _resume(run)
+
+
 def test_what_the_yaml_files_name_is_known_at_its_place_only():
     known = known_targets("humanoid_sac")
     assert (("env", "_target_"), "coachable.envs.humanoid.HumanoidEnv") in known
