@@ -225,7 +225,7 @@ def announce(config: dict[str, Any], train: Train) -> None:
     parameters = sum(p.numel() for p in train.learner.loss_module.actor_network_params.parameters())
     bf16 = train.learner.precision == "bf16"
     seconds = estimate_update_seconds(parameters, config["train"]["batch_size"], bf16, pick_device(config["device"]))
-    remaining = config["train"]["total_frames"] - train.frames
+    remaining = max(0, config["train"]["total_frames"] - train.frames)
     updates = remaining * (config["train"]["utd_ratio"] or 0)
     hours = max(updates * seconds, remaining / (config["train"]["throttle"] or float("inf"))) / 3600
     print(f"Found {detect().describe()}: preset {config['preset']}, {train.learner.precision} updates")
