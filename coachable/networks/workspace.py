@@ -1,8 +1,8 @@
 """The hand-written passes of residual networks on prepared memory, with the kernels of `kernels.c`.
 
-Between two products of matrices that fill the cache, every Python call is a cold one; so all views and buffers that do
-not change from update to update are made once. Addresses are not: whoever shares a network with other processes moves
-its parameters.
+Between two products of matrices that fill the cache, every Python call is a cold one; so all views, buffers and the
+addresses of these buffers, which nobody else has, are prepared once. Addresses of parameters and gradients are taken at
+each call: whoever shares a network with other processes moves them.
 """
 
 from __future__ import annotations
@@ -88,8 +88,6 @@ class Workspace:
 
 
 class _MemberSpace:
-    """Passes of one member. Addresses are taken at each call: parameters may move between calls."""
-
     def __init__(
         self,
         space: Workspace,
@@ -110,7 +108,7 @@ class _MemberSpace:
             own = member.products[i], *parameters[i + 1 : i + 4]
             self._layers.append(_LayerSpace(space, layer, x, own, grads[i : i + 4], buffers[index], below))
             x, i = buffers[index][1], i + layer.tensors
-        self._features, self._scratch = x, space._scratch
+        self._features, self._features_at, self._scratch_at = x, x.data_ptr(), space._scratch.data_ptr()
         self._head = (parameters[i], parameters[i + 1]) if i < len(parameters) else None
         self._head_grads = grads[i:]
         self._head_kernels: tuple[Any, Any] | None = None
@@ -131,12 +129,12 @@ class _MemberSpace:
     def forward(self, out: Tensor) -> None:
         products = self.products()
         for layer in self._layers:
-            arguments = (*_addresses(layer.forward_inputs), *layer.forward_sizes, *_addresses(layer.forward_outputs))
+            own, (z, *rest) = [tensor.data_ptr() for tensor in layer.norm], layer.forward_arguments
             if products is not None:
-                products.dense_forward(layer.shape.in_features, layer.low.data_ptr(), *arguments)
+                products.dense_forward(layer.in_features, layer.low.data_ptr(), z, *own, *rest)
             else:
                 torch.mm(layer.x, layer.low.t(), out=layer.z)
-                self._layer_forward(*arguments)
+                self._layer_forward(z, *own, *rest)
         if self._head is None:
             out.copy_(self._features)
             return
@@ -144,7 +142,7 @@ class _MemberSpace:
             self._head_kernels = products and (products.wide_head_forward, products.wide_head_backward)
         weight, bias = self._head
         if self._head_kernels is not None:
-            addresses = _addresses((self._features, weight, bias))
+            addresses = self._features_at, weight.data_ptr(), bias.data_ptr()
             self._head_kernels[0](*addresses, self._space.rows, *self._head_sizes, out.data_ptr())
         else:
             if self._hidden is not self._features:
@@ -162,20 +160,20 @@ class _MemberSpace:
         kernel, products = self._layer_backward, self.products()
         index = None if rows is None else rows.data_ptr()
         for layer in reversed(self._layers):
-            targets = _addresses(layer.norm_grads) if trained else (None, None, None)
-            numbers = index, count, trained, add, layer.shape.out_features
-            kernel(
-                *_addresses(layer.backward_inputs), *numbers, layer.dz.data_ptr(), *targets, self._scratch.data_ptr()
-            )
+            own = [tensor.data_ptr() for tensor in layer.norm]
+            targets = [grad.data_ptr() for grad in layer.norm_grads] if trained else (None, None, None)
+            here, z, dz, *statistics = layer.backward_addresses
+            numbers = index, count, trained, add, layer.out_features
+            kernel(here, z, *own, *statistics, *numbers, dz, *targets, self._scratch_at)
             if products is not None:
                 if trained:
-                    layer.weight_gradient(products, add)
+                    products.weight_gradient(*layer.factors, add, layer.weight_grad.data_ptr())
                 if layer.below is not None:
-                    layer.input_gradient(products, count, 0, layer.shape.in_features, layer.below)
+                    layer.input_gradient(products, count, 0, layer.in_features, layer.below_at)
                 elif columns is not None:
                     width = columns.stop - columns.start
                     grad = torch.empty(count, width, dtype=layer.dz.dtype)
-                    layer.input_gradient(products, count, columns.start, width, grad)
+                    layer.input_gradient(products, count, columns.start, width, grad.data_ptr())
                 continue
             if trained:
                 layer.weight_gradient_of_torch(add)
@@ -190,9 +188,9 @@ class _MemberSpace:
         count = grad.shape[0]
         if self._head_kernels is not None:
             grad = grad.contiguous()
-            first = _addresses((grad, self._features, weight))
-            targets = _addresses(self._head_grads) if trained else (None, None)
-            scratch = (self._scratch.data_ptr(),) if self._small_head else ()
+            first = grad.data_ptr(), self._features_at, weight.data_ptr()
+            targets = [into.data_ptr() for into in self._head_grads] if trained else (None, None)
+            scratch = (self._scratch_at,) if self._small_head else ()
             self._head_kernels[1](*first, count, *self._head_sizes, trained, add, top.data_ptr(), *targets, *scratch)
             return
         if trained:
@@ -230,34 +228,30 @@ class _LayerSpace:
         flow: int,
     ) -> None:
         rows, n, m = space.rows, shape.in_features, shape.out_features
-        self.low, *norm = own
+        self.low, *self.norm = own
         self.z, out, mean, rstd = buffers
-        self.x, self.shape = x, shape
-        self.forward_inputs = (self.z, *norm, x)
-        self.forward_sizes = (x.stride(0), *shape.skip_columns, shape.eps, rows, m)
-        self.forward_outputs = (out, mean, rstd, space._scratch)
+        self.x, self.shape, self.in_features, self.out_features = x, shape, n, m
+        z_at, x_at, stride = self.z.data_ptr(), x.data_ptr(), x.stride(0)
+        self._skip = shape.skip_columns
+        statistics = mean.data_ptr(), rstd.data_ptr()
+        last = out.data_ptr(), *statistics, space._scratch.data_ptr()
+        self.forward_arguments = (z_at, x_at, stride, *self._skip, shape.eps, rows, m, *last)
         if not space.keep:
             return
         # The gradient alternates between two buffers: the last layer's arrives in the first.
         self.here = _corner(space._flow[flow % 2], rows, m)
         self.below = _corner(space._flow[(flow + 1) % 2], rows, n) if x is not space._input else None
+        self.below_at = 0 if self.below is None else self.below.data_ptr()
         self.dz, self._dw = _corner(space._dz, rows, m), _corner(space._dw, m, n)
-        self.backward_inputs = (self.here, self.z, *norm, mean, rstd)
+        self._here_at, self._dz_at = self.here.data_ptr(), self.dz.data_ptr()
+        self.backward_addresses = (self._here_at, z_at, self._dz_at, *statistics)
         self.norm_grads = (grads[2], grads[3], grads[1]) if grads else ()
-        self._weight_grad = grads[0] if grads else None
-
-    def weight_gradient(self, products: Products, add: bool) -> None:
-        """Gradient of the weight by the kernels."""
-        assert self._weight_grad is not None
-        rows, m = self.dz.shape
-        sizes = self.x.shape[1], self.x.stride(0), rows
-        target = self._weight_grad.data_ptr()
-        products.weight_gradient(self.dz.data_ptr(), m, self.x.data_ptr(), *sizes, add, target)
+        self.weight_grad = grads[0] if grads else self._dw
+        self.factors = (self._dz_at, m, x_at, n, stride, rows)
 
     def weight_gradient_of_torch(self, add: bool) -> None:
         """Gradient of the weight by torch's product."""
-        into = self._weight_grad
-        assert into is not None
+        into = self.weight_grad
         if add:
             into.add_(torch.mm(self.dz.t(), self.x))
         elif into.dtype == self.dz.dtype:
@@ -265,19 +259,14 @@ class _LayerSpace:
         else:
             into.copy_(torch.mm(self.dz.t(), self.x, out=self._dw))
 
-    def input_gradient(self, products: Products, count: int, first: int, width: int, into: Tensor) -> None:
-        """Gradient of `width` columns of the input from column `first`, by the kernels."""
-        n, m = self.shape.in_features, self.shape.out_features
-        start, to, columns = self.shape.skip_columns
+    def input_gradient(self, products: Products, count: int, first: int, width: int, into: int) -> None:
+        """Gradient of `width` columns of the input from column `first`, by the kernels, to the address `into`."""
+        start, *skip = self._skip
         weight = self.low.data_ptr() + first * self.low.itemsize
-        place = self.here.data_ptr(), start - first, to, columns, into.data_ptr()
-        products.dense_backward(self.dz.data_ptr(), count, m, weight, n, width, *place)
+        place = self._here_at, start - first, *skip, into
+        products.dense_backward(self._dz_at, count, self.out_features, weight, self.in_features, width, *place)
 
 
 def _corner(memory: Tensor, rows: int, columns: int) -> Tensor:
     """The beginning of `memory` as a matrix."""
     return memory.view(-1)[: rows * columns].view(rows, columns)
-
-
-def _addresses(tensors: Sequence[Tensor]) -> list[int]:
-    return [tensor.data_ptr() for tensor in tensors]
