@@ -55,7 +55,7 @@ def load_object(thing: Any, state: dict[str, Any]) -> None:
     """
     for name, saved in state.items():
         if name not in vars(thing) and hasattr(type(thing), name):
-            raise UnsavableError(f"{type(thing).__name__}.{name} belongs to its class, which a checkpoint cannot change")
+            raise UnsavableError(f"{type(thing).__name__}.{name} belongs to its class, not to a checkpoint")
         vars(thing)[name] = _unpack(saved, vars(thing).get(name), f"{type(thing).__name__}.{name}")
 
 
