@@ -47,7 +47,7 @@ VARIANTS: dict[str, list[str]] = {
     "uniform": ["replay=uniform"],
     "one_hot": ["sampler=one_hot"],
     "independent": ["sampler=independent"],
-    "clipped": ["learner.max_grad_norm=10"],
+    "unclipped": ["learner.max_grad_norm=null"],
 }
 LABELS = {
     "sac": "categorical SAC",
@@ -58,13 +58,13 @@ LABELS = {
     "uniform": "uniform replay",
     "one_hot": "styles one-hot",
     "independent": "styles independent",
-    "clipped": "gradients clipped at 10",
+    "unclipped": "gradients not clipped",
 }
 PANELS = {
     "loss and its entropy samples": ("sac", "samples_1", "samples_1000"),
     "impersonation and replay": ("impersonation_0", "impersonation_2", "uniform"),
     "training styles": ("one_hot", "independent"),
-    "gradients": ("clipped",),
+    "gradients": ("unclipped",),
 }
 METRICS = {"eval/style_score": "style score", "eval/won": "fights won"}
 EVALUATIONS = 8  # during a training

@@ -54,6 +54,8 @@ def load_object(thing: Any, state: dict[str, Any]) -> None:
         UnsavableError: if it does not fit.
     """
     for name, saved in state.items():
+        if name not in vars(thing) and hasattr(type(thing), name):
+            raise UnsavableError(f"{type(thing).__name__}.{name} belongs to its class, which a checkpoint cannot change")
         vars(thing)[name] = _unpack(saved, vars(thing).get(name), f"{type(thing).__name__}.{name}")
 
 

@@ -214,10 +214,10 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
     config.pop("hydra", None)
     config["run_dir"] = str(Path(config["run_dir"] or _new_run_dir(config["domain"])).expanduser().absolute())
     config = {str(key): value for key, value in config.items()}
-    if not config["resume"]:
+    try:
         return checked_numbers(config)
-    with refusing(config["resume"], "a configuration"):
-        return checked_numbers(config)
+    except (AttributeError, KeyError, TypeError) as error:  # of a saved one: what is composed here has the right kinds
+        raise CheckpointError(f"{config['resume']} holds a configuration of another kind: {error}") from error
 
 
 def announce(config: dict[str, Any], train: Train) -> None:
@@ -225,7 +225,7 @@ def announce(config: dict[str, Any], train: Train) -> None:
     parameters = sum(p.numel() for p in train.learner.loss_module.actor_network_params.parameters())
     bf16 = train.learner.precision == "bf16"
     seconds = estimate_update_seconds(parameters, config["train"]["batch_size"], bf16, pick_device(config["device"]))
-    remaining = config["train"]["total_frames"] - train.frames
+    remaining = max(0, config["train"]["total_frames"] - train.frames)
     updates = remaining * (config["train"]["utd_ratio"] or 0)
     hours = max(updates * seconds, remaining / (config["train"]["throttle"] or float("inf"))) / 3600
     print(f"Found {detect().describe()}: preset {config['preset']}, {train.learner.precision} updates")

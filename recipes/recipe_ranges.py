@@ -116,7 +116,7 @@ def _checked(value: Any, path: tuple[str, ...]) -> Any:
         return {key: _checked(entry, (*path, str(key))) for key, entry in value.items()}
     if isinstance(value, list):
         return [_checked(entry, (*path, "*")) for entry in value]
-    expected = range_of(path)
+    expected = None if path[-1] == "_target_" else range_of(path)
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if not number and expected is None:
         return value

@@ -98,6 +98,11 @@ def test_text_is_not_taken_from_a_checkpoint():
     load_object(Dice(model="/elsewhere/model.xml"), state)
 
 
+def test_methods_are_not_taken_from_a_checkpoint():
+    with pytest.raises(UnsavableError, match=r"Dice\.step belongs to its class"):
+        load_object(Dice(sides=6), {"sides": 4, "step": 5})
+
+
 def test_what_all_copies_share_is_left_out():
     shared = {"space": spaces.Discrete(3), "rule": abs, "kind": int, "library": np}
     assert set(save_object(Dice(steps=1, **shared))) == {"steps"}

@@ -112,5 +112,7 @@ def _report(
     median = f"{times.median():.2f} s" if len(times) else "never"
     text += f"\n## Style switched at random every 100 steps ({switch_episodes} episodes)\n\n"
     text += markdown_table([switching.metrics], dict.fromkeys(switching.metrics, ".3f"))
+    if not switching.switches:
+        return text + "\nThe episodes are too short for a switch.\n"
     text += f"\nComplied before the next switch: {switching.complied:.0%} of {switching.switches} switches; "
     return text + f"median time to comply {median}.\n"

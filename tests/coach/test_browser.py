@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("viser")
+viser = pytest.importorskip("viser")
 sync_api = pytest.importorskip("playwright.sync_api")
 
 from coachable.coach.page import CoachPage  # noqa: E402
@@ -41,8 +41,8 @@ def visit(browser):
         outside.append(route.request.url)
         route.abort()
 
-    def visit(page):
-        context = browser.new_context(viewport={"width": 900, "height": 640})  # small, because drawing is slow
+    def visit(page, width=900):
+        context = browser.new_context(viewport={"width": width, "height": 640})  # small, because drawing is slow
         context.route(lambda url: not url.startswith(("http://127.0.0.1", "data:", "blob:")), stop)
         tab = context.new_page()
         tab.set_default_timeout(1000 * PATIENCE)
@@ -177,3 +177,51 @@ def test_this_machine_only(visit, echo_page):
     listening, connected, here = "0A", "01", "0100007F"  # 127.0.0.1, little endian
     assert [local for state, local, _ in sockets if state == listening] == [here]
     assert {remote for state, _, remote in sockets if state == connected} == {here}
+
+
+CONNECT = """([address, protocol]) => new Promise(done => {
+    const socket = new WebSocket(address, [protocol]);
+    socket.onmessage = () => done("heard");
+    socket.onclose = () => done("refused");
+})"""
+
+
+def test_a_foreign_page_in_the_same_browser_is_refused(visit, browser, echo_page):
+    port = echo_page.server.get_port()
+    arguments = [f"ws://127.0.0.1:{port}", f"viser-v{viser.__version__}"]
+    own = visit(echo_page)
+    assert own.evaluate(CONNECT, arguments) == "heard"
+    context = browser.new_context()
+    page = f'<p>elsewhere</p><iframe src="http://127.0.0.1:{port}"></iframe>'
+    context.route("http://127.0.0.1:1/**", lambda route: route.fulfill(content_type="text/html", body=page))
+    foreign = context.new_page()
+    foreign.goto("http://127.0.0.1:1/")
+    foreign.get_by_text("elsewhere").wait_for()
+    assert foreign.evaluate(CONNECT, arguments) == "refused"
+    assert foreign.evaluate(f"fetch('http://127.0.0.1:{port}/').then(() => 'read', () => 'refused')") == "refused"
+    assert foreign.frames[-1].get_by_text("Pause").count() == 0
+
+
+CHART = """() => Object.values(window.__viserTestpoints?.uplots ?? {}).map(({chart}) => {
+    const {left, top, width, height} = chart.bbox;
+    const pixels = chart.root.querySelector("canvas").getContext("2d").getImageData(left, top, width, height).data;
+    let blue = 0;
+    for (let i = 0; i < pixels.length; i += 4) blue += pixels[i + 3] > 60 && pixels[i + 2] > 120 && pixels[i] < 110;
+    return {from: chart.scales.x.min, to: chart.scales.x.max, blue};
+})"""
+
+
+def test_charts_are_not_blank(visit, echo_page):
+    for _ in range(5):
+        tab = visit(echo_page)
+        wait_for(lambda tab=tab: any(chart["blue"] > 10 for chart in tab.evaluate(CHART)))
+        assert [(chart["from"], chart["to"]) for chart in tab.evaluate(CHART)] == [(-30, 0)]
+        tab.context.close()
+
+
+def test_in_a_narrow_window_the_agent_is_above_the_panel(visit, page):
+    if page.session.domain.name != "humanoid":
+        pytest.skip("pictures are tested without a browser")
+    visit(page, width=400)
+    (client,) = page.server.get_clients().values()
+    wait_for(lambda: client.camera.look_at[2] == pytest.approx(-0.9))

@@ -74,7 +74,7 @@ def test_ctrl_c_ends_it(moment, capsys, monkeypatch):
         monkeypatch.setattr(CoachSession, "open", interrupt)
     else:
         monkeypatch.setattr(command, "wait", interrupt)
-    assert main(["coach", "echo", "--port", "18282"]) == 0
+    assert main(["coach", "humanoid", "--port", "18282"]) == 0
     output = capsys.readouterr()
     assert output.out.endswith("ended\n") and output.err == ""
     if moment == "while it acts":

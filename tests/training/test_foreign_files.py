@@ -1,5 +1,6 @@
 """Files from anybody: nothing in them is executed, nothing outside of them is touched, and damage is one sentence."""
 
+import copy
 import json
 import os
 import pickle
@@ -153,14 +154,18 @@ def _put(config, place, value):
 @pytest.mark.parametrize(
     "wrap", [lambda x: x, lambda x: [x], lambda x: ({"deeper": [x]},)], ids=["plain", "list", "tuple"]
 )
-@pytest.mark.parametrize("place", PLACES)
-def test_no_target_of_a_saved_configuration_is_called(trained, tmp_path, place, wrap):
+def test_no_target_of_a_saved_configuration_is_called(trained, tmp_path, wrap):
     marker = tmp_path / "marker"
+    whole = load_state(find_checkpoint(trained) / "state.pt")["config"]
     for payload in _payloads(tmp_path, marker).values():
-        config = load_state(find_checkpoint(trained) / "state.pt")["config"]
-        _put(config, place, wrap(payload))
-        with pytest.raises(CheckpointError, match=r"^\S+ names '.*' as its .*_target_: expected .* yourself if you"):
-            check_saved_config(config, tmp_path, RECIPE, said=["eval.num_envs", "threads"])
+        for place in PLACES:
+            config = copy.deepcopy(whole)
+            _put(config, place, wrap(payload))
+            with pytest.raises(
+                CheckpointError, match=r"^\S+ names '.*' as its .*_target_: expected .* yourself if you"
+            ):
+                check_saved_config(config, tmp_path, RECIPE, said=["eval.num_envs", "threads"])
+    check_saved_config(whole, tmp_path, RECIPE)
     assert not marker.exists()
 
 
@@ -207,6 +212,13 @@ def test_a_configuration_cannot_choose_the_folder(run):
         if domain is not None and not isinstance(domain, int):
             with pytest.raises(CheckpointError, match="holds no configuration of a training"):
                 _resume(run)
+
+
+def test_groups_of_another_kind_are_refused(run):
+    for group in ("network", "train"):
+        _changed(find_checkpoint(run) / "state.pt", lambda state, g=group: _put(state["config"], g, "text"))
+        with pytest.raises(CheckpointError, match="frames_000000000040 holds a configuration"):
+            _resume(run)
 
 
 def test_what_the_yaml_files_name_is_known_at_its_place_only():
@@ -403,7 +415,7 @@ DAMAGE = {
     ),
 }
 IGNORED = ("checkpoints/LATEST", "metadata.json")  # for people, or replaced by what is there
-PARTS = (*IGNORED, "state.pt", "replay/state.pt", "replay/index.json", "replay/action.npy", "replay/next.done.npy")
+PARTS = (*IGNORED, "state.pt", "replay/state.pt", "replay/index.json", "replay/action.npy")
 
 
 @pytest.fixture(scope="module")

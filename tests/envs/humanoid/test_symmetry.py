@@ -81,7 +81,7 @@ def test_the_generator_is_saved():
 def test_bad_maps_are_refused():
     with pytest.raises(ValueError, match="not each other's mirror image"):
         MirrorMap((1, 2, 0), (1.0, 1.0, 1.0))
-    with pytest.raises(ValueError, match="probability must lie in"):
+    with pytest.raises(ValueError, match="probability of MirrorSymmetry is"):
         MirrorSymmetry({}, probability=2.0)
     with pytest.raises(ValueError, match="has 3 entries, its mirror map 2"):
         MirrorSymmetry({"action": MirrorMap((1, 0), (1.0, 1.0))})(TensorDict({"action": torch.ones(4, 3)}, [4]))
