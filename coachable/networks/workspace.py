@@ -1,8 +1,8 @@
 """The hand-written passes of residual networks on prepared memory, with the kernels of `kernels.c`.
 
-Between two products of matrices that fill the cache, every Python call is a cold one; so all views, buffers and the
-addresses of these buffers, which nobody else has, are prepared once. Addresses of parameters and gradients are taken at
-each call: whoever shares a network with other processes moves them.
+Between two products of matrices that fill the cache, every Python call is a cold one; so all views, addresses and
+buffers that do not change from update to update are made once. A workspace is good for as long as the parameters stay
+where they are; when they have moved, a new plan is made (the learner looks at the beginning of each update).
 """
 
 from __future__ import annotations
@@ -96,29 +96,59 @@ class _MemberSpace:
         member: Member,
         buffers: Sequence[tuple[Tensor, Tensor, Tensor, Tensor]],
     ) -> None:
-        self._space = space
+        self._space, self._layers = space, layers
         self._layer_forward, self._layer_backward = kernels.layer_forward, kernels.layer_backward
         even = all(layer.out_features % 2 == 0 for layer in layers)
         self._own_products = kernels.products if even else None
-        parameters, grads = member.parameters, member.grads
-        self._layers: list[_LayerSpace] = []
-        x, i = space._input, 0
+        # Addresses do not keep tensors alive.
+        self._own, self._low, self._buffers, self._grads = member.parameters, member.products, buffers, member.grads
+        self._forward_steps: list[tuple[Any, ...]] = []
+        self._backward_steps: list[tuple[Any, ...]] = []
+        self._product_steps: list[tuple[Any, ...]] = []
+        x, i, rows = space._input, 0, space.rows
+        scratch = space._scratch.data_ptr()
         for index, layer in enumerate(layers):
-            below = len(layers) - 1 - index
-            own = member.products[i], *parameters[i + 1 : i + 4]
-            self._layers.append(_LayerSpace(space, layer, x, own, grads[i : i + 4], buffers[index], below))
-            x, i = buffers[index][1], i + layer.tensors
-        self._features, self._features_at, self._scratch_at = x, x.data_ptr(), space._scratch.data_ptr()
-        self._head = (parameters[i], parameters[i + 1]) if i < len(parameters) else None
-        self._head_grads = grads[i:]
+            z, out, mean, rstd = buffers[index]
+            bias, gamma, beta = (t.data_ptr() for t in self._own[i + 1 : i + 4])
+            start, to, width = layer.skip_columns
+            statistics = (mean.data_ptr(), rstd.data_ptr())
+            arguments = (z.data_ptr(), bias, gamma, beta, x.data_ptr(), x.stride(0), start, to, width, layer.eps)
+            arguments += (rows, layer.out_features, out.data_ptr(), *statistics, scratch)
+            weight_address = self._low[i].data_ptr()
+            self._forward_steps.append((x, self._low[i].t(), z, layer.in_features, weight_address, arguments))
+            if space.keep:
+                n, m = layer.in_features, layer.out_features
+                # The gradient alternates between two buffers: the last layer's arrives in the first.
+                flow = len(layers) - 1 - index
+                here = space._flow[flow % 2].view(-1)[: rows * m].view(rows, m)
+                below = space._flow[(flow + 1) % 2].view(-1)[: rows * n].view(rows, n) if index else None
+                dz = space._dz.view(-1)[: rows * m].view(rows, m)
+                grads = self._grads[i : i + 4]
+                targets = [g.data_ptr() for g in (grads[2], grads[3], grads[1])] if grads else [None] * 3
+                first = (here.data_ptr(), z.data_ptr(), bias, gamma, beta, *statistics)
+                last = (m, dz.data_ptr(), *targets, scratch)
+                dw = space._dw[: m * n].view(m, n)
+                weight = grads[0] if grads else None
+                self._backward_steps.append((layer, x, here, below, dz, dz.t(), dw, weight, self._low[i], first, last))
+                factors = (dz.data_ptr(), m, x.data_ptr(), n, x.stride(0), rows)
+                target = weight.data_ptr() if weight is not None else None
+                addresses = dz.data_ptr(), weight_address, here.data_ptr(), None if below is None else below.data_ptr()
+                self._product_steps.append((factors, target, addresses, (start, to, width)))
+            x, i = out, i + 4
+        self._features = x
+        self._head = (self._own[i], self._own[i].t(), self._own[i + 1]) if i < len(self._own) else None
+        self._head_grads = self._grads[i:]
         self._head_kernels: tuple[Any, Any] | None = None
         if self._head is None:
             return
-        outputs = self._head[0].shape[0]
-        self._head_sizes = x.shape[1], outputs
-        self._small_head = outputs <= _FEW_OUTPUTS
+        weight, _, bias = self._head
+        self._head_sizes = x.shape[1], weight.shape[0]
+        self._head_addresses = x.data_ptr(), weight.data_ptr(), bias.data_ptr()
+        self._head_targets: list[int | None] = [g.data_ptr() for g in self._head_grads] or [None] * 2
+        self._small_head = weight.shape[0] <= _FEW_OUTPUTS
         if self._small_head:
             self._head_kernels = kernels.head_forward, kernels.head_backward
+            self._head_targets.append(scratch)
             return
         self._hidden = x if x.dtype == torch.float32 else space._arena.empty(*x.shape)  # what torch's head sees
         self._head_gradient = space._arena.empty(*x.shape) if space.keep else x
@@ -128,145 +158,76 @@ class _MemberSpace:
 
     def forward(self, out: Tensor) -> None:
         products = self.products()
-        for layer in self._layers:
-            own, (z, *rest) = [tensor.data_ptr() for tensor in layer.norm], layer.forward_arguments
-            if products is not None:
-                products.dense_forward(layer.in_features, layer.low.data_ptr(), z, *own, *rest)
-            else:
-                torch.mm(layer.x, layer.low.t(), out=layer.z)
-                self._layer_forward(z, *own, *rest)
+        if products is not None:
+            for _, _, _, inner, address, arguments in self._forward_steps:
+                products.dense_forward(inner, address, *arguments)
+        else:
+            for x, weight, z, _, _, arguments in self._forward_steps:
+                torch.mm(x, weight, out=z)
+                self._layer_forward(*arguments)
         if self._head is None:
             out.copy_(self._features)
             return
         if not self._small_head:  # the backward pass follows this choice
             self._head_kernels = products and (products.wide_head_forward, products.wide_head_backward)
-        weight, bias = self._head
         if self._head_kernels is not None:
-            addresses = self._features_at, weight.data_ptr(), bias.data_ptr()
-            self._head_kernels[0](*addresses, self._space.rows, *self._head_sizes, out.data_ptr())
+            self._head_kernels[0](*self._head_addresses, self._space.rows, *self._head_sizes, out.data_ptr())
         else:
             if self._hidden is not self._features:
                 self._hidden.copy_(self._features)
-            torch.addmm(bias, self._hidden, weight.t(), out=out)
+            torch.addmm(self._head[2], self._hidden, self._head[1], out=out)
 
     def backward(self, grad: Tensor, trained: bool, add: bool, rows: Tensor | None, columns: slice | None) -> Tensor:
         if rows is not None:
             grad = grad.index_select(0, rows)
-        count, top = grad.shape[0], self._layers[-1].here
-        if self._head is None:
-            top[:count].copy_(grad)
-        else:
-            self._head_backward(self._head[0], grad, trained, add, top)
-        kernel, products = self._layer_backward, self.products()
-        index = None if rows is None else rows.data_ptr()
-        for layer in reversed(self._layers):
-            own = [tensor.data_ptr() for tensor in layer.norm]
-            targets = [grad.data_ptr() for grad in layer.norm_grads] if trained else (None, None, None)
-            here, z, dz, *statistics = layer.backward_addresses
-            numbers = index, count, trained, add, layer.out_features
-            kernel(here, z, *own, *statistics, *numbers, dz, *targets, self._scratch_at)
-            if products is not None:
-                if trained:
-                    products.weight_gradient(*layer.factors, add, layer.weight_grad.data_ptr())
-                if layer.below is not None:
-                    layer.input_gradient(products, count, 0, layer.in_features, layer.below_at)
-                elif columns is not None:
-                    width = columns.stop - columns.start
-                    grad = torch.empty(count, width, dtype=layer.dz.dtype)
-                    layer.input_gradient(products, count, columns.start, width, grad.data_ptr())
-                continue
-            if trained:
-                layer.weight_gradient_of_torch(add)
-            dz, here, weight = layer.dz[:count], layer.here[:count], layer.low
-            if layer.below is not None:
-                torch.addmm(layer.shape.skip_adjoint(here), dz, weight, out=layer.below[:count])
-            elif columns is not None:
-                return layer.shape.skip_adjoint(here)[:, columns] + torch.mm(dz, weight[:, columns])
-        return grad
-
-    def _head_backward(self, weight: Tensor, grad: Tensor, trained: bool, add: bool, top: Tensor) -> None:
-        count = grad.shape[0]
+        count, top = grad.shape[0], self._backward_steps[-1][2]
         if self._head_kernels is not None:
             grad = grad.contiguous()
-            first = grad.data_ptr(), self._features_at, weight.data_ptr()
-            targets = [into.data_ptr() for into in self._head_grads] if trained else (None, None)
-            scratch = (self._scratch_at,) if self._small_head else ()
-            self._head_kernels[1](*first, count, *self._head_sizes, trained, add, top.data_ptr(), *targets, *scratch)
-            return
-        if trained:
-            into, bias = self._head_grads
-            if add:
-                into.addmm_(grad.t(), self._hidden)
-                bias.add_(grad.sum(0))
-            else:
-                torch.mm(grad.t(), self._hidden, out=into)
-                torch.sum(grad, 0, out=bias)
-        top[:count].copy_(torch.mm(grad, weight, out=self._head_gradient[:count]))
-
-
-class _LayerSpace:
-    """Tensors and sizes that the kernels of one layer take.
-
-    Args:
-        space: Memory that all layers share.
-        shape: The layer.
-        x: Its input.
-        own: Weight in the dtype of the products, bias, and the layer norm's scale and shift.
-        grads: Where the gradients of weight, bias, scale and shift go, or nothing.
-        buffers: Product, output, mean and reciprocal deviation.
-        flow: Number of layers above.
-    """
-
-    def __init__(
-        self,
-        space: Workspace,
-        shape: Layer,
-        x: Tensor,
-        own: Sequence[Tensor],
-        grads: Sequence[Tensor],
-        buffers: tuple[Tensor, Tensor, Tensor, Tensor],
-        flow: int,
-    ) -> None:
-        rows, n, m = space.rows, shape.in_features, shape.out_features
-        self.low, *self.norm = own
-        self.z, out, mean, rstd = buffers
-        self.x, self.shape, self.in_features, self.out_features = x, shape, n, m
-        z_at, x_at, stride = self.z.data_ptr(), x.data_ptr(), x.stride(0)
-        self._skip = shape.skip_columns
-        statistics = mean.data_ptr(), rstd.data_ptr()
-        last = out.data_ptr(), *statistics, space._scratch.data_ptr()
-        self.forward_arguments = (z_at, x_at, stride, *self._skip, shape.eps, rows, m, *last)
-        if not space.keep:
-            return
-        # The gradient alternates between two buffers: the last layer's arrives in the first.
-        self.here = _corner(space._flow[flow % 2], rows, m)
-        self.below = _corner(space._flow[(flow + 1) % 2], rows, n) if x is not space._input else None
-        self.below_at = 0 if self.below is None else self.below.data_ptr()
-        self.dz, self._dw = _corner(space._dz, rows, m), _corner(space._dw, m, n)
-        self._here_at, self._dz_at = self.here.data_ptr(), self.dz.data_ptr()
-        self.backward_addresses = (self._here_at, z_at, self._dz_at, *statistics)
-        self.norm_grads = (grads[2], grads[3], grads[1]) if grads else ()
-        self.weight_grad = grads[0] if grads else self._dw
-        self.factors = (self._dz_at, m, x_at, n, stride, rows)
-
-    def weight_gradient_of_torch(self, add: bool) -> None:
-        """Gradient of the weight by torch's product."""
-        into = self.weight_grad
-        if add:
-            into.add_(torch.mm(self.dz.t(), self.x))
-        elif into.dtype == self.dz.dtype:
-            torch.mm(self.dz.t(), self.x, out=into)
+            arguments = (grad.data_ptr(), *self._head_addresses[:2], count, *self._head_sizes, trained, add)
+            self._head_kernels[1](*arguments, top.data_ptr(), *self._head_targets)
+        elif self._head is not None:
+            if trained:
+                weight, bias = self._head_grads
+                if add:
+                    weight.addmm_(grad.t(), self._hidden)
+                    bias.add_(grad.sum(0))
+                else:
+                    torch.mm(grad.t(), self._hidden, out=weight)
+                    torch.sum(grad, 0, out=bias)
+            top[:count].copy_(torch.mm(grad, self._head[0], out=self._head_gradient[:count]))
         else:
-            into.copy_(torch.mm(self.dz.t(), self.x, out=self._dw))
-
-    def input_gradient(self, products: Products, count: int, first: int, width: int, into: int) -> None:
-        """Gradient of `width` columns of the input from column `first`, by the kernels, to the address `into`."""
-        start, *skip = self._skip
-        weight = self.low.data_ptr() + first * self.low.itemsize
-        place = self._here_at, start - first, *skip, into
-        products.dense_backward(self._dz_at, count, self.out_features, weight, self.in_features, width, *place)
-
-
-def _corner(memory: Tensor, rows: int, columns: int) -> Tensor:
-    """The beginning of `memory` as a matrix."""
-    return memory.view(-1)[: rows * columns].view(rows, columns)
+            top[:count].copy_(grad)
+        kernel, products = self._layer_backward, self.products()
+        address = None if rows is None else rows.data_ptr()
+        for index in reversed(range(len(self._layers))):
+            layer, x, here, below, dz, dz_t, dw, into, weight, first, last = self._backward_steps[index]
+            kernel(*first, address, count, trained, add, *last)
+            if products is not None:
+                factors, target, (dz_at, weight_at, here_at, below_at), (start, *skip) = self._product_steps[index]
+                if trained:
+                    products.weight_gradient(*factors, add, target)
+                n, m = layer.in_features, layer.out_features
+                if index:
+                    products.dense_backward(dz_at, count, m, weight_at, n, n, here_at, start, *skip, below_at)
+                elif columns is not None:
+                    first_column, width = columns.start, columns.stop - columns.start
+                    grad = torch.empty(count, width, dtype=dz.dtype)
+                    factor = weight_at + first_column * dz.itemsize, n, width
+                    place = here_at, start - first_column, *skip, grad.data_ptr()
+                    products.dense_backward(dz_at, count, m, *factor, *place)
+                continue
+            if trained:
+                if add:
+                    into.add_(torch.mm(dz_t, x))
+                elif into.dtype == dz_t.dtype:
+                    torch.mm(dz_t, x, out=into)
+                else:
+                    into.copy_(torch.mm(dz_t, x, out=dw))
+            if rows is not None:
+                dz, here = dz[:count], here[:count]
+            if below is not None:
+                below = below if rows is None else below[:count]
+                torch.addmm(layer.skip_adjoint(here), dz, weight, out=below)
+            elif columns is not None:
+                return layer.skip_adjoint(here)[:, columns] + torch.mm(dz, weight[:, columns])
+        return grad

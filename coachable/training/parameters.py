@@ -34,10 +34,10 @@ def trained_parameters(loss_module: LossModule) -> dict[str, list[str]]:
 
 
 class Watch:
-    """Notices when a loss or its policy has other parameters, or the same ones with other memory or of another dtype.
+    """Notices when a loss or its policy has other parameters, or the same ones elsewhere in memory or of another dtype.
 
-    Memory that moves with everybody who uses it, as in `share_memory_()`, counts as the same. Memory that is exchanged,
-    as in `tensor.data = other`, `.to(dtype)` or `load_state_dict(assign=True)`, does not.
+    Memory may be exchanged, as in `tensor.data = other` or `.to(dtype)`, or move together with everybody who uses it,
+    as in `share_memory_()`.
 
     Args:
         loss_module: The loss.
@@ -46,7 +46,7 @@ class Watch:
     def __init__(self, loss_module: LossModule) -> None:
         self._loss = loss_module
         self._seen: list[tuple[dict[str, Any], str, Any]] = []
-        self._memory: list[tuple[Tensor, Tensor]] = []
+        self._memory: list[tuple[Tensor, Tensor, int]] = []
 
     def look(self) -> None:
         """Take note of the parameters as they are now, and of where modules keep them."""
@@ -55,12 +55,12 @@ class Watch:
         kept = [module._parameters for module in places] + [params._buffers for params in _sets(loss)]
         self._seen = [(owner, name, value) for owner in (loss._modules, *kept) for name, value in owner.items()]
         tensors = {id(value): value for _, _, value in self._seen if isinstance(value, Tensor)}
-        self._memory = [(tensor, tensor.detach()) for tensor in tensors.values()]
+        self._memory = [(tensor, tensor.detach(), tensor.data_ptr()) for tensor in tensors.values()]
 
     def changed(self) -> bool:
         """Whether anything is other than at the last look."""
         return any(owner.get(name) is not value for owner, name, value in self._seen) or not all(
-            tensor.is_set_to(alias) for tensor, alias in self._memory
+            tensor.is_set_to(alias) and tensor.data_ptr() == address for tensor, alias, address in self._memory
         )
 
     def forget_copies(self) -> None:
