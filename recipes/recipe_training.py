@@ -106,6 +106,8 @@ def build_training(
     loss_module = make(config["loss"])(actor, critics, action_spec=probe.action_spec, num_qvalue_nets=len(critics))
     loss_module.make_value_estimator(gamma=config["gamma"])
     loss_module.to(device)
+    probe.close()  # now, not whenever it is collected: TorchRL raises the number of threads when it closes a SerialEnv
+    torch.set_num_threads(threads.learner)
     if config["init_from"]:
         initialise_from(config["init_from"], actor, loss_module, space, config["init_new_observations"])
     learner = make(config["learner"])(loss_module)

@@ -1,5 +1,6 @@
 """Every recipe's training, resumed from its middle, ends like the one that was not interrupted, bit for bit."""
 
+import gc
 import os
 from importlib import import_module
 
@@ -42,3 +43,13 @@ def test_a_resumed_training_takes_as_many_threads(tmp_path):
     threads = read_state(find_checkpoint(tmp_path))["config"]["threads"]["learner"]
     assert threads == torch.get_num_threads()
     assert compose_config("rare_targets", [f"resume={tmp_path}"])["threads"]["learner"] == threads
+
+
+def test_the_number_of_threads_is_the_one_that_was_asked_for(tmp_path, monkeypatch):
+    """TorchRL raises it when a `SerialEnv` is closed, which happens to a forgotten one at any time."""
+    monkeypatch.setattr("torchrl._THREAD_POOL_INIT", 4)
+    train = import_module("cheetah_speed").build(compose_config("cheetah_speed", [*TINY, f"run_dir={tmp_path}"]))
+    gc.collect()
+    assert torch.get_num_threads() == 1
+    train.collector.shutdown()
+    torch.set_num_threads(1)
