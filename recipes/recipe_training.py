@@ -14,7 +14,7 @@ from tensordict import NestedKey
 from coachable.keys import STYLE_FEATURES
 from coachable.replay import EventTableBuffer
 from coachable.styles import StyleReward, StyleSpace
-from coachable.training.checkpoint import CheckpointStore, check_writable
+from coachable.training.checkpoint import CheckpointStore, check_unused, check_writable
 from coachable.training.collection import evaluate_policy
 from coachable.training.episodes import EpisodeSums
 from coachable.training.hardware import pick_device, share_threads
@@ -86,6 +86,8 @@ def build_training(
         replay.append_transform(TaskImpersonation(style_reward, seed=config["seed"], **config["impersonation"]))
     keys = replay_keys(probe, tables=bool(tables))
     run_dir = Path(config["run_dir"])
+    if not config["resume"] or not Path(config["resume"]).resolve().is_relative_to(run_dir.resolve()):
+        check_unused(run_dir)
     check_writable(run_dir)
     if config["checkpoint"]["replay"]:  # two at a time: the old one is removed when the new one is complete
         check_writable(run_dir, required_bytes=2 * replay_bytes(probe, keys, config["replay_capacity"]))

@@ -261,7 +261,7 @@ class ActorCriticLoss(SACLoss):
 
     def _scalar(self, tensordict: TensorDictBase, key: Any, required: bool = True) -> Any:
         """Entry (..., 1) or (...,) as (...,); None if it is missing and not required."""
-        value = tensordict.get(key) if required else tensordict.get(key, None)
+        value = tensordict[key] if required else tensordict.get(key, None)
         if value is None or value.ndim == tensordict.ndim:
             return value
         return value.squeeze(-1)

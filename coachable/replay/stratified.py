@@ -105,8 +105,6 @@ class StratifiedSampler(Sampler):
         beta: float = 0.4,
         eps: float = 1e-8,
     ) -> None:
-        if alpha < 0 or beta < 0 or eps <= 0:
-            raise ValueError(f"priority_alpha is {alpha}, priority_beta {beta}: expected numbers >= 0")
         self.regions = regions
         self.proportions = proportions
         self.minimum = minimum

@@ -32,7 +32,15 @@ from coachable.files import (
 from coachable.replay.files import record_bytes
 from coachable.training.replay_files import write_replay
 
-__all__ = ["CheckpointError", "CheckpointStore", "check_fits", "check_writable", "find_checkpoint", "read_state"]
+__all__ = [
+    "CheckpointError",
+    "CheckpointStore",
+    "check_fits",
+    "check_unused",
+    "check_writable",
+    "find_checkpoint",
+    "read_state",
+]
 
 SCHEMA_VERSION = 1
 _LATEST = "LATEST"
@@ -231,6 +239,22 @@ def check_fits(saved: Mapping[str, Tensor], present: Mapping[str, Tensor], what:
         raise CheckpointError(
             f"the {what} of {source} does not fit this run: {shown}. "
             "Choose the same network settings (network.*), loss and domain, or start without resume and init_from."
+        )
+
+
+def check_unused(directory: Path | str) -> None:
+    """Makes sure before a new training starts that its folder holds no other one.
+
+    Args:
+        directory: folder of the new run.
+
+    Raises:
+        CheckpointError: if it holds checkpoints.
+    """
+    if _complete(Path(directory) / "checkpoints"):
+        raise CheckpointError(
+            f"{directory} holds a run already. Continue it with resume={directory}, or choose another folder with "
+            "run_dir=PATH"
         )
 
 

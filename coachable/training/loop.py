@@ -114,6 +114,7 @@ class Train:
         self._losses = Means()
         self._latest: dict[str, float] = {}
         self._evaluations = 0
+        self._evaluated_frames = -1
         self._filled_from = 0  # env-steps when the replay buffer was empty
         self._logged = self._saved = time.monotonic()
         self._logged_frames = 0
@@ -128,6 +129,8 @@ class Train:
             NonFiniteError: if a number of a transition, loss or gradient is not finite. It is not stored, it changes
                 no weight, and no checkpoint is written after it. Or if a weight was not finite from the start.
         """
+        if self.frames == 0:
+            self.log.rewind(0)  # of a training that was killed here before its first checkpoint
         self.progress.start(self.frames, self.learner.updates)
         batches = iter(self.collector)
         try:
@@ -206,6 +209,7 @@ class Train:
             return
         with self._timed("evaluate"):
             metrics = {f"eval/{name}": value for name, value in self.evaluate().items()}
+        self._evaluated_frames = self.frames
         self._latest |= metrics
         self._write({**self._position(), **metrics})
 
@@ -249,9 +253,11 @@ class Train:
         return path
 
     def _finish(self, *, interrupted: bool) -> None:
-        if not interrupted:
+        # A training that is resumed at its end, or whose last step was one to evaluate at, repeats neither row.
+        if not interrupted and self._evaluated_frames < self.frames:
             self._evaluate()
-        self._log()
+        if self._logged_frames < self.frames:
+            self._log()
         self._checkpoint()
         self.progress.update(self.frames, self.learner.updates, self._latest, force=True)
 
@@ -263,6 +269,7 @@ class Train:
                 "frames": self.frames,
                 "owed": self.owed,
                 "evaluations": self._evaluations,
+                "evaluated_frames": self._evaluated_frames,
                 "filled_from": self._filled_from,
             },
             "collector": collector_state(self.collector),
@@ -302,6 +309,7 @@ class Train:
         self.frames = int(state["loop"]["frames"])
         self.owed = float(state["loop"]["owed"])
         self._evaluations = int(state["loop"]["evaluations"])
+        self._evaluated_frames = int(state["loop"].get("evaluated_frames", -1))
         self._filled_from = int(state["loop"]["filled_from"])
         if replay is not None:
             read_replay(self.replay, replay)

@@ -470,6 +470,12 @@ BAD_OPTIONS = [
 ]
 
 
+def test_the_default_support_is_the_papers() -> None:
+    critics = [make_critic(OBS, 2, PlainSpace(), (8,), num_outputs=255) for _ in range(2)]
+    bins = CatRACLoss(make_mixed_actor(OBS, AXES, PlainSpace(), (8,)), critics).bins
+    assert (bins.v_min, bins.v_max, bins.num_atoms) == (-600.0, 1000.0, 255)  # paper, Cat-RAC
+
+
 @pytest.mark.parametrize(("kind", "options", "message"), BAD_OPTIONS, ids=lambda x: str(x)[:40])
 def test_bad_options(kind: Any, options: dict[str, Any], message: str) -> None:
     critics = [make_critic(OBS, 2, PlainSpace(), (8,)) for _ in range(2)]

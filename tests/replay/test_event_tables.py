@@ -484,6 +484,7 @@ BAD_CONSTRUCTIONS = {
     "both": (dict(events=KeyEvents(["default"]), event_horizon=1), "both routed"),
     "prefetch": (dict(table_capacities={"default": 9}, prefetch=2, batch_size=2), "prefetch"),
     "alpha": (dict(table_capacities={"default": 9}, prioritized=True, priority_alpha=-1.0), "priority_alpha"),
+    "beta": (dict(table_capacities={"default": 9}, prioritized=True, priority_beta=-1.0), "priority_beta is -1.0"),
 }  # fmt: skip
 
 

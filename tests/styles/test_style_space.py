@@ -205,6 +205,7 @@ def test_view_names_the_blocks(space):
         (("pose", "step_length", "gap", "fuel"), [0, 1, 2, 3, 4, 5]),
         (("gap", "fuel"), [4, 5]),
         (("fuel", "pose"), [5, 0, 1, 2]),
+        (("fuel", "gap", "step_length", "pose"), [5, 4, 3, 0, 1, 2]),
     ],
 )
 def test_view_block(space, names, columns):

@@ -54,6 +54,29 @@ def test_n_plus_n_equals_2n_bit_for_bit(make_train, tmp_path):
     assert (stored == again).all()
 
 
+def test_resume_of_a_finished_training_changes_no_row(make_train, tmp_path):
+    """A kill after the last checkpoint is complete leaves such a training behind."""
+    train = make_train(total_frames=80)
+    train.evaluate = lambda: {"return": 1.0}
+    train.run()
+    before = (tmp_path / "run" / "metrics.csv").read_text()
+    assert before.count("\n80,") == 2  # of the evaluation, and of the log
+    again = make_train(total_frames=80)
+    again.evaluate = train.evaluate
+    again.resume(tmp_path / "run")
+    again.run()
+    assert (tmp_path / "run" / "metrics.csv").read_text() == before
+
+
+def test_a_training_killed_before_its_first_checkpoint_leaves_no_row_to_the_next(make_train, tmp_path):
+    train = make_train(total_frames=80, log_interval=0.0)
+    train.run()
+    train.checkpoints.directory.rename(tmp_path / "elsewhere")
+    make_train(total_frames=40).run()
+    with (tmp_path / "run" / "metrics.csv").open() as file:
+        assert [int(row["frames"]) for row in csv.DictReader(file)] == [40]
+
+
 def test_resume_without_simulator_state_restarts_episodes_and_says_so(make_train, tmp_path):
     make_train(total_frames=80, resumable=False).run()
     rest = make_train(total_frames=120, resumable=False)
@@ -212,7 +235,7 @@ def test_evaluation_happens_when_due_and_changes_nothing(make_train, make_echo_e
 
     train.evaluate = evaluate
     metrics = train.run()
-    assert calls == [52, 100, 152, 200, 200]  # multiples of 50 rounded up to rounds of 4, and once at the end
+    assert calls == [52, 100, 152, 200]  # multiples of 50 rounded up to rounds of 4; the end is one of them
     assert metrics["eval/length"] <= 20
     for name, value in _tensors(plain.learner.state_dict()):
         assert torch.equal(value, dict(_tensors(train.learner.state_dict()))[name]), name

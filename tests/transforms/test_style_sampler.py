@@ -198,6 +198,16 @@ def test_hold_clamps_or_raises(make_env, space):
         CoachableEnv(env.base_env, Compose()).hold_style(far)
 
 
+def test_a_sampler_clamps_what_it_holds_unless_it_is_strict(space):
+    far = space.make(length=0.5)
+    far[2] = 2.0
+    sampler = StyleSampler(space)
+    with pytest.warns(StyleRangeWarning, match="length = 2 m"):
+        sampler.hold(far)
+    with pytest.raises(ValueError, match="length = 2 m"):
+        sampler.hold(far, strict=True)
+
+
 def test_holding_does_not_advance_the_stream(make_env, space):
     env, twin = make_env(seed=1), make_env(seed=1)
     env.hold_style(space.default)
