@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -152,14 +153,19 @@ def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
     elif any(o.key_or_group == "resume" and o.value() for o in overrides):
         raise SystemExit("error: a resumed run keeps its preset: leave preset= out, or start anew with init_from=PATH")
     presets = [f"{config_name}/{preset}" for preset in chosen["preset"]]
-    with _configs():
-        firsts = [f"{group}={choices[0]}" for group, choices in chosen.items() if group != "preset"]
-        known = hydra.compose(config_name, [*firsts, f"preset={presets[0]}"])
+    firsts = [f"{group}={choices[0]}" for group, choices in chosen.items() if group != "preset"]
+    known = _composed(config_name, *firsts, f"preset={presets[0]}")
     for override in overrides:
         if override.key_or_group not in groups and not override.key_or_group.startswith("hydra"):
             _check(override, known)
     # Hydra's parser takes overrides in one piece only, not before and after its options.
     return [*options, *(a for a in given if not a.startswith("preset=")), f"preset={','.join(presets)}"]
+
+
+@cache
+def _composed(config_name: str, *choices: str) -> DictConfig:
+    with _configs():
+        return hydra.compose(config_name, list(choices))
 
 
 def build_checked(build: Callable[[dict[str, Any]], Train], config: dict[str, Any]) -> Train:

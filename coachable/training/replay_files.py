@@ -46,11 +46,10 @@ def read_replay(replay: ReplayBuffer, folder: Path) -> int:
     """
     storage: Any = replay.storage  # typed too narrowly in TorchRL: it takes slices and tensors
     filled = read_records(storage, folder)
-    if filled:
-        state = load_state(folder / "state.pt")
-        with refusing(folder / "state.pt", "the state of a replay buffer"):
-            # The records are in place already: the storage gets its own state.
-            replay.load_state_dict({**state, "_storage": storage.state_dict()})
+    state = load_state(folder / "state.pt")  # of a buffer without records, too: it may hold steps back
+    with refusing(folder / "state.pt", "the state of a replay buffer"):
+        # The records are in place already: the storage gets its own state.
+        replay.load_state_dict({**state, "_storage": storage.state_dict()})
     return filled
 
 

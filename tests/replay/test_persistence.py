@@ -150,7 +150,22 @@ def test_a_loaded_buffer_shares_no_memory_with_what_it_was_loaded_from(tmp_path)
     assert_same(again, saved)
 
 
-@pytest.mark.parametrize("way", [by_state_dict, by_dumps])
+@pytest.mark.parametrize("way", [by_state_dict, by_dumps, by_replay_files])
+def test_a_buffer_whose_steps_are_all_held_back_round_trips(way, tmp_path):
+    """Before the first return over `n_steps` is complete, the writer has steps and the storage has no record."""
+    saved, fresh = make(n_steps=4), make(n_steps=4)
+    first = batch(0, time=2)
+    first["next", "done"].zero_(), first["next", "terminated"].zero_()
+    saved.extend(first)
+    assert len(saved) == 0
+    way(saved, fresh, tmp_path)
+    for buffer in (saved, fresh):
+        buffer.extend(batch(1, time=6))
+    assert len(saved) > 0
+    assert_same(saved, fresh)
+
+
+@pytest.mark.parametrize("way", [by_state_dict, by_dumps, by_replay_files])
 def test_an_empty_buffer_round_trips(way, tmp_path):
     saved, fresh = make(n_steps=3, relabel=True), make(n_steps=3, relabel=True)
     way(saved, fresh, tmp_path)

@@ -125,7 +125,7 @@ def test_features_by_index_name_and_path():
     assert scalar_feature(nested, ("gait", "length"), like=torch.zeros(2)).shape == (2,)
     assert feature(nested, ("gait", "arms", 2)).tolist() == [2, 5]
     assert feature(nested, ("speed", 0)).shape == (2,)
-    with pytest.raises(KeyError, match=r"no style feature named sped: the environment emits gait\.arms, gait\.length, speed\."):
+    with pytest.raises(KeyError, match=r"no style feature named sped: .* emits gait\.arms, gait\.length, speed\."):
         feature(nested, "sped")
     with pytest.raises(KeyError, match="one tensor of 3 columns"):
         feature(tensor, "speed")

@@ -401,6 +401,12 @@ def test_flipped_bytes_never_pass_silently(shipped, tmp_path):
     assert refused > 75
 
 
+def _flipped(content):
+    damaged = np.frombuffer(content, np.uint8).copy()
+    damaged[50::97] ^= 0x41
+    return damaged.tobytes()
+
+
 DAMAGE = {
     "cut in half": lambda file: os.truncate(file, file.stat().st_size // 2),
     "cut at the end": lambda file: os.truncate(file, file.stat().st_size - 1),
@@ -410,9 +416,7 @@ DAMAGE = {
     "list": lambda file: file.write_text("[1, 2]"),
     "null": lambda file: file.write_text("null"),
     "noise": lambda file: file.write_bytes(random.Random(1).randbytes(500)),
-    "flipped": lambda file: file.write_bytes(
-        bytes(b ^ 0x41 if i % 97 == 50 else b for i, b in enumerate(file.read_bytes()))
-    ),
+    "flipped": lambda file: file.write_bytes(_flipped(file.read_bytes())),
 }
 IGNORED = ("checkpoints/LATEST", "metadata.json")  # for people, or replaced by what is there
 PARTS = (*IGNORED, "state.pt", "replay/state.pt", "replay/index.json", "replay/action.npy")
