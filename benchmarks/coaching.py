@@ -57,9 +57,9 @@ def open_page(source: str) -> None:
 
 def act(source: str, seconds: float) -> None:
     """Control steps per second and the delay of slider changes, while a browser shows the page and moves a slider."""
-    from coachable.coach.page import CoachPage
-    from coachable.coach.server import make_server
-    from coachable.coach.session import CoachSession
+    from coachable.coach.page.page import CoachPage
+    from coachable.coach.page.server import make_server
+    from coachable.coach.session.session import CoachSession
 
     page = CoachPage(make_server(port=18380), CoachSession.open(source))
     delays: list[int] = []
@@ -109,7 +109,7 @@ def call_export(source: str) -> None:
     import numpy as np
     import onnxruntime
 
-    from coachable.coach.export import export
+    from coachable.export.onnx import export
 
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "policy.onnx"

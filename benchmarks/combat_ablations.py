@@ -27,9 +27,9 @@ from combat_cat_rac import build
 from recipe_config import compose_config
 
 from coachable.domain import load_domain
-from coachable.envs.combat.styles import single_styles
+from coachable.domains.combat.fights import damage_rows, fight_matrix, style_label
+from coachable.domains.combat.styles import single_styles
 from coachable.evaluation.curves import read_metric, summarise_runs
-from coachable.evaluation.fights import damage_rows, fight_matrix, style_label
 from coachable.evaluation.statistics import bootstrap_interval
 from coachable.evaluation.style_grid import write_csv
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state

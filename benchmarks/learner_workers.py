@@ -140,11 +140,11 @@ def gamepad(entropy_samples):
     """Cat-RAC on the gamepad of the combat domain: six heads of buttons, four Gaussian axes."""
     import torch
 
+    from coachable.envs.combat.gamepad import GAMEPAD
     from coachable.losses import CatRACLoss
     from coachable.networks.hl_gauss_critic import make_hl_gauss_critic
     from coachable.networks.mixed import make_mixed_actor
     from coachable.training import Learner
-    from coachable.transforms.gamepad import GAMEPAD
 
     torch.manual_seed(0)
     widths = [WIDTH] * LAYERS

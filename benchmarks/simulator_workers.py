@@ -36,7 +36,8 @@ def coachable_env_steps(threads):
     """Ours: observation, task reward, style features, style sampler, style reward, episode sums, TensorDict."""
     import torch
 
-    from coachable.envs.humanoid import HumanoidEnv, humanoid_style_reward, humanoid_style_space
+    from coachable.domains.humanoid import humanoid_style_reward, humanoid_style_space
+    from coachable.envs.humanoid import HumanoidEnv
     from coachable.training.episodes import EpisodeSums
     from coachable.transforms import coachable_env
 

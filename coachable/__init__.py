@@ -12,7 +12,7 @@ from coachable.gl import choose_gl_backend
 choose_gl_backend()  # MuJoCo, which TorchRL imports, reads the choice once, when it is imported
 
 if TYPE_CHECKING:
-    from coachable.coach.session import CoachSession
+    from coachable.coach.session.session import CoachSession
     from coachable.replay import EventTableBuffer
     from coachable.styles import Choice, Setpoint, StyleReward, StyleSpace, Weight
     from coachable.transforms import CoachableEnv, StyleRewardTransform, StyleSampler, TaskImpersonation, coachable_env
@@ -27,7 +27,7 @@ _MODULE_OF = {
     "StyleReward": "coachable.styles",
     "StyleSpace": "coachable.styles",
     "Weight": "coachable.styles",
-    "CoachSession": "coachable.coach.session",
+    "CoachSession": "coachable.coach.session.session",
     "CoachableEnv": "coachable.transforms",
     "StyleRewardTransform": "coachable.transforms",
     "StyleSampler": "coachable.transforms",

@@ -140,7 +140,7 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--out", type=Path, default=Path("policy.onnx"), help="(default: %(default)s)")
     export.set_defaults(run=_export)
 
-    from coachable.coach.command import add_parser
+    from coachable.coach.page.command import add_parser
 
     add_parser(commands, _SOURCE_HELP, _coach)
 
@@ -205,7 +205,7 @@ def _explain(options: argparse.Namespace) -> int:
 
 
 def _export(options: argparse.Namespace) -> int:
-    from coachable.coach.export import export
+    from coachable.export.onnx import export
 
     difference = export(options.source, options.out)
     print(f"wrote {options.out} ({options.out.stat().st_size / 1e6:.1f} MB), at most {difference:.1g} from torch")
@@ -214,7 +214,7 @@ def _export(options: argparse.Namespace) -> int:
 
 def _coach(options: argparse.Namespace) -> int:
     _require_agent(options.source)  # before the page's address is announced
-    from coachable.coach.command import serve
+    from coachable.coach.page.command import serve
 
     serve(say=lambda text: print(text, flush=True), **_arguments(options))
     return 0

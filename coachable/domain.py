@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import import_module
+from importlib.metadata import entry_points
 from itertools import product
 from typing import Any, Protocol
 
@@ -15,14 +15,7 @@ from torchrl.envs import EnvBase
 
 from coachable.styles import StyleReward, StyleSpace
 
-# Where each built-in domain is declared; imported only when asked for.
-_DECLARATIONS = {
-    "combat": "coachable.envs.combat.domain",
-    "humanoid": "coachable.envs.humanoid.domain",
-    "racing_aggressiveness": "coachable.envs.racing.domains.aggressiveness",
-    "racing_drift": "coachable.envs.racing.domains.drift",
-    "racing_resources": "coachable.envs.racing.domains.resources",
-}
+_GROUP = "coachable.domains"  # entry points: name = "package.module:DOMAIN"
 
 
 class StyleMeasures(Protocol):
@@ -79,6 +72,8 @@ class Domain:
         make_reward: `(space, **scales) -> StyleReward`.
         measures: measured style.
         make_renderer: `(width, height) -> Renderer`.
+        make_scene: `(server, session) -> coachable.coach.page.views.View`, which draws the live page in 3-D; None
+            shows the renderer's pictures.
         grid: values of each style parameter, whose combinations make up the evaluation grid; or its styles one by one,
             by parameter name, where the combinations are too many.
         control_step: duration of one env step [s].
@@ -108,6 +103,7 @@ class Domain:
     as_trained: Callable[[Mapping[str, Any]], Domain] | None = None
     coached: Mapping[str, Any] = field(default_factory=dict)
     evaluation: Callable[..., str] | None = None
+    make_scene: Callable[..., Any] | None = None
 
     def cells(self) -> list[dict[str, Any]]:
         """The styles of the evaluation grid, by parameter name."""
@@ -116,36 +112,30 @@ class Domain:
         return [dict(cell) for cell in self.grid]
 
 
-def deferred(path: str) -> Callable[..., str]:
-    """A function looked up when it is called: evaluation knows domains, domains may only name their evaluation.
-
-    Args:
-        path: module and name, "package.module.function".
-    """
-    module, name = path.rsplit(".", 1)
-
-    def call(*arguments: Any, **settings: Any) -> str:
-        return getattr(import_module(module), name)(*arguments, **settings)
-
-    return call
-
-
 def domain_names() -> list[str]:
-    """The built-in domains."""
-    return sorted(_DECLARATIONS)
+    """List the domains that installed packages register, this one among them."""
+    return sorted({entry.name for entry in entry_points(group=_GROUP)})
 
 
 def load_domain(name: str, config: Mapping[str, Any] | None = None) -> Domain:
-    """The declaration of a built-in domain.
+    """Return the declaration of a registered domain.
+
+    A package registers a domain by an entry point of the group `coachable.domains`, which names its `Domain`:
+    `[project.entry-points."coachable.domains"]` in pyproject.toml, `pendulum = "my_package.domain:DOMAIN"` below it.
 
     Args:
         name: of the domain.
         config: of a training; the domain is as it was there.
 
     Raises:
-        ValueError: if there is no such domain; lists those that exist.
+        ValueError: if no installed package registers such a domain; lists those that exist.
+        TypeError: if a package registers something that is not a `Domain`.
     """
-    if name not in _DECLARATIONS:
-        raise ValueError(f"unknown domain {name!r}: expected one of {domain_names()}")
-    domain: Domain = import_module(_DECLARATIONS[name]).DOMAIN
-    return domain if config is None or domain.as_trained is None else domain.as_trained(config.get("env", {}))
+    for entry in entry_points(group=_GROUP, name=name):
+        domain = entry.load()
+        if not isinstance(domain, Domain):
+            raise TypeError(f"the entry point {name} = {entry.value!r} is a {type(domain).__name__}: expected a Domain")
+        return domain if config is None or domain.as_trained is None else domain.as_trained(config.get("env", {}))
+    names = domain_names()
+    expected = f"expected one of {names}" if names else "no package registers any; install this one anew with pip"
+    raise ValueError(f"unknown domain {name!r}: {expected}")

@@ -15,7 +15,7 @@ from typing import Any
 from recipe_config import run_recipe
 from recipe_training import build_training
 
-from coachable.envs.combat import combat_style_reward, combat_style_space
+from coachable.domains.combat import combat_style_reward, combat_style_space
 from coachable.training.loop import Train
 
 

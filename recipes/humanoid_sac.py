@@ -14,8 +14,8 @@ from typing import Any
 from recipe_config import run_recipe
 from recipe_training import build_training
 
-from coachable.envs.humanoid import humanoid_style_reward, humanoid_style_space
-from coachable.envs.humanoid.symmetry import humanoid_mirror_maps
+from coachable.domains.humanoid import humanoid_style_reward, humanoid_style_space
+from coachable.domains.humanoid.mirror_maps import humanoid_mirror_maps
 from coachable.training.loop import Train
 
 

@@ -18,7 +18,7 @@ from typing import Any
 from recipe_config import run_recipe
 from recipe_training import build_training
 
-from coachable.envs.racing.families import family_style
+from coachable.domains.racing.families import family_style
 from coachable.training.loop import Train
 
 

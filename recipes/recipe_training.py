@@ -13,6 +13,7 @@ from tensordict import NestedKey
 
 from coachable.keys import STYLE_FEATURES
 from coachable.replay import EventTableBuffer
+from coachable.replay.replay_files import replay_bytes
 from coachable.styles import StyleReward, StyleSpace
 from coachable.training.checkpoint import CheckpointStore, check_unused, check_writable
 from coachable.training.collection import evaluate_policy
@@ -20,7 +21,6 @@ from coachable.training.episodes import EpisodeSums
 from coachable.training.hardware import pick_device, share_threads
 from coachable.training.logging import MetricsLog, Progress, wandb_logger
 from coachable.training.loop import Train, replay_keys
-from coachable.training.replay_files import replay_bytes
 from coachable.training.rng import seed_everything
 from coachable.training.weights import agent_state, initialise_from
 from coachable.transforms import CoachableEnv, MirrorMap, MirrorSymmetry, TaskImpersonation, coachable_env

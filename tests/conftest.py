@@ -13,7 +13,7 @@ import pytest
 if os.environ.get("COACHABLE_SANITIZE") == "1":  # see CONTRIBUTING.md
     import torch
 
-    from coachable.networks import memory, native
+    from coachable.fast import memory, native
 
     native._FLAGS += ("-fsanitize=address,undefined", "-fno-sanitize-recover=undefined", "-g")
     # Each tensor's memory of its own, so that what lies beyond its end is known to be nobody's.

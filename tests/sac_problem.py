@@ -4,9 +4,9 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives import SACLoss
 
+from coachable.distributions.action_heads import ActionHeads
 from coachable.losses import CatRACLoss, QRSACLoss
 from coachable.networks import make_critic, make_gaussian_actor
-from coachable.networks.action_heads import ActionHeads
 from coachable.networks.hl_gauss_critic import make_hl_gauss_critic
 from coachable.networks.mixed import make_mixed_actor
 

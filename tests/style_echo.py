@@ -8,8 +8,8 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from coachable.distributions.action_heads import ActionHeads
 from coachable.keys import STYLE_FEATURES, TASK_REWARD
-from coachable.networks.action_heads import ActionHeads
 from coachable.styles import Setpoint, StyleReward, StyleSpace, Term
 from coachable.transforms import CoachableEnv, coachable_env
 

@@ -77,7 +77,7 @@ def test_no_page_is_announced_for_what_is_no_agent(source, capsys, monkeypatch, 
     def announced(*_, **__):
         raise AssertionError("the page was announced")
 
-    monkeypatch.setattr("coachable.coach.command.serve", announced)
+    monkeypatch.setattr("coachable.coach.page.command.serve", announced)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "README.md").write_text("# Not an agent\n")
     assert main(["coach", source]) == 2
@@ -89,7 +89,7 @@ def test_no_page_is_announced_for_what_is_no_agent(source, capsys, monkeypatch, 
 @pytest.mark.parametrize("source", ["humanoid", "."])
 def test_the_page_is_opened_for_an_agent(source, monkeypatch, tmp_path):
     opened = []
-    monkeypatch.setattr("coachable.coach.command.serve", lambda **settings: opened.append(settings["source"]))
+    monkeypatch.setattr("coachable.coach.page.command.serve", lambda **settings: opened.append(settings["source"]))
     monkeypatch.chdir(tmp_path)
     assert main(["coach", source]) == 0
     assert opened == [source]

@@ -13,11 +13,11 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from coachable.distributions.action_heads import ActionHeads
 from coachable.finite import require_finite_action
 from coachable.gym.actions import action_components, native_action
 from coachable.gym.features import Features, checked_features, flat_observation
 from coachable.keys import STYLE_FEATURES, TASK_REWARD
-from coachable.networks.action_heads import ActionHeads
 from coachable.third_party import load_object, save_object
 
 __all__ = ["GymnasiumEnv"]

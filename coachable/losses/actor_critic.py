@@ -14,10 +14,10 @@ from torch import Tensor, nn
 from torchrl.data import TensorSpec
 from torchrl.objectives import SACLoss, ValueEstimators
 
+from coachable.distributions.mixed_action import MixedAction
+from coachable.distributions.tanh_gaussian import at_least_float32
 from coachable.losses.functional import bootstrap_target
 from coachable.losses.policy import PolicyReader
-from coachable.networks.mixed_action import MixedAction
-from coachable.networks.tanh_gaussian import at_least_float32
 from coachable.ranges import POSITIVE, SHARE
 
 Reduction = Literal["none", "mean", "sum"]

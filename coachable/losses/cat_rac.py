@@ -8,8 +8,8 @@ from typing import Any
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
 
+from coachable.distributions.hl_gauss import HLGauss, Support
 from coachable.losses.rac import RACLoss
-from coachable.networks.hl_gauss import HLGauss, Support
 
 
 class CatRACLoss(RACLoss):

@@ -10,8 +10,8 @@ from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDict
 from torchrl.data import TensorSpec
 from torchrl.modules import TanhNormal
 
-from coachable.networks.action_heads import ActionHeads, MixedActionSpec
-from coachable.networks.mixed_action import MixedAction
+from coachable.distributions.action_heads import ActionHeads, MixedActionSpec
+from coachable.distributions.mixed_action import MixedAction
 
 
 class PolicyReader:

@@ -8,9 +8,9 @@ from typing import Any
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
 
+from coachable.distributions.mixed_action import MixedAction
+from coachable.distributions.tanh_gaussian import at_least_float32
 from coachable.losses.actor_critic import ActorCriticLoss
-from coachable.networks.mixed_action import MixedAction
-from coachable.networks.tanh_gaussian import at_least_float32
 from coachable.ranges import COUNT
 
 

@@ -8,8 +8,8 @@ from typing import Any
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
 
+from coachable.distributions.mixed_action import MixedAction
 from coachable.losses.cat_rac import CatRACLoss
-from coachable.networks.mixed_action import MixedAction
 
 
 class CategoricalSACLoss(CatRACLoss):

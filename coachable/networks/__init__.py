@@ -1,6 +1,6 @@
 """Networks: padded residual trunks, style-conditioned actors and critics."""
 
-from coachable.networks.action_heads import ActionHeads
+from coachable.distributions.action_heads import ActionHeads
 from coachable.networks.actors import make_gaussian_actor
 from coachable.networks.critics import make_critic
 from coachable.networks.hl_gauss_critic import make_hl_gauss_critic

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 from torchrl.data import Bounded
 from torchrl.modules import ProbabilisticActor
 
+from coachable.distributions.tanh_normal import TanhGaussian
 from coachable.keys import STYLE
 from coachable.networks.residual import ResidualMLP
-from coachable.networks.tanh_normal import TanhGaussian
 
 
 class StyleEncoding(Protocol):

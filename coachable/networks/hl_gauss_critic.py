@@ -7,9 +7,9 @@ from typing import Any
 
 from torchrl.modules import ValueOperator
 
+from coachable.distributions.hl_gauss import HLGauss, Support, initialise_value
 from coachable.networks.actors import StyleEncoding
 from coachable.networks.critics import make_critic
-from coachable.networks.hl_gauss import HLGauss, Support, initialise_value
 
 
 def make_hl_gauss_critic(

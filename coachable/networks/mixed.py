@@ -11,13 +11,13 @@ from torch import Tensor, nn
 from torchrl.data import TensorSpec
 from torchrl.modules import ProbabilisticActor
 
+from coachable.distributions.action_heads import ActionHeads
+from coachable.distributions.categorical import RegretGradient, regret_matching_probabilities
+from coachable.distributions.mixed_action import MixedAction
+from coachable.distributions.tanh_gaussian import at_least_float32
 from coachable.keys import STYLE
-from coachable.networks.action_heads import ActionHeads
 from coachable.networks.actors import StyleEncoding
-from coachable.networks.categorical import RegretGradient, regret_matching_probabilities
-from coachable.networks.mixed_action import MixedAction
 from coachable.networks.residual import ResidualMLP
-from coachable.networks.tanh_gaussian import at_least_float32
 
 MeanBound = Literal["post_tanh", "location"]
 

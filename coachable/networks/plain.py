@@ -8,8 +8,8 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
+from coachable.distributions.categorical import EPSILON
 from coachable.networks.actors import GaussianPolicy
-from coachable.networks.categorical import EPSILON
 from coachable.networks.mixed import MixedPolicy
 
 __all__ = ["ActionOutputs", "DeterministicAction", "policy_network"]

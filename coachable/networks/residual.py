@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from coachable.networks.fused import Layer, Plan, residual_network
+from coachable.fast.fused import Layer, Plan, residual_network
 
 Side = Literal["end", "beginning"]
 Padding = Literal["alternate", "end", "beginning"]
@@ -170,7 +170,7 @@ class ResidualMLP(nn.Module):
             return self.head(hidden.to(self.head.weight.dtype))
 
     def layers(self) -> tuple[Layer, ...]:
-        """Shapes of the layers, for :mod:`coachable.networks.fused`."""
+        """Shapes of the layers, for :mod:`coachable.fast.fused`."""
         return tuple(
             Layer(
                 in_features=block.linear.in_features,

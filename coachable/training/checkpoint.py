@@ -30,7 +30,7 @@ from coachable.files import (
     write_text,
 )
 from coachable.replay.files import record_bytes
-from coachable.training.replay_files import write_replay
+from coachable.replay.replay_files import write_replay
 
 __all__ = [
     "CheckpointError",

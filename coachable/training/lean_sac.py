@@ -12,8 +12,8 @@ from torchrl.objectives import LossModule, SACLoss
 from torchrl.objectives.utils import distance_loss
 from torchrl.objectives.value import TD0Estimator
 
-from coachable.networks.tanh_normal import TanhGaussian
-from coachable.training.acceleration import Acceleration
+from coachable.distributions.tanh_normal import TanhGaussian
+from coachable.fast.accelerate import Acceleration
 
 
 class LeanSAC:

@@ -16,10 +16,10 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import LossModule, SoftUpdate
 
+from coachable.fast.accelerate import Acceleration
+from coachable.fast.flat_adam import FlatAdam, place_moments
 from coachable.finite import NonFiniteError
 from coachable.ranges import AMOUNT, NOT_NEGATIVE, POSITIVE, SHARE, Range
-from coachable.training.acceleration import Acceleration
-from coachable.training.adam import FlatAdam, place_moments
 from coachable.training.lean_sac import LeanSAC
 from coachable.training.parameters import Watch, adopt_actor, follow, loaded, share_actor, trained_parameters
 from coachable.training.precision import Precision, resolve_precision
@@ -69,7 +69,7 @@ class Learner:
         update_order: See above.
         precision: `"bf16"` multiplies in bfloat16 with float32 master weights, layer-norm statistics, heads, targets
             and losses; `"auto"` takes it where the device has it in hardware.
-        fused: Evaluate residual networks through their hand-written passes (`coachable.networks.fused`) where possible:
+        fused: Evaluate residual networks through their hand-written passes (`coachable.fast.fused`) where possible:
             on a CPU, when policy and critics consist of nothing else. The numbers are the same, the update is faster.
         compile: Compile the loss functions with `torch.compile` where `fused` does not apply (on a GPU, or with
             networks of other kinds). On a CPU that takes a C++ compiler; without one the log says that it was left.

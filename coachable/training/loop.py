@@ -18,12 +18,12 @@ from coachable.files import refusing
 from coachable.finite import NonFiniteError, require_finite
 from coachable.keys import EVENTS, STYLE, STYLE_FEATURES, TASK_REWARD
 from coachable.replay import EventTableBuffer
+from coachable.replay.replay_files import read_replay
 from coachable.training.checkpoint import CheckpointStore, find_checkpoint, read_state
 from coachable.training.collection import collector_state, load_collector_state, simulation_env
 from coachable.training.episodes import EpisodeStatistics, Means
 from coachable.training.learner import Learner
 from coachable.training.logging import MetricsLog, Progress
-from coachable.training.replay_files import read_replay
 from coachable.training.rng import rng_state, set_rng_state
 from coachable.training.settings import TrainSettings
 from coachable.training.simulators import UnsavableError

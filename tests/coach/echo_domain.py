@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
-from coachable.coach.session import CoachSession
+from coachable.coach.session.session import CoachSession
 from coachable.domain import Domain
 from coachable.keys import STYLE, STYLE_FEATURES
 from coachable.styles import Choice, Setpoint, StyleReward, StyleSpace, Term, Weight

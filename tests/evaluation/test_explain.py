@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from coachable.cli import main
+from coachable.distributions.action_heads import ActionHeads
 from coachable.domain import load_domain
 from coachable.evaluation.attribution import Group, input_groups, rank_groups
 from coachable.evaluation.explain import explain, record_states
 from coachable.networks import make_gaussian_actor
-from coachable.networks.action_heads import ActionHeads
 from coachable.networks.mixed import make_mixed_actor
 from coachable.networks.plain import ActionOutputs
 from coachable.styles import Choice, Setpoint, StyleSpace

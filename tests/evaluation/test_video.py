@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from coachable.domain import load_domain
-from coachable.envs.humanoid import humanoid_style_space
+from coachable.domains.humanoid import humanoid_style_space
 from coachable.evaluation import video
 from coachable.evaluation.video import asked_line, default_tour, render, write_video
 from coachable.styles import StyleRangeWarning, StyleSpace, Weight

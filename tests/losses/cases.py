@@ -11,12 +11,12 @@ from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import LossModule, SACLoss
 
+from coachable.distributions.action_heads import ActionHeads
+from coachable.distributions.mixed_action import MixedAction
 from coachable.losses import CategoricalSACLoss, CatRACLoss, QRSACLoss, RACLoss
 from coachable.networks import make_critic
-from coachable.networks.action_heads import ActionHeads
 from coachable.networks.hl_gauss_critic import make_hl_gauss_critic
 from coachable.networks.mixed import make_mixed_actor
-from coachable.networks.mixed_action import MixedAction
 
 OBS, THETA = 5, 2
 AXES = ActionHeads(axes=2)

@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tensordict.nn import TensorDictModule
 
-from coachable.networks.categorical import regret_matching_probabilities
+from coachable.distributions.categorical import regret_matching_probabilities
 from tests.losses.cases import HEADS, OURS, Case, ConstantCritic, constant_actor, gradients, make_batch
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")

@@ -11,9 +11,9 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 from torchrl.objectives import LossModule, SACLoss
 
+from coachable.distributions.action_heads import ActionHeads
 from coachable.losses import CategoricalSACLoss, CatRACLoss, QRSACLoss, RACLoss
 from coachable.networks import make_critic
-from coachable.networks.action_heads import ActionHeads
 from coachable.networks.hl_gauss_critic import make_hl_gauss_critic
 from coachable.networks.mixed import make_mixed_actor
 from coachable.training import Learner

@@ -13,8 +13,8 @@ from torch import nn
 from torchrl.data import Bounded, OneHot, Unbounded
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
+from coachable.distributions.action_heads import ActionHeads, MixedActionSpec
 from coachable.losses.policy import PolicyReader
-from coachable.networks.action_heads import ActionHeads, MixedActionSpec
 from coachable.networks.mixed import make_mixed_actor
 
 

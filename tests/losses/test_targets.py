@@ -8,10 +8,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from coachable.distributions.action_heads import ActionHeads
+from coachable.distributions.categorical import regret_matching_probabilities
+from coachable.distributions.mixed_action import MixedAction
 from coachable.losses import CategoricalSACLoss, CatRACLoss, QRSACLoss
-from coachable.networks.action_heads import ActionHeads
-from coachable.networks.categorical import regret_matching_probabilities
-from coachable.networks.mixed_action import MixedAction
 from tests.losses.cases import AXES, HEADS, OURS, Case, constant_loss, make_batch
 
 F64 = torch.float64

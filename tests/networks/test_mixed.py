@@ -8,9 +8,9 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Composite
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from coachable.networks.action_heads import ActionHeads, MixedActionSpec
+from coachable.distributions.action_heads import ActionHeads, MixedActionSpec
+from coachable.distributions.mixed_action import MixedAction
 from coachable.networks.mixed import MixedPolicy, make_mixed_actor
-from coachable.networks.mixed_action import MixedAction
 
 F64 = torch.float64
 GAMEPAD = ActionHeads(categorical=(4, 6, 3, 3, 2, 2), axes=4)

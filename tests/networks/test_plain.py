@@ -6,8 +6,8 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from coachable.distributions.action_heads import ActionHeads
 from coachable.networks import make_gaussian_actor
-from coachable.networks.action_heads import ActionHeads
 from coachable.networks.mixed import make_mixed_actor
 from coachable.networks.plain import ActionOutputs, DeterministicAction, policy_network
 from coachable.styles import StyleSpace, Weight

@@ -10,7 +10,7 @@ import torch
 from recipe_config import compose_config, config_groups, run_recipe
 from tensordict import TensorDict
 
-from coachable.envs.racing.families import racing_family
+from coachable.domains.racing.families import racing_family
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
 from coachable.training.loop import REPLAY_KEYS
 

@@ -12,7 +12,8 @@ import pytest
 import torch
 from recipe_config import checked_arguments, compose_config
 
-from coachable.envs.humanoid import HumanoidEnv, humanoid_style_reward
+from coachable.domains.humanoid import humanoid_style_reward
+from coachable.envs.humanoid import HumanoidEnv
 from coachable.training import Learner
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
 from coachable.training.settings import TrainSettings

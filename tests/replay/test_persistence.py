@@ -9,8 +9,8 @@ from torchrl.checkpoint import Checkpoint
 from torchrl.data import LazyMemmapStorage
 
 from coachable.replay import EventTableBuffer, KeyEvents, KeyRoute
+from coachable.replay.replay_files import read_replay, write_replay
 from coachable.styles import StyleReward, StyleSpace, Weight, WeightedFeature
-from coachable.training.replay_files import read_replay, write_replay
 from coachable.transforms import TaskImpersonation
 
 SPACE = StyleSpace([Weight("a", -1.0, 1.0)])

@@ -15,9 +15,9 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from coachable.files import save_state
 from coachable.replay import EventTableBuffer, KeyEvents
+from coachable.replay.replay_files import read_replay, write_replay
 from coachable.styles import Setpoint, StyleSpace
 from coachable.training.checkpoint import CheckpointError, CheckpointStore, check_writable, find_checkpoint, read_state
-from coachable.training.replay_files import read_replay, write_replay
 from coachable.training.rng import preserved_rng, rng_state, seed_everything, set_rng_state
 from coachable.training.weights import export_weights, initialise_from, load_policy
 

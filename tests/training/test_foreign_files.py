@@ -17,13 +17,13 @@ from recipe_config import build_checked, compose_config, run_recipe
 from recipe_saved import CONFIGS, check_saved_config, known_targets
 
 from coachable.cli import main
-from coachable.coach.export import export
-from coachable.coach.session import CoachSession
-from coachable.envs.humanoid import humanoid_style_space
+from coachable.coach.session.session import CoachSession
+from coachable.domains.humanoid import humanoid_style_space
 from coachable.evaluation.curves import read_metric
 from coachable.evaluation.evaluate import evaluate
 from coachable.evaluation.report import report
 from coachable.evaluation.video import render
+from coachable.export.onnx import export
 from coachable.files import CheckpointError, check_contained, load_state, save_state
 from coachable.networks import make_gaussian_actor
 from coachable.replay import EventTableBuffer
@@ -117,7 +117,7 @@ def _payloads(folder: Path, marker: Path):
         f"from pathlib import Path\ndef touch(**_):\n    Path({str(marker)!r}).touch()\n"
     )
     path = {"_target_": "pathlib.Path", "_args_": [str(marker)]}
-    later = {"_target_": "coachable.domain.deferred", "path": "os.mkdir"}
+    later = {"_target_": "hydra.utils.get_method", "path": "os.mkdir"}
     return {
         "sorted": {"_target_": "builtins.sorted", "_args_": [[str(marker)]], "key": later},
         "torch.load": {"_target_": "torch.load", "f": str(folder / "harmful.pt"), "weights_only": False},
@@ -310,7 +310,7 @@ def test_a_style_space_names_only_samplers(tmp_path):
     "target",
     [
         "os.system",
-        "coachable.networks.native.load",
+        "coachable.fast.native.load",
         "coachable.networks.plain.torch.load",
         "torch.nn.Linear",
         None,

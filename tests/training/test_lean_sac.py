@@ -2,8 +2,8 @@ import pytest
 import torch
 from torchrl.objectives import SACLoss, SoftUpdate
 
+from coachable.fast.accelerate import Acceleration
 from coachable.training import Learner
-from coachable.training.acceleration import Acceleration
 from coachable.training.lean_sac import LeanSAC
 from tests.sac_problem import make_batch, make_loss
 

@@ -8,8 +8,8 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from coachable.fast.accelerate import Acceleration
 from coachable.training import Learner
-from coachable.training.acceleration import Acceleration
 from tests.sac_problem import cat_rac, make_batch, make_loss, qr_sac
 
 

@@ -9,9 +9,9 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, MultiStep, TensorDictReplayBuffer
 
-from coachable.envs.combat import combat_style_space
-from coachable.envs.humanoid import humanoid_style_space
-from coachable.envs.racing.families import FAMILIES, family_style
+from coachable.domains.combat import combat_style_space
+from coachable.domains.humanoid import humanoid_style_space
+from coachable.domains.racing.families import FAMILIES, family_style
 from coachable.replay import EventTableBuffer, KeyEvents
 from coachable.styles import (
     Choice,

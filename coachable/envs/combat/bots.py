@@ -12,11 +12,11 @@ from torch import Tensor
 
 from coachable.envs.combat import constants as c
 from coachable.envs.combat.env import CombatEnv
+from coachable.envs.combat.gamepad import GAMEPAD, HEADS
 from coachable.envs.combat.player import to_stick, wrap
 from coachable.envs.combat.state import ACTIVE, TELEGRAPH, nearest, pick
 from coachable.envs.combat.tables import AMMO, KINDS, WEAPONS
 from coachable.envs.combat.traits import FARTHEST, KIND, SPEED
-from coachable.transforms.gamepad import GAMEPAD, HEADS
 
 _BERRY_BELOW = 430.0  # [HP]
 _DODGE_WITHIN, _DODGE_SHARE, _SHOT_SHARE = 0.22, 0.6, 0.42  # [s] before an attack, probability per step

@@ -16,6 +16,7 @@ from coachable.envs.combat.damage import ElementNumbers
 from coachable.envs.combat.features import observation_size, observe
 from coachable.envs.combat.fight import run_step
 from coachable.envs.combat.frame import Noise, Rules
+from coachable.envs.combat.gamepad import GAMEPAD, canonical_rows
 from coachable.envs.combat.rewards import (
     COMPONENT_SLICES,
     NUM_COMPONENTS,
@@ -24,8 +25,7 @@ from coachable.envs.combat.rewards import (
     task_weights,
 )
 from coachable.envs.combat.state import State, start_fights
-from coachable.envs.combat.styles import check_styles
-from coachable.envs.combat.tables import MACHINES, SITES, STYLES
+from coachable.envs.combat.tables import MACHINES, SITES, STYLES, check_styles
 from coachable.envs.combat.traits import (
     AMMO_SLOTS,
     MACHINE_NAMES,
@@ -40,7 +40,6 @@ from coachable.envs.combat.traits import (
 from coachable.envs.combat.traps import TrapNumbers
 from coachable.finite import require_finite_action
 from coachable.keys import EVENTS, STYLE_FEATURES, TASK_REWARD
-from coachable.transforms.gamepad import GAMEPAD, canonical_rows
 
 COMPONENTS_KEY = "components"
 """Raw components of a step, `(N, 44)`, for evaluation; see `rewards.COMPONENTS`."""

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from coachable.envs.combat import constants as c
+from coachable.envs.combat.gamepad import Pad
 from coachable.envs.combat.state import (
     AIR,
     BERRY,
@@ -35,7 +36,6 @@ from coachable.envs.combat.traits import (
     Traits,
 )
 from coachable.envs.combat.traits import RELOAD as RELOAD_FRAMES
-from coachable.transforms.gamepad import Pad
 
 
 @dataclass

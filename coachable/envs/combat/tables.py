@@ -6,7 +6,7 @@ Origins: `paper` (tables of Appendix C and D) or `ours`.
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -212,3 +212,16 @@ def attacks_of(kind: str) -> list[str]:
         if len(table.words(name, "kind", KINDS)) != 1:
             raise table.fail(name, f"expected one kind of {KINDS}")
     return found
+
+
+def check_styles(styles: Sequence[str] | None) -> tuple[str, ...]:
+    """The chosen styles in the order given; all 18 if None.
+
+    Raises:
+        ValueError: if one is unknown or repeated.
+    """
+    chosen = STYLES if styles is None else tuple(styles)
+    unknown = [name for name in chosen if name not in STYLES]
+    if unknown or not chosen or len(set(chosen)) < len(chosen):
+        raise ValueError(f"styles are {list(chosen)}: expected distinct ones of {list(STYLES)}")
+    return chosen

@@ -11,6 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from coachable.envs.humanoid.features import STYLE_FEATURES_SIZE, pack_style_features
 from coachable.envs.humanoid.gait import GaitTracker
 from coachable.envs.humanoid.model import NUM_ACTIONS, NUM_POSITIONS
 from coachable.envs.humanoid.observation import (
@@ -23,7 +24,6 @@ from coachable.envs.humanoid.observation import (
 )
 from coachable.envs.humanoid.rewards import move_reward
 from coachable.envs.humanoid.simulation import HumanoidSimulation, Kinematics
-from coachable.envs.humanoid.styles import STYLE_FEATURES_SIZE, pack_style_features
 from coachable.finite import require_finite_action
 from coachable.keys import STYLE_FEATURES, TASK_REWARD
 from coachable.ranges import COUNT

@@ -11,21 +11,21 @@ from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from coachable.envs.racing.circuits import load_track
-from coachable.envs.racing.garage import Garage
-from coachable.envs.racing.observation import COURSE_POINTS, observation_groups
-from coachable.envs.racing.parameters import Resources, compound_table
-from coachable.envs.racing.profile import Envelope, speed_profile
-from coachable.envs.racing.referee import TELEMETRY, WRONG_WAY_TIME, Referee, Verdict
-from coachable.envs.racing.rescue import back_on_track, way_clear
-from coachable.envs.racing.rivals import Rivals
-from coachable.envs.racing.run import RUN_ROWS, Run
-from coachable.envs.racing.scenarios import Conditions, Scenario, Starter, race_scenarios
-from coachable.envs.racing.simulation import SUBSTEPS, Simulation, maybe_compile
-from coachable.envs.racing.state import STATE_ROWS
-from coachable.envs.racing.styles import style_features_size
-from coachable.envs.racing.task import TaskWeights
-from coachable.envs.racing.track import Course, Track
+from coachable.envs.racing.circuit.circuits import load_track
+from coachable.envs.racing.circuit.profile import Envelope, speed_profile
+from coachable.envs.racing.circuit.track import Course, Track
+from coachable.envs.racing.physics.parameters import Resources, compound_table
+from coachable.envs.racing.physics.simulation import SUBSTEPS, Simulation, maybe_compile
+from coachable.envs.racing.physics.state import STATE_ROWS
+from coachable.envs.racing.race.features import style_features_size
+from coachable.envs.racing.race.garage import Garage
+from coachable.envs.racing.race.observation import COURSE_POINTS, observation_groups
+from coachable.envs.racing.race.referee import TELEMETRY, WRONG_WAY_TIME, Referee, Verdict
+from coachable.envs.racing.race.rescue import back_on_track, way_clear
+from coachable.envs.racing.race.rivals import Rivals
+from coachable.envs.racing.race.run import RUN_ROWS, Run
+from coachable.envs.racing.race.scenarios import Conditions, Scenario, Starter, race_scenarios
+from coachable.envs.racing.race.task import TaskWeights
 from coachable.finite import require_finite_action
 from coachable.keys import STYLE_FEATURES, TASK_REWARD
 from coachable.ranges import COUNT

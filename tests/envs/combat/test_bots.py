@@ -6,10 +6,10 @@ from tensordict import TensorDict
 
 from coachable.envs.combat import CombatEnv
 from coachable.envs.combat.bots import BOTS, fight_all
+from coachable.envs.combat.gamepad import GAMEPAD
 from coachable.envs.combat.player import from_stick, to_stick
 from coachable.envs.combat.state import State
 from coachable.envs.combat.tables import AMMO, MACHINES, WEAPONS
-from coachable.transforms.gamepad import GAMEPAD
 
 TOP = ("Slitherfang", "Apex Thunderjaw", "Slaughterspine", "Specter Prime")
 

@@ -9,11 +9,11 @@ from tensordict import TensorDict
 from coachable.envs.combat import CombatEnv
 from coachable.envs.combat import constants as c
 from coachable.envs.combat.damage import ACID, BURNING, FROST, PLASMA, SHOCK, Totals, damage_parts
+from coachable.envs.combat.gamepad import press
 from coachable.envs.combat.rewards import COMPONENT_SLICES
 from coachable.envs.combat.state import ACTIVE, IDLE, SAFE, STAGGER, STAGGERED
 from coachable.envs.combat.tables import ALL_MACHINES, AMMO, ELEMENTS, MACHINES, WEAPONS, load_table, resistance
 from coachable.envs.combat.traits import DAMAGE, KIND, MACHINE_NAMES, SPREAD
-from coachable.transforms.gamepad import press
 
 NOTHING = press()
 NEVER = 1e6  # frames

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from coachable.domains.combat.styles import combat_style_space
 from coachable.envs.combat.rewards import NUM_COMPONENTS, style_weights, task_weights
-from coachable.envs.combat.styles import combat_style_space
 from coachable.envs.combat.tables import (
     AMMO,
     ELEMENTS,

@@ -6,7 +6,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-from coachable.envs.humanoid import HumanoidEnv, humanoid_style_reward, humanoid_style_space
+from coachable.domains.humanoid import humanoid_style_reward, humanoid_style_space
+from coachable.envs.humanoid import HumanoidEnv
 from coachable.envs.humanoid.observation import OBSERVATION_GROUPS
 from coachable.transforms import coachable_env
 

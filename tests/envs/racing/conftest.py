@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from coachable.envs.racing.dynamics import WheelSet, substep
-from coachable.envs.racing.parameters import Resources, load_car
-from coachable.envs.racing.state import HEATS, INPUT_ROWS, ROW, SPINS, STATE_ROWS, CarInputs
+from coachable.envs.racing.physics.dynamics import WheelSet, substep
+from coachable.envs.racing.physics.parameters import Resources, load_car
+from coachable.envs.racing.physics.state import HEATS, INPUT_ROWS, ROW, SPINS, STATE_ROWS, CarInputs
 
 INPUT = {name: row for row, name in enumerate(CarInputs._fields)}
 

@@ -6,7 +6,7 @@ is Pacejka's combined-slip curve; how wheel forces move the body, and which way 
 
 import torch
 
-from coachable.envs.racing.body import rotate, sum_wheels, wheel_force, wheel_velocity
+from coachable.envs.racing.physics.body import rotate, sum_wheels, wheel_force, wheel_velocity
 
 GRAVITY = 9.81
 BLEND_SPEED, BLEND_WIDTH = 0.2, 0.05  # [m/s], below which the model turns kinematic

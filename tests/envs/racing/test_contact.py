@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from coachable.envs.racing.contact import Bodies, body_gaps, collide, overlap
-from coachable.envs.racing.state import ROW, CarInputs
-from coachable.envs.racing.surface import locate
-from coachable.envs.racing.task import impacts_of
+from coachable.envs.racing.physics.contact import Bodies, body_gaps, collide, overlap
+from coachable.envs.racing.physics.state import ROW, CarInputs
+from coachable.envs.racing.physics.surface import locate
+from coachable.envs.racing.race.task import impacts_of
 
 LENGTH, WIDTH = 4.6, 2.0
 INPUT = {name: row for row, name in enumerate(CarInputs._fields)}

@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from coachable.envs.racing import RacingEnv
-from coachable.envs.racing.driver import LineFollower
-from coachable.envs.racing.line import minimum_curvature_line
-from coachable.envs.racing.referee import TELEMETRY
-from coachable.envs.racing.scenarios import Scenario
+from coachable.envs.racing.circuit.line import minimum_curvature_line
+from coachable.envs.racing.race.driver import LineFollower
+from coachable.envs.racing.race.referee import TELEMETRY
+from coachable.envs.racing.race.scenarios import Scenario
 
 T = {name: column for column, name in enumerate(TELEMETRY)}
 ALONE = (Scenario("solo", 1.0, "solo"),)

@@ -8,22 +8,22 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-from coachable.envs.racing import (
-    RacingEnv,
+from coachable.domains.racing import (
     aggressiveness_style_reward,
     aggressiveness_style_space,
     resource_style_reward,
     resource_style_space,
 )
-from coachable.envs.racing.chance import uniforms
-from coachable.envs.racing.driver import LineFollower
-from coachable.envs.racing.observation import observation_groups
-from coachable.envs.racing.parameters import Resources
-from coachable.envs.racing.referee import TELEMETRY
-from coachable.envs.racing.run import Others, Run
-from coachable.envs.racing.scenarios import Conditions, Scenario, drift_scenarios, race_scenarios, rolling_start
-from coachable.envs.racing.state import HEATS, ROW, WEARS
-from coachable.envs.racing.task import TaskWeights, metres_gained
+from coachable.envs.racing import RacingEnv
+from coachable.envs.racing.physics.parameters import Resources
+from coachable.envs.racing.physics.state import HEATS, ROW, WEARS
+from coachable.envs.racing.race.counter_rng import uniforms
+from coachable.envs.racing.race.driver import LineFollower
+from coachable.envs.racing.race.observation import observation_groups
+from coachable.envs.racing.race.referee import TELEMETRY
+from coachable.envs.racing.race.run import Others, Run
+from coachable.envs.racing.race.scenarios import Conditions, Scenario, drift_scenarios, race_scenarios, rolling_start
+from coachable.envs.racing.race.task import TaskWeights, metres_gained
 from coachable.transforms import coachable_env
 
 T = {name: column for column, name in enumerate(TELEMETRY)}

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from coachable.envs.racing import contact
-from coachable.envs.racing.body import wall_impulse, wheel_velocity
-from coachable.envs.racing.contact import Bodies, collide, overlap
+from coachable.envs.racing.physics import contact
+from coachable.envs.racing.physics.body import wall_impulse, wheel_velocity
+from coachable.envs.racing.physics.contact import Bodies, collide, overlap
 
 MASS, INERTIA, RESTITUTION = 1300.0, 2100.0, 0.3
 

@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from coachable.envs.racing import RacingEnv
-from coachable.envs.racing.referee import TELEMETRY
-from coachable.envs.racing.rescue import RESCUE_SPEED, way_clear
-from coachable.envs.racing.run import Run
-from coachable.envs.racing.scenarios import rolling_start
-from coachable.envs.racing.simulation import CONTROL_STEP
-from coachable.envs.racing.state import ROW
+from coachable.envs.racing.physics.simulation import CONTROL_STEP
+from coachable.envs.racing.physics.state import ROW
+from coachable.envs.racing.race.referee import TELEMETRY
+from coachable.envs.racing.race.rescue import RESCUE_SPEED, way_clear
+from coachable.envs.racing.race.run import Run
+from coachable.envs.racing.race.scenarios import rolling_start
 
 T = {name: column for column, name in enumerate(TELEMETRY)}
 

@@ -5,12 +5,12 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from coachable.domains.racing.families import AGENTS, CARS, racing_family
+from coachable.domains.racing.styles import aggressiveness_style_space
 from coachable.envs.racing import RacingEnv
-from coachable.envs.racing.driver import LineFollower
-from coachable.envs.racing.families import AGENTS, CARS, racing_family
-from coachable.envs.racing.rivals import Rivals
-from coachable.envs.racing.scenarios import rolling_start
-from coachable.envs.racing.styles import aggressiveness_style_space
+from coachable.envs.racing.race.driver import LineFollower
+from coachable.envs.racing.race.rivals import Rivals
+from coachable.envs.racing.race.scenarios import rolling_start
 from coachable.training.collection import SelfPlayEnv
 
 

@@ -7,15 +7,15 @@ import pytest
 import torch
 
 from coachable.envs.racing import RacingEnv
-from coachable.envs.racing.circuits import load_track
-from coachable.envs.racing.contact import Bodies
-from coachable.envs.racing.dynamics import AIR_DENSITY, GRAVITY, WheelSet, total_mass, wheel_loads
-from coachable.envs.racing.observation import opponents_seen, own_columns
-from coachable.envs.racing.parameters import load_car
-from coachable.envs.racing.rescue import RESCUE_SPEED, back_on_track
-from coachable.envs.racing.run import SLIPSTREAM_LENGTH, SLIPSTREAM_WIDTH, Run, look_around, slipstream, tyre_view
-from coachable.envs.racing.state import HEATS, ROW, SPINS, WEARS, CarState
-from coachable.envs.racing.track import Course
+from coachable.envs.racing.circuit.circuits import load_track
+from coachable.envs.racing.circuit.track import Course
+from coachable.envs.racing.physics.contact import Bodies
+from coachable.envs.racing.physics.dynamics import AIR_DENSITY, GRAVITY, WheelSet, total_mass, wheel_loads
+from coachable.envs.racing.physics.parameters import load_car
+from coachable.envs.racing.physics.state import HEATS, ROW, SPINS, WEARS, CarState
+from coachable.envs.racing.race.observation import opponents_seen, own_columns
+from coachable.envs.racing.race.rescue import RESCUE_SPEED, back_on_track
+from coachable.envs.racing.race.run import SLIPSTREAM_LENGTH, SLIPSTREAM_WIDTH, Run, look_around, slipstream, tyre_view
 
 F64 = torch.float64
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from coachable.envs.racing.circuits import CIRCUITS, generate_track, load_track, oval, ring
-from coachable.envs.racing.driver import line_geometry
-from coachable.envs.racing.line import minimum_curvature_line
-from coachable.envs.racing.parameters import load_car
-from coachable.envs.racing.profile import Envelope, cornering_speed, lap_time, speed_profile
-from coachable.envs.racing.track import Course, Track, clearance
+from coachable.envs.racing.circuit.circuits import CIRCUITS, generate_track, load_track, oval, ring
+from coachable.envs.racing.circuit.line import minimum_curvature_line
+from coachable.envs.racing.circuit.profile import Envelope, cornering_speed, lap_time, speed_profile
+from coachable.envs.racing.circuit.track import Course, Track, clearance
+from coachable.envs.racing.physics.parameters import load_car
+from coachable.envs.racing.race.driver import line_geometry
 
 
 @pytest.mark.parametrize(("name", "length"), [("lakeside", 5733.0), ("ridge", 4090.0), ("endurance", 13600.0)])

@@ -1,0 +1,94 @@
+"""`coachable coach`: opens the page and keeps it running."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import threading
+import webbrowser
+from collections.abc import Callable
+from contextlib import ExitStack, redirect_stdout
+from typing import Any
+
+
+def add_parser(commands: Any, source_help: str, run: Callable[[argparse.Namespace], int]) -> None:
+    """Adds the sub-command to the command line."""
+    parser = commands.add_parser("coach", help="coach an agent while it acts, on a page in the browser")
+    parser.add_argument("source", help=source_help)
+    parser.add_argument("--port", type=_port, default=8080, help="first port to try (default: %(default)s)")
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="address to listen on; whoever reaches it can steer (default: %(default)s)"
+    )
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--open", action="store_true", dest="open_browser", help="open the page in the browser")
+    parser.set_defaults(run=run)
+
+
+def serve(source: str, *, say: Callable[[str], None], **settings: Any) -> None:
+    """Serves the page of an agent until interrupted.
+
+    Args:
+        source: as for `CoachSession.open`.
+        say: where the page's address is announced.
+        **settings: `port`, first to try, where one that is in use gives way to the next; `host`, address to listen on;
+            `seed` of the first session; `open_browser`, whether to open the page in the user's browser.
+
+    Raises:
+        CheckpointError: if there is no such agent.
+        ImportError: without the extra `ui`.
+        OSError: if one cannot listen there.
+    """
+    try:
+        _serve(source, say, **settings)
+    except KeyboardInterrupt:
+        say("ended")
+
+
+def _serve(
+    source: str,
+    say: Callable[[str], None],
+    port: int = 8080,
+    host: str = "127.0.0.1",
+    seed: int = 0,
+    open_browser: bool = False,
+) -> None:
+    from coachable.coach.page.server import make_server, page_address
+
+    with ExitStack() as closing:
+        # First of all, so that the page is there while the agent is still being loaded.
+        server = make_server(host, port)
+        closing.callback(_quietly, server.stop)
+        loading = server.gui.add_markdown("Loading the agent ...")
+        found = server.get_port()
+        address = page_address(host, found)
+        note = "" if found == port else f" (port {port} is in use)"
+        say(f"coaching {source} at {address}{note}; Ctrl-C ends it")
+        if open_browser:
+            webbrowser.open(address)
+
+        from coachable.coach.page.page import CoachPage
+        from coachable.coach.session.session import CoachSession
+
+        session = CoachSession.open(source, seed=seed)
+        closing.callback(session.close)
+        page = CoachPage(server, session)
+        closing.callback(page.stop)
+        loading.remove()
+        page.start()
+        wait()
+
+
+def wait() -> None:
+    """Until interrupted."""
+    threading.Event().wait()
+
+
+def _quietly(stop: Callable[[], None]) -> None:
+    with redirect_stdout(io.StringIO()):  # viser says that it ends
+        stop()
+
+
+def _port(text: str) -> int:
+    if not text.isdecimal() or int(text) > 65535:
+        raise argparse.ArgumentTypeError(f"there is no port {text!r}: expected a number from 0 to 65535")
+    return int(text)

@@ -1,0 +1,140 @@
+"""A recorded session as a film: it is run again, and drawn."""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from coachable.coach.session.recording import Recording
+from coachable.coach.session.session import CoachSession
+from coachable.evaluation.video import CAPTION, caption, write_video
+
+_LONGEST_SESSION = 600.0  # [s]; all of it is run again for its last seconds
+
+
+class FilmStudio:
+    """Films sessions beside the thread that steps them, one at a time.
+
+    Args:
+        session: whose policy and domain to use; it is not touched.
+        note: called with what there is to say.
+    """
+
+    def __init__(self, session: CoachSession, note: Callable[[str], None]) -> None:
+        self._session, self._note = session, note
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def shoot(self, recording: Recording, last: float, deliver: Callable[[bytes], None]) -> None:
+        """Begins to draw the last seconds of a recording; returns at once.
+
+        Args:
+            recording: what to show.
+            last: seconds.
+            deliver: called with the mp4 file's content when it is finished.
+
+        Raises:
+            ValueError: while another film is drawn, or if the recording is too long.
+        """
+        if self._thread is not None and self._thread.is_alive():
+            raise ValueError("a film is being drawn already: wait until it is finished")
+        seconds = recording.steps * self._session.domain.control_step
+        if seconds > _LONGEST_SESSION:
+            raise ValueError(
+                f"the session has lasted {seconds:.0f} s, and a film runs it again from the start: at most "
+                f"{_LONGEST_SESSION:.0f} s are filmed here. Start over with a seed, or film the downloaded recording "
+                "with coachable.coach.page.film"
+            )
+        self._thread = threading.Thread(target=self._draw, args=(recording, last, deliver), name="filming", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Ends the film that is being drawn, if any."""
+        self._closing.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _draw(self, recording: Recording, last: float, deliver: Callable[[bytes], None]) -> None:
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                out = Path(folder) / "film.mp4"
+                deliver(film(recording, self._session, out, last=last, on_progress=self._progress).read_bytes())
+            self._note("drawn")
+        except Exception as error:  # this thread has nobody else to tell
+            if not self._closing.is_set():
+                self._note(f"Problem: {error}")
+
+    def _progress(self, share: float) -> None:
+        if self._closing.is_set():
+            raise RuntimeError("the page is closing")
+        self._note(f"drawing: {share:.0%}, the agent goes on meanwhile")
+
+
+def film(
+    recording: Recording,
+    session: CoachSession,
+    out: Path,
+    *,
+    last: float | None = None,
+    size: tuple[int, int] = (640, 480),
+    on_progress: Callable[[float], None] = lambda share: None,
+) -> Path:
+    """Replays a recording beside its session, which may go on meanwhile, and writes what it looked like.
+
+    Args:
+        recording: what to show.
+        session: whose policy and domain to use; it is not touched.
+        out: `.mp4` or `.gif`.
+        last: only the last so many seconds.
+        size: width and height [px].
+        on_progress: called with the share that is done, from 0 to 1.
+
+    Returns:
+        `out`.
+
+    Raises:
+        ValueError: if nothing was recorded, or for another suffix.
+        ImportError: for mp4 without PyAV; names the extra to install.
+    """
+    if out.suffix not in (".mp4", ".gif"):
+        raise ValueError(f"cannot write {out.name}: expected a file ending in .mp4 or .gif")
+    if recording.steps == 0:
+        raise ValueError("nothing was recorded yet: step the session first")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    replica = session.replica()
+    try:
+        write_video(_frames(replica, recording, last, size, on_progress), out, round(1 / session.domain.control_step))
+    finally:
+        replica.close()
+    return out
+
+
+def _frames(
+    session: CoachSession,
+    recording: Recording,
+    last: float | None,
+    size: tuple[int, int],
+    on_progress: Callable[[float], None],
+) -> Iterator[np.ndarray]:
+    first = 0 if last is None else recording.steps - round(last / session.domain.control_step)
+    renderer = session.domain.make_renderer(size[0], size[1] - CAPTION)
+    session.replay(recording)
+    try:
+        for step in range(recording.steps):
+            session.step()
+            on_progress((step + 1) / recording.steps)
+            if step >= first:
+                yield caption(renderer.draw(session.env), _lines(session))
+    finally:
+        renderer.close()
+
+
+def _lines(session: CoachSession) -> tuple[str, str]:
+    report = session.report()
+    asked = ", ".join(f"{n} {v:.2f}" if isinstance(v, float) else f"{v}" for n, v in report.requested.items())
+    shown = ", ".join(f"{name} {value:.2f}" for name, value in report.measured.items())
+    return f"asked: {asked}".replace("_", " "), f"measured: {shown}".replace("_", " ")

@@ -1,0 +1,324 @@
+"""The coaching page: a thin client of `CoachSession` in the browser."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from coachable.coach.page.film import FilmStudio
+from coachable.coach.page.views import View, make_view
+from coachable.coach.page.widgets import Chart, MeasuredText, ParameterWidget, write
+from coachable.coach.phrases.grammar import Understanding, readable_number
+from coachable.coach.session.loop import LiveLoop
+from coachable.coach.session.plan import read_plan
+from coachable.coach.session.readout import StyleReport, measures_by_parameter
+from coachable.coach.session.recording import Recording
+from coachable.coach.session.session import CoachSession
+from coachable.styles import Parameter
+
+if TYPE_CHECKING:
+    import viser
+
+_FRAMES_PER_SECOND = 30.0
+_REPORTS_PER_SECOND = 5.0
+_FILM_SECONDS = 10.0
+_SPEEDS = (0.1, 4.0)
+_LONGEST_PHRASE, _LONGEST_PLAN, _LONGEST_NAME = 200, 2000, 40  # characters
+_PRESETS = 50
+_LARGEST_FILE = 8 << 20  # [byte]
+_S = TypeVar("_S", str, bytes)
+_T = TypeVar("_T")
+_PAUSE, _RESUME, _STEP, _RESET = "Pause", "Resume", "Step", "Reset"
+
+
+class CoachPage:
+    """Widgets, view and read-outs of one session.
+
+    Every browser that opens the page shows and steers the same session. Widgets hand their requests to the loop, which
+    carries them out before the next step; everything shown is read from the session.
+
+    Args:
+        server: an empty page.
+        session: what is coached; from `start` on it belongs to the loop's thread.
+
+    Attributes:
+        loop: runs the session.
+        widgets: by parameter name, live controls included.
+    """
+
+    def __init__(self, server: viser.ViserServer, session: CoachSession) -> None:
+        self.server, self.session = server, session
+        self.loop = LiveLoop(session, self._on_step)
+        self._view: View | None = None
+        self._reading = threading.Lock()
+        self._studio = FilmStudio(session, lambda note: write(self.film_note, escaped(note)))
+        self._frame_due = self._report_due = 0.0
+        self.widgets: dict[str, ParameterWidget] = {}
+        self.measured: dict[str, MeasuredText] = {}
+        self.status = server.gui.add_markdown("")
+        self._add_run()
+        tabs = server.gui.add_tab_group()
+        with tabs.add_tab("Coach"):
+            self._add_phrase_box()
+            self._add_style()
+        with tabs.add_tab("Plan"):
+            self._add_presets()
+        with tabs.add_tab("Session"):
+            self._add_session()
+
+    def start(self) -> None:
+        """Begins to act."""
+        self.loop.start()
+
+    def stop(self) -> None:
+        """Ends the loop; the session stays open."""
+        self.loop.stop()
+        self._studio.close()
+        if self._view is not None:
+            self._view.close()
+
+    # -- widgets ---------------------------------------------------------------------------------------------------
+
+    def _add_style(self) -> None:
+        with self.server.gui.add_folder("Style"):
+            for parameter in self.session.space.parameters:
+                self._add_widget(parameter, self.session.style[parameter.name], self._set)
+                self.measured[parameter.name] = MeasuredText(self.server, parameter)
+            self.others = self.server.gui.add_markdown("")
+        if self.session.coaching.controls:
+            with self.server.gui.add_folder("Steering"):
+                for control in self.session.coaching.controls:
+                    name = control.parameter.name
+                    self._add_widget(control.parameter, self.session.controls[name], self._steer)
+        folder = self.server.gui.add_folder("Requested and measured")
+        self.chart = Chart(self.server, folder, self.session.space, self.loop.show)
+
+    def _add_widget(self, parameter: Parameter, value: float | str, request: Callable[[ParameterWidget], None]) -> None:
+        name = parameter.name
+        self.widgets[name] = ParameterWidget(self.server, parameter, value, lambda: request(self.widgets[name]))
+
+    def _set(self, widget: ParameterWidget) -> None:
+        self.loop.submit(lambda session: self._carry_out(session, widget))
+
+    def _carry_out(self, session: CoachSession, widget: ParameterWidget) -> None:
+        self.chart.follow(widget.parameter.name)
+        session.set(**widget.take())
+
+    def _steer(self, widget: ParameterWidget) -> None:
+        self.loop.submit(lambda session: session.steer(**widget.take()))  # pyright: ignore[reportArgumentType]
+
+    def _add_phrase_box(self) -> None:
+        gui, examples = self.server.gui, self.session.grammar.examples
+        with gui.add_form("In words") as form:
+            self.phrase = gui.add_text("phrase", "", hint=f"such as: {'; '.join(examples)}; a bit more")
+            self.say = gui.add_button("Apply")
+            self.answer = gui.add_markdown("")
+        self.say.on_click(lambda _: form.submit())
+        form.on_submit(lambda _: self._aside("phrase", self.phrase.value, _LONGEST_PHRASE, self._understand, self._say))
+
+    def _understand(self, phrase: str) -> Understanding:
+        return self.session.understand(phrase)
+
+    def _say(self, session: CoachSession, understood: Understanding) -> None:
+        session.follow(understood)
+        write(self.answer, escaped(str(understood)))
+        asked = next((name for name in understood.changes if name in session.space), None)
+        if asked is not None:
+            self.chart.follow(asked)
+
+    def _aside(
+        self, what: str, given: _S, longest: int, read: Callable[[_S], _T], then: Callable[[CoachSession, _T], None]
+    ) -> None:
+        """Reads what somebody gave in viser's thread, so that the agent does not wait; the loop gets what it means."""
+        if len(given) > longest:
+            unit = "characters" if isinstance(given, str) else "bytes"
+            self.loop.refuse(f"the {what} has {len(given):,} {unit}: at most {longest:,} are read")
+        elif not self._reading.acquire(blocking=False):
+            self.loop.refuse("what was given before is still being read")
+        else:
+            try:
+                meant = read(given)
+                self.loop.submit(lambda session: then(session, meant))
+            except Exception as error:  # this thread has nobody else to tell
+                self.loop.refuse(str(error))
+            finally:
+                self._reading.release()
+
+    def _add_run(self) -> None:
+        gui = self.server.gui
+        self.run = gui.add_button_group("run", (_PAUSE, _STEP, _RESET))
+        self.speed = gui.add_slider("speed", *_SPEEDS, 0.1, 1.0, hint="simulated seconds per second; 1 is real time")
+        self.run.on_click(lambda _: self._press(self.run.value))
+        self.speed.on_update(lambda _: self._change_speed())
+
+    def _press(self, button: str) -> None:
+        if button == _STEP:
+            self.loop.single_step()
+        elif button == _RESET:
+            self.loop.submit(lambda session: session.reset())
+        elif button in (_PAUSE, _RESUME):
+            self.loop.paused = button == _PAUSE
+            self.loop.submit(lambda _: None)  # shows the state
+
+    def _change_speed(self) -> None:
+        low, high = _SPEEDS
+        if low <= self.speed.value <= high:  # false for NaN
+            self.loop.speed = float(self.speed.value)
+        else:
+            self.loop.refuse(f"speed = {self.speed.value}: expected a number from {low:g} to {high:g}")
+            self.speed.value = self.loop.speed
+
+    def _add_presets(self) -> None:
+        gui = self.server.gui
+        with gui.add_folder("Presets"):
+            self.preset = gui.add_dropdown("preset", list(self.session.presets))
+            apply = gui.add_button("Apply preset")
+            self.preset_name = gui.add_text("new name", "")
+            keep = gui.add_button("Save style as preset")
+        with gui.add_folder("Schedule"):
+            example = next(iter(self.session.grammar.examples), "default")
+            gui.add_markdown(f"One `SECONDS: PHRASE` or `SECONDS: PRESET` per line, such as `3: {example}`.")
+            self.plan = gui.add_text("plan", "", multiline=True)
+            self.run_plan = gui.add_button("Run schedule")
+            cancel = gui.add_button("Stop schedule")
+
+        apply.on_click(lambda _: self.loop.submit(lambda session: session.apply(self.preset.value)))
+        keep.on_click(lambda _: self.loop.submit(self._save_preset))
+        self.run_plan.on_click(
+            lambda _: self._aside("plan", self.plan.value, _LONGEST_PLAN, self._read_plan, CoachSession.schedule)
+        )
+        cancel.on_click(lambda _: self.loop.submit(lambda session: session.cancel()))
+
+    def _read_plan(self, text: str) -> dict[float, dict[str, Any]]:
+        return read_plan(text, self.session)
+
+    def _save_preset(self, session: CoachSession) -> None:
+        name = self.preset_name.value.strip()
+        if not name:
+            raise ValueError("give the preset a name first")
+        if len(name) > _LONGEST_NAME or len(session.presets) >= _PRESETS:
+            raise ValueError(
+                f"a preset's name has at most {_LONGEST_NAME} characters, and there are at most {_PRESETS}"
+            )
+        session.presets[name] = session.style
+        self.preset.options = tuple(session.presets)
+        self.preset.value = name
+
+    def _add_session(self) -> None:
+        gui = self.server.gui
+        with gui.add_folder("Episodes"):
+            self.hold = gui.add_checkbox(
+                "hold the style", True, hint="otherwise each episode draws one, as in training"
+            )
+            self.seed = gui.add_number("seed", self.session.recording().seed, min=0, step=1)
+            reseed = gui.add_button("Start over with seed", hint="also begins a new recording")
+        with gui.add_folder("Recording"):
+            save = gui.add_button("Download JSON", hint="everything since the last seed; replays exactly")
+            again = gui.add_button("Replay from the start")
+            self.upload = gui.add_upload_button("Replay a JSON file", mime_type="application/json")
+            stop = gui.add_button("Stop replay")
+            shoot = gui.add_button(f"Film the last {_FILM_SECONDS:g} s (mp4)")
+            self.film_note = gui.add_markdown("")
+
+        self.hold.on_update(lambda _: self.loop.submit(lambda session: setattr(session, "hold", self.hold.value)))
+        reseed.on_click(lambda _: self.loop.submit(lambda session: session.reset(int(self.seed.value))))
+        save.on_click(lambda event: self.loop.submit(lambda session: self._send_recording(session, event.client)))
+        again.on_click(lambda _: self.loop.submit(lambda session: session.replay(session.recording())))
+        self.upload.on_upload(
+            lambda _: self._aside(
+                "file", self.upload.value.content, _LARGEST_FILE, _read_recording, CoachSession.replay
+            )
+        )
+        stop.on_click(lambda _: self.loop.submit(lambda session: session.cancel()))
+        shoot.on_click(lambda event: self.loop.submit(lambda session: self._shoot(session, event.client)))
+
+    def _send_recording(self, session: CoachSession, client: viser.ClientHandle | None) -> None:
+        """To the browser that asks for it, without the path by which this machine knows the agent."""
+        recording = session.recording()
+        recording = replace(recording, source=Path(recording.source).name)
+        (client or self.server).send_file_download(f"{recording.domain}.json", recording.to_json().encode())
+
+    def _shoot(self, session: CoachSession, client: viser.ClientHandle | None) -> None:
+        name = f"{session.domain.name}.mp4"
+        self._studio.shoot(
+            session.recording(),
+            _FILM_SECONDS,
+            lambda content: (client or self.server).send_file_download(name, content),
+        )
+
+    # -- read-outs, in the loop's thread ---------------------------------------------------------------------------
+
+    def _on_step(self) -> None:
+        now = time.perf_counter()
+        for name, value in (self.session.style | self.session.controls).items():
+            self.widgets[name].follow(value)
+        if now >= self._report_due or self.loop.paused or self.session.ended is not None:
+            self._report_due = now + 1.0 / _REPORTS_PER_SECOND
+            self._show(self.session.report())
+        # Last, so that a view that fails leaves the read-outs, which say so.
+        if self._view is None:
+            self._view = make_view(self.server, self.session)
+        if now >= self._frame_due or self.loop.paused:
+            self._frame_due = now + 1.0 / _FRAMES_PER_SECOND
+            self._view.update()
+
+    def _show(self, report: StyleReport) -> None:
+        with self.server.atomic():
+            write(self.status, self._status(report))
+            buttons = (_RESUME if self.loop.paused else _PAUSE, _STEP, _RESET)
+            if self.run.options != buttons:
+                self.run.options = buttons
+            groups = measures_by_parameter(self.session.space, [*report.measured, *report.unmeasured])
+            for name, text in self.measured.items():
+                text.update(report, groups[name])
+            rest = [m for m in groups[""] if m in report.measured]
+            others = ", ".join(f"{m.replace('_', ' ')} **{readable_number(report.measured[m])}**" for m in rest)
+            write(self.others, f"also measured: {others}" if others else "")
+            self.chart.add(self.session.step_count * self.session.domain.control_step, report)
+
+    def _status(self, report: StyleReport) -> str:
+        if self.loop.problem:
+            first = f"**Problem:** {escaped(self.loop.problem)}"
+        elif report.ended is not None:
+            first = f"**The agent {report.ended}** after {report.episode_time:.1f} s; a new episode begins."
+        else:
+            first = verdict(report)
+        running = "between episodes" if report.ended is not None else f"{self.loop.factor:.2f} of real time"
+        state = "**paused**" if self.loop.paused else running
+        if self.session.replaying:
+            state += " · replaying"
+        elif self.session.scheduled:
+            state += f" · {self.session.scheduled} scheduled"
+        endings = "".join(f" · {reason}: {count}" for reason, count in report.endings.items())
+        return f"{first}\n\n{state} · episode {report.episode}, {report.episode_time:.1f} s{endings}"
+
+
+def _read_recording(content: bytes) -> Recording:
+    try:
+        return Recording.from_json(content.decode())
+    except UnicodeDecodeError:
+        raise ValueError("this is no recording: expected JSON written by a coaching session") from None
+
+
+def verdict(report: StyleReport) -> str:
+    """Whether the agent does what was asked, as far as that can be told from what was measured."""
+    if not report.asks:
+        return "Nothing is asked for: every weight is 0."
+    if report.complied_after is None:
+        if report.complying is None:
+            return f"Request not judged yet, after {report.since_request:.1f} s: that takes {report.needs}."
+        return f"Request not yet met, after {report.since_request:.1f} s."
+    first = f"first after {report.complied_after:.1f} s"
+    if report.complying is None:
+        return f"Request met {first}; nothing to judge in the last {report.seconds:.1f} s."
+    now = f"{report.complying:.0%} of what was judged in the last {report.seconds:.1f} s"
+    return f"**Request met**, {first}: {now}." if report.complying >= 0.5 else f"Request met {first}, but only {now}."
+
+
+def escaped(text: str) -> str:
+    """Without what Markdown would take for markup."""
+    return "".join(f"\\{c}" if c in "\\`*_{}[]<>#|~" else c for c in text)

@@ -1,0 +1,237 @@
+"""Widgets of a style space: one per parameter, what was measured below it, and a chart of both."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from coachable.coach.phrases.grammar import readable_number
+from coachable.coach.session.readout import StyleReport, measures_by_parameter
+from coachable.styles import Choice, Parameter, StyleSpace, Weight
+
+if TYPE_CHECKING:
+    import viser
+
+_SLIDER_STEPS = 200
+_SPAN = 30.0  # [s] of simulated time that the chart shows
+_HISTORY = 150  # points of the chart
+_REQUESTED, _MEASURED = "#d62728", "#1f77b4"
+
+
+class ParameterWidget:
+    """A slider with its number box, or a dropdown, that follows the session and asks it.
+
+    Args:
+        server: where to add it.
+        parameter: what it sets.
+        value: present value.
+        ask: called in viser's threads after the user changed it.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, parameter: Parameter, value: float | str, ask: Callable[[], None]
+    ) -> None:
+        self.parameter = parameter
+        self._shown = value
+        hint = parameter.help or None
+        if isinstance(parameter, Choice):
+            options = [_words(option) for option in parameter.options]
+            self.handle: Any = server.gui.add_dropdown(
+                label(parameter), options, initial_value=_words(str(value)), hint=hint
+            )
+        else:
+            step = 10.0 ** math.floor(math.log10((parameter.high - parameter.low) / _SLIDER_STEPS))
+            self.handle = server.gui.add_slider(
+                label(parameter), parameter.low, parameter.high, step, self._inside(float(value)), hint=hint
+            )
+        self.handle.on_update(lambda _: None if self._same(self.asked) else ask())
+
+    @property
+    def asked(self) -> float | str:
+        """What the widget shows, as the session understands it; a browser may have sent what is no option."""
+        if isinstance(self.parameter, Choice):
+            shown = str(self.handle.value)
+            return next((o for o in self.parameter.options if _words(o) == shown), shown)
+        return float(self.handle.value)
+
+    def take(self) -> dict[str, float | str]:
+        """The request, which from now on counts as shown."""
+        self._shown = self.asked
+        return {self.parameter.name: self._shown}
+
+    def follow(self, value: float | str) -> None:
+        """Shows what is in force, unless it is what the user asked for already."""
+        if self._same(value):
+            return
+        self._shown = value
+        self.handle.value = _words(value) if isinstance(value, str) else self._inside(value)
+
+    def _inside(self, value: float) -> float:
+        """Float32 has digits that nobody asked for, and rounds to just beyond the bounds."""
+        return min(max(float(f"{value:.6g}"), self.parameter.low), self.parameter.high)
+
+    def _same(self, value: float | str) -> bool:
+        if isinstance(value, str) or isinstance(self._shown, str):
+            return value == self._shown
+        return abs(value - self._shown) <= 1e-6 * (self.parameter.high - self.parameter.low)
+
+
+class MeasuredText:
+    """The line below a widget: what was measured, whether it complies, whether the request was out of range."""
+
+    def __init__(self, server: viser.ViserServer, parameter: Parameter) -> None:
+        self.parameter = parameter
+        self.handle = server.gui.add_markdown(trained(parameter))
+
+    def update(self, report: StyleReport, measures: list[str]) -> None:
+        """Shows the report's values of the parameter's `measures`, or says why there are none."""
+        name, found = self.parameter.name, "not measured yet"
+        shown = [
+            f"{self._name(m)}**{self._value(report.measured[m])}{self._unit(m)}**"
+            for m in measures
+            if m in report.measured
+        ]
+        if shown:
+            found = f"measured {', '.join(shown)}"
+        elif report.seconds and not measures:
+            found = "no measure of its own"
+        text = " · ".join(filter(None, [found, trained(self.parameter)]))
+        outside = report.outside.get(name)
+        if outside is not None:
+            used, unit = report.requested[name], f" {self.parameter.unit}".rstrip()
+            text += f"\n\n**Outside the trained range:** {outside:g}{unit} was asked for, {used:.3g}{unit} is used."
+        write(self.handle, text)
+
+    def _name(self, measure: str) -> str:
+        """Without the parameter's own name."""
+        rest = f"_{measure}_".replace(f"_{self.parameter.name}_", "_").strip("_")
+        return f"{_words(rest)} " if rest else ""
+
+    def _value(self, value: float) -> str:
+        """Of a choice, the share of the time in which it was met."""
+        return f"{value:.0%}" if isinstance(self.parameter, Choice) else readable_number(value)
+
+    def _unit(self, measure: str) -> str:
+        same = measure.removesuffix("_error") == self.parameter.name
+        return f" {self.parameter.unit}" if self.parameter.unit and same else ""
+
+
+class Chart:
+    """Requested against measured over the last seconds, of one parameter at a time.
+
+    The axis of time is fixed: viser's plot otherwise remembers which share of the data was in view before the first
+    were drawn, and may show a part of the axis that has none.
+
+    Args:
+        server: where to add it.
+        folder: in which folder.
+        space: the styles.
+        redraw: called in viser's threads after the user chose another parameter; `add` is to follow.
+    """
+
+    def __init__(self, server: viser.ViserServer, folder: Any, space: StyleSpace, redraw: Callable[[], None]) -> None:
+        self._server, self._folder, self._space = server, folder, space
+        self._history: deque[tuple[float, StyleReport]] = deque(maxlen=_HISTORY)
+        self._names = {_words(name): name for name in space.names}
+        numeric = [p.name for p in space.parameters if not isinstance(p, Choice)]
+        self.shown = [*numeric, *space.names][0]
+        with folder:
+            self.choice = server.gui.add_dropdown("show", list(self._names), initial_value=_words(self.shown))
+            self.note = server.gui.add_markdown("", visible=False)
+        self.choice.on_update(lambda _: redraw())
+        self.plot: Any = None
+        self._drawn: tuple[str, bool] | None = None  # parameter of the plot, and whether it has anything measured
+
+    def follow(self, name: str) -> None:
+        """Shows a parameter, because it was just asked for."""
+        if self.choice.value != _words(name):
+            self.choice.value = _words(name)
+
+    def add(self, time: float, report: StyleReport) -> None:
+        """A further point."""
+        if self._history and time < self._history[-1][0]:
+            self._history.clear()  # the session started over
+        elif self._history and time == self._history[-1][0]:
+            self._history.pop()  # shown again, for example while paused
+        self._history.append((time, report))
+        self._draw()
+
+    def _draw(self) -> None:
+        """Shows the chosen parameter: a number as it is; of a choice, the share of time in which it was met."""
+        self.shown = self._names.get(str(self.choice.value), self.shown)
+        now = self._history[-1][0]
+        rows = [
+            (moment - now, self._requested(report), self._measured(report))
+            for moment, report in self._history
+            if moment >= now - _SPAN
+        ]
+        measured = [row for row in rows if math.isfinite(row[2])]  # uPlot draws nothing at all if there are NaN
+        columns = np.array(measured or rows, dtype=float).T
+        self._plot((self.shown, bool(measured)), tuple(columns if measured else columns[:2]))
+        write(self.note, f"{_words(self.shown)}: nothing was measured in the last {_SPAN:g} s")
+        if self.note.visible == bool(measured):
+            self.note.visible = not measured
+
+    def _plot(self, kind: tuple[str, bool], data: tuple[np.ndarray, ...]) -> None:
+        """Draws data in a plot of their kind: for another kind a new plot, so that its settings change together."""
+        if kind == self._drawn:
+            self.plot.data = data
+            return
+        if self.plot is not None:
+            self.plot.remove()
+        with self._folder:
+            self.plot = self._server.gui.add_uplot(data=data, height=190, **self._layout(*kind))
+        self._drawn = kind
+
+    def _layout(self, name: str, measured: bool) -> dict[str, Any]:
+        """Of a parameter: a weight and what it brings about have no common unit, hence an axis each."""
+        import viser.uplot as uplot
+
+        series = [uplot.Series(label="seconds ago"), uplot.Series(label="requested", stroke=_REQUESTED, width=2)]
+        axes = [uplot.Axis(size=34), uplot.Axis(size=48)]
+        apart = measured and isinstance(self._space[name], Weight)
+        if apart:
+            axes.append(uplot.Axis(scale="right", side=1, size=56, stroke=_MEASURED, grid=uplot.Axis_Grid(show=False)))
+        if measured:
+            label, scale = ("measured (right)", "right") if apart else ("measured", "y")
+            dots = uplot.Series_Points(show=True, size=3, fill=_MEASURED)  # where it was measured; lines only join them
+            series.append(uplot.Series(label=label, stroke=_MEASURED, width=2, scale=scale, points=dots))
+        return {
+            "series": tuple(series),
+            "scales": {"x": uplot.Scale(time=False, range=(-_SPAN, 0.0))},
+            "axes": tuple(axes),
+        }
+
+    def _requested(self, report: StyleReport) -> float:
+        value = report.requested[self.shown]
+        return 1.0 if isinstance(value, str) else value
+
+    def _measured(self, report: StyleReport) -> float:
+        measures = measures_by_parameter(self._space, report.measured)[self.shown]
+        return report.measured[measures[0]] if measures else math.nan
+
+
+def label(parameter: Parameter) -> str:
+    """Name and unit."""
+    return _words(parameter.name) + (f" [{parameter.unit}]" if parameter.unit else "")
+
+
+def trained(parameter: Parameter) -> str:
+    """The trained range, of a number."""
+    if isinstance(parameter, Choice):
+        return ""
+    return f"trained {parameter.low:g} to {parameter.high:g} {parameter.unit}".rstrip()
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def write(handle: Any, text: str) -> None:
+    """Only what changed is sent to the browsers."""
+    if handle.content != text:
+        handle.content = text

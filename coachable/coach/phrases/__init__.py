@@ -1,0 +1,1 @@
+"""Phrases such as "shorter steps" read as changes of a style, by rules."""

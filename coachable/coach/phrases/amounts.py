@@ -1,0 +1,135 @@
+"""What a request asks of a number: "0.4 m", "a bit longer", "twice as much", "avoid"."""
+
+from __future__ import annotations
+
+from typing import cast
+
+from coachable.coach.phrases.segments import Segment
+from coachable.coach.phrases.vocabulary import ANY, PERCENT, PLAINLY, SLIGHTLY, STRONGLY, TURNS, UNITS, stem
+from coachable.styles import Choice, Setpoint, Weight
+
+Last = tuple[tuple[str, ...], float]  # parameters and direction of a change
+
+_QUALITY = 0.85  # share of the range that an adjective such as "careful" asks for
+
+
+def amount(p: Weight | Setpoint, segment: Segment, now: float, last: Last | None, spent: bool = False) -> float | str:
+    """The value that a request asks for.
+
+    Args:
+        p: the parameter it is about.
+        segment: the request.
+        now: value in force.
+        last: the last change, to which "a bit more" refers.
+        spent: whether the parameter rewards saving what it is named after: "less fuel" asks for more of it.
+
+    Returns:
+        The value, possibly outside the range where a number was given; or, as text, what is missing.
+    """
+    compared = segment.direction is not None or segment.level is not None
+    sense = segment.sense or (-1 if spent and compared else 0)
+    sign = _sign(segment, p, last, sense)
+    if segment.number is not None:
+        return _given(p, segment, now, sign, sense)
+    if segment.keep and sign is None and segment.only_degree:
+        return now
+    if segment.negated and segment.direction is not None:
+        return now  # "not longer" asks for no change
+    if segment.factor is not None:
+        return now / segment.factor if sense < 0 else now * segment.factor
+    if sign is not None:
+        return _moved(p, segment, now, sign)
+    if segment.level is not None:
+        return _level(p, 1.0 - segment.level if sense < 0 else segment.level, segment.degree)
+    if segment.default:
+        return default_of(p)
+    if isinstance(p, Weight):
+        return _weight(p, segment, spent)
+    if sense:
+        return _level(p, _QUALITY if (sense > 0) != segment.negated else 1.0 - _QUALITY, segment.degree)
+    return f"how much? {p.name.replace('_', ' ')} goes from {p.low:g} to {p.high:g} {p.unit}".rstrip()
+
+
+def dimension_of(parameter: Weight | Setpoint | Choice) -> str:
+    """What a parameter measures, by its unit."""
+    return UNITS.get(stem(parameter.unit), (ANY, 1.0))[0] if parameter.unit else ANY
+
+
+def default_of(parameter: Weight | Setpoint) -> float:
+    """Declared or derived, it is never None once the parameter exists."""
+    return cast(float, parameter.default)
+
+
+def wrapped(p: Weight | Setpoint | Choice, value: float) -> float:
+    """The same direction within the range of a parameter that goes full circle; other values as they are."""
+    if _is_circle(p) and not p.low <= value <= p.high:
+        return p.low + (value - p.low) % 360.0
+    return value
+
+
+def _is_circle(p: Weight | Setpoint | Choice) -> bool:
+    return p.unit == "deg" and p.high - p.low == 360.0
+
+
+def _sign(segment: Segment, p: Weight | Setpoint, last: Last | None, sense: int) -> float | None:
+    """+1 or -1 for a change relative to the value in force."""
+    same = last is not None and p.name in last[0]
+    turn = -1.0 if sense < 0 and segment.dimension == ANY else 1.0  # "closer" is closer, also of "careful"
+    if segment.direction is not None:
+        dimension, sign = segment.direction
+        if last is not None and same and segment.repeated and dimension == ANY and not segment.mentions:
+            return sign * last[1]  # "a bit more" of what was asked before
+        return sign * turn
+    if segment.level is not None:
+        relative = (segment.too or segment.negated) and segment.level != 0.5
+        return (-turn if segment.level > 0.5 else turn) if relative else None
+    if segment.mentions and segment.only_degree and (segment.too or (segment.negated and "so" in segment.words)):
+        return -turn  # "too much fire", "not so careful"
+    return last[1] if last is not None and same and segment.repeated else None
+
+
+def _moved(p: Weight | Setpoint, segment: Segment, now: float, sign: float) -> float:
+    degree = segment.degree or (SLIGHTLY if segment.negated else PLAINLY)
+    if _is_circle(p):
+        return now + sign * TURNS[degree] * 360.0
+    return min(max(now + sign * degree * (p.high - p.low), p.low), p.high)
+
+
+def _level(p: Weight | Setpoint, share: float, degree: float) -> float:
+    """Of an adjective, such as "short" or "very short"."""
+    if degree == STRONGLY and share != 0.5:
+        share = float(round(share))
+    elif degree == SLIGHTLY:
+        share = 0.5 + (share - 0.5) / 2
+    return share * p.high if isinstance(p, Weight) else p.low + share * (p.high - p.low)
+
+
+def _weight(p: Weight, segment: Segment, spent: bool) -> float:
+    """Of a mere mention: "fire", "a bit of fire", "avoid fire"; "save fuel", "do not save fuel", "use fuel"."""
+    if segment.negated and not segment.sense and not spent:
+        return p.low
+    if segment.negated != (segment.sense < 0):
+        return 0.0
+    return p.high / 4 if segment.degree == SLIGHTLY else p.high
+
+
+def _given(p: Weight | Setpoint, segment: Segment, now: float, sign: float | None, sense: int) -> float | str:
+    """Of a number that was said."""
+    assert segment.number is not None
+    number, unit = segment.number
+    if segment.negated:
+        return "say what instead"
+    if unit in PERCENT:
+        if sign is not None and not segment.absolute:
+            return now * (1 + sign * number / 100)
+        share = number / 100
+        return p.low + (p.high - p.low) * (1.0 - share if sense < 0 else share)
+    if unit:
+        if dimension_of(p) != UNITS[unit][0]:
+            return f"{p.name.replace('_', ' ')} is no {UNITS[unit][0]}" + (f", it is in {p.unit}" if p.unit else "")
+        number = number * UNITS[unit][1] / UNITS[stem(p.unit)][1]
+    if segment.signed or (number < 0 and p.low >= 0):
+        return now + number
+    if sign is not None and not segment.absolute and segment.level is None:
+        return now + sign * number
+    return float(f"{number:.9g}")

@@ -1,0 +1,256 @@
+"""A phrase cut into single requests."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from coachable.coach.phrases.vocabulary import (
+    ABSOLUTE,
+    DEFAULTS,
+    DEGREES,
+    DIRECTIONS,
+    FACTORS,
+    FILLERS,
+    KEEPS,
+    LEVELS,
+    NEGATIONS,
+    PERCENT,
+    PREFERENCES,
+    REPEATS,
+    SEPARATORS,
+    UNITS,
+    stem,
+)
+
+
+@dataclass(frozen=True)
+class Mention:
+    """What a word or phrase of the lexicon names.
+
+    Attributes:
+        names: parameters; several for a word such as "room", which is about the gaps on all sides.
+        value: an option or a number, if the word stands for one.
+        sign: +1 if the word asks for more of the parameters ("careful" for gaps), -1 if for less ("aggressive"), 0 if
+            it only names them ("gap").
+    """
+
+    names: tuple[str, ...]
+    value: float | str | None = None
+    sign: int = 0
+
+
+@dataclass
+class Segment:
+    """One request: at most one parameter, and what is asked of it.
+
+    Attributes:
+        words: as they were said.
+        mentions: parameters and options named.
+        direction: dimension and sign of a comparative.
+        level: share of the range of an adjective.
+        dimension: what the words measure, "" if anything.
+        number: value and unit, "" if none was said.
+        degree: strength, 0 if none was said.
+        factor: of "twice" and the like.
+        unknown: words without a meaning here.
+    """
+
+    words: list[str] = field(default_factory=list)
+    mentions: list[Mention] = field(default_factory=list)
+    direction: tuple[str, float] | None = None
+    level: float | None = None
+    dimension: str = ""
+    number: tuple[float, str] | None = None
+    degree: float = 0.0
+    factor: float | None = None
+    unknown: list[str] = field(default_factory=list)
+    negated: bool = False
+    preferred: bool = False
+    default: bool = False
+    keep: bool = False
+    repeated: bool = False
+    absolute: bool = False
+    signed: bool = False
+
+    @property
+    def text(self) -> str:
+        """What was said."""
+        return " ".join(self.words)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters that all mentions have in common: "the bow of the hunter" is one bow."""
+        first, *others = (mention.names for mention in self.mentions) if self.mentions else ((),)
+        return tuple(name for name in first if all(name in names for names in others))
+
+    @property
+    def sense(self) -> int:
+        """+1 or -1 if the words ask for more or less of the parameters; 0 if they only name them."""
+        return math.prod(signs) if (signs := [m.sign for m in self.mentions if m.sign]) else 0
+
+    @property
+    def too(self) -> bool:
+        """Whether something is too much; at the end of a request "too" means "also"."""
+        return "too" in self.words[:-1]
+
+    @property
+    def has_head(self) -> bool:
+        """Whether it asks for something, be it of an unnamed parameter."""
+        asked = (self.direction, self.level, self.number, self.factor)
+        return any(part is not None for part in asked) or self.default or self.repeated or self.keep or self.degree > 0
+
+    @property
+    def only_degree(self) -> bool:
+        """Whether it says how much, but not of what nor in which direction."""
+        return (self.direction, self.level, self.number, self.factor) == (None,) * 4
+
+    @property
+    def complete(self) -> bool:
+        """Whether another request may begin here."""
+        valued = any(mention.value is not None for mention in self.mentions)
+        head = any(part is not None for part in (self.direction, self.level, self.number, self.factor))
+        return valued or bool(self.mentions and head)
+
+
+def split(tokens: Sequence[str], lexicon: Mapping[tuple[str, ...], Mention]) -> list[Segment]:
+    """Cuts a phrase at punctuation, conjunctions, and where a request is complete and another begins.
+
+    The work grows in proportion to the number of tokens.
+
+    Args:
+        tokens: from `tokenise`.
+        lexicon: what stemmed words name.
+    """
+    sizes, named_ahead = _look_up(tokens, lexicon)
+    stems = [stem(token) for token in tokens]
+    found, segment, i = [], Segment(), 0
+    while i < len(tokens):
+        size = sizes[i]
+        mention = lexicon[tuple(stems[i : i + size])] if size else None
+        if mention is None and tokens[i] in SEPARATORS:
+            found.append(segment)
+            segment, i = Segment(), i + 1
+            continue
+        if _begins_another(segment, tokens[i : i + 2], mention, named_ahead[i]):
+            found.append(segment)
+            segment = Segment()
+        if mention is not None:
+            segment.words += tokens[i : i + size]
+            if mention not in segment.mentions:
+                segment.mentions.append(mention)
+            i += size
+        else:
+            i += _take(segment, tokens, i)
+    found.append(segment)
+    return _tidy(found)
+
+
+def _look_up(tokens: Sequence[str], lexicon: Mapping[tuple[str, ...], Mention]) -> tuple[list[int], list[bool]]:
+    """Finds what the lexicon names at each token.
+
+    Returns:
+        The number of tokens of the longest entry that begins there, 0 if none does; and whether an entry lies between
+        there and the next separator.
+    """
+    longest = max((len(words) for words in lexicon), default=1)
+    stems = [stem(token) for token in tokens]
+    sizes, named_ahead = [0] * len(tokens), [False] * len(tokens)
+    ahead, clear = False, 0  # `clear` counts the tokens before the next separator
+    for i in reversed(range(len(tokens))):
+        fitting = [n for n in range(min(longest, len(tokens) - i), 0, -1) if tuple(stems[i : i + n]) in lexicon]
+        sizes[i] = fitting[0] if fitting else 0
+        clear = 0 if stems[i] in SEPARATORS else clear + 1
+        ahead = clear > 0 and (ahead or any(n <= clear for n in fitting))
+        named_ahead[i] = ahead
+    return sizes, named_ahead
+
+
+def _begins_another(segment: Segment, rest: Sequence[str], mention: Mention | None, named_ahead: bool) -> bool:
+    if mention is not None:
+        other = bool(segment.mentions) and not set(segment.names) & set(mention.names)
+        # "arms up": the option completes what the noun began
+        return other or (mention.value is not None and segment.complete)
+    if not segment.complete:
+        return False
+    word = rest[0]
+    if word in NEGATIONS:
+        return True
+    if word in LEVELS or word in DIRECTIONS:
+        # "arms up high" is one request, "arms up high speed" are two
+        dimension = (LEVELS.get(word) or DIRECTIONS[word])[0]
+        return segment.number is None and (named_ahead or bool(dimension))
+    # A degree belongs to what follows it, if something does: "shorter steps much more melee".
+    return word in DEGREES and len(rest) > 1 and (rest[1] in DIRECTIONS or rest[1] in LEVELS)
+
+
+def _take(segment: Segment, tokens: Sequence[str], i: int) -> int:
+    """Notes what a word means; returns how many tokens were used."""
+    word = tokens[i]
+    segment.words.append(word)
+    if word[-1].isdigit() and not math.isfinite(float(word)):
+        segment.unknown.append(word)
+    elif word[-1].isdigit():
+        segment.signed = word.startswith("+")
+        unit = stem(tokens[i + 1]) if i + 1 < len(tokens) else ""
+        if unit in PERCENT or unit in UNITS:
+            segment.words.append(tokens[i + 1])
+            segment.number = (float(word), unit)
+            segment.dimension = segment.dimension or UNITS.get(unit, ("", 1.0))[0]
+            return 2
+        segment.number = (float(word), "")
+    elif word in NEGATIONS:
+        segment.negated = not segment.negated
+    elif word in DIRECTIONS:
+        segment.direction = segment.direction or DIRECTIONS[word]
+        segment.dimension = segment.dimension or DIRECTIONS[word][0]
+        segment.repeated |= word in REPEATS
+    elif word in LEVELS:
+        segment.dimension, segment.level = segment.dimension or LEVELS[word][0], LEVELS[word][1]
+    elif word in FACTORS:
+        segment.factor = FACTORS[word]
+    elif word == "possible" and segment.level is not None:
+        segment.level = float(round(segment.level))
+    else:
+        _take_modifier(segment, word)
+    return 1
+
+
+def _take_modifier(segment: Segment, word: str) -> None:
+    known = word in FILLERS
+    if word in DEGREES:
+        segment.degree = max(segment.degree, DEGREES[word])
+        known = True
+    if word in PREFERENCES:
+        segment.preferred = known = True
+    if word in DEFAULTS:
+        segment.default = known = True
+    if word in KEEPS:
+        segment.keep = known = True
+    if word in REPEATS:
+        segment.repeated = known = True
+    if word in ABSOLUTE:
+        segment.absolute |= word != "by"
+        known = True
+    if not known:
+        segment.unknown.append(word)
+
+
+def _tidy(found: list[Segment]) -> list[Segment]:
+    """Drops empty segments and joins what a comma tore apart: "steps, shorter", "shorter steps, just a bit"."""
+    kept: list[Segment] = []
+    for segment in found:
+        asks = segment.mentions or segment.unknown or segment.has_head or segment.negated or segment.preferred
+        if not asks or segment.words == ["no"]:
+            continue
+        before = kept[-1] if kept else None
+        anonymous = not (segment.mentions or segment.unknown)
+        if before is not None and anonymous and segment.degree and segment.only_degree:
+            before.degree = segment.degree
+        elif before is not None and anonymous and before.mentions and not (before.has_head or before.complete):
+            segment.mentions, segment.words = before.mentions, [*before.words, *segment.words]
+            kept[-1] = segment
+        else:
+            kept.append(segment)
+    return kept

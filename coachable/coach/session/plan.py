@@ -1,0 +1,47 @@
+"""A schedule of styles written in words: "0: T-pose; 3: arms up, shorter steps"."""
+
+from __future__ import annotations
+
+import re
+
+from coachable.coach.phrases.grammar import Value
+from coachable.coach.session.session import CoachSession
+
+MAX_PLAN = 20_000  # characters
+_ENTRY = re.compile(r"\s*(\d+(?:\.\d+)?)\s*(?:s\b)?\s*[: ]\s*(.+)")
+
+
+def read_plan(text: str, session: CoachSession) -> dict[float, dict[str, Value]]:
+    """Reads a schedule, to be handed to `CoachSession.schedule`.
+
+    Args:
+        text: `SECONDS: PHRASE`, separated by semicolons or new lines. Each phrase is understood relative to the style
+            before it, or names a preset. At most 20,000 characters.
+        session: whose style space, words and presets to use; it is not changed.
+
+    Raises:
+        ValueError: naming the entry that was not understood.
+    """
+    if len(text) > MAX_PLAN:
+        raise ValueError(f"the schedule has {len(text):,} characters, at most {MAX_PLAN:,} are read")
+    example = f"'3: {next(iter(session.grammar.examples), 'default')}'"
+    style, plan, previous = dict(session.style), {}, None
+    for entry in filter(str.strip, re.split(r"[;\n]", text)):
+        match = _ENTRY.fullmatch(entry)
+        if match is None:
+            raise ValueError(f"'{entry.strip()}' is no SECONDS: PHRASE, such as {example}")
+        seconds, phrase = float(match[1]), match[2].strip()
+        preset = next((values for name, values in session.presets.items() if name.lower() == phrase.lower()), None)
+        if preset is None:
+            previous = session.grammar.read(phrase, style | session.controls, previous)
+            fixed = [name for name in previous.changes if name not in session.space]
+            hint = [f"try: {', '.join(previous.examples)}"] if previous.examples else []
+            if previous.failed or fixed:
+                problems = [*previous.failed, *(f"{name} is no style" for name in fixed), *hint]
+                raise ValueError(f"at {seconds:g} s: " + "; ".join(problems))
+            preset = previous.changes
+        style |= preset
+        plan[seconds] = plan.get(seconds, {}) | preset
+    if not plan:
+        raise ValueError(f"the schedule is empty: write SECONDS: PHRASE, such as {example}")
+    return plan

@@ -1,0 +1,396 @@
+"""`CoachSession`: an agent that acts while somebody tells it how. Headless; the page and scripts are its clients."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from coachable.coach.phrases.grammar import StyleGrammar, Understanding
+from coachable.coach.session.coaching import Coaching, coaching_of
+from coachable.coach.session.episodes import LiveEpisodes
+from coachable.coach.session.readout import MeasuredWindow, StyleReport
+from coachable.coach.session.recording import Recording, check_seed
+from coachable.coach.session.timeline import Timeline
+from coachable.domain import Domain
+from coachable.styles import Choice, StyleSpace, Weight
+from coachable.training.weights import domain_of, load_policy
+
+
+class CoachSession:
+    """One agent in one environment, coached while it acts.
+
+    A request applies at the next observation: what `set` writes is what the policy sees in the following `step`. The
+    request stays in force through resets while `hold` is true; otherwise each episode draws a style as in training.
+    An episode that has ended is reset by the following `step`.
+
+    Args:
+        policy: reads `observation` and `style`, writes `action`.
+        space: the styles it was trained on.
+        domain: where it acts.
+        source: where the policy came from, kept in recordings.
+        seed: of the initial states and drawn styles.
+        style: first request, by parameter name; the space's default for those left out.
+        strict: raise for a request outside the trained range instead of clamping it with a warning.
+        endless: go on when the domain's time limit is reached.
+        window: length of the measured window [s].
+        coaching: live controls, words and presets; by default those of the domain.
+
+    Attributes:
+        policy: see above; may be exchanged between steps.
+        presets: named styles, yours to extend.
+        grammar: reads the phrases of `say`.
+        hold: see above.
+
+    Example:
+        >>> session = CoachSession.open("humanoid", seed=1)
+        >>> session.set(pose="t_pose", step_length=0.5)
+        >>> transition = session.step()
+        >>> session.style["pose"]
+        't_pose'
+        >>> session.close()
+    """
+
+    def __init__(
+        self,
+        policy: TensorDictModuleBase,
+        space: StyleSpace,
+        domain: Domain,
+        *,
+        source: str = "",
+        seed: int = 0,
+        style: Mapping[str, float | str] | None = None,
+        strict: bool = False,
+        endless: bool = True,
+        window: float = 2.0,
+        coaching: Coaching | None = None,
+    ) -> None:
+        self.policy, self.space, self.domain, self.source = policy, space, domain, source
+        self.coaching = (coaching_of(domain.name) if coaching is None else coaching).fitting(space)
+        self.strict, self.hold, self.window = strict, True, window
+        self._episodes = LiveEpisodes(domain, space, endless=endless, terminated=self.coaching.terminated)
+        self.presets: dict[str, dict[str, Any]] = {"default": space.describe(space.default)}
+        self.presets |= {name: dict(style) for name, style in self.coaching.presets.items()}
+        self._controls = {control.parameter.name: control for control in self.coaching.controls}
+        self._control_values = {name: cast(float, c.parameter.default) for name, c in self._controls.items()}
+        self.grammar = StyleGrammar(
+            [*space.parameters, *(control.parameter for control in self.coaching.controls)],
+            self.coaching.vocabulary,
+            self.coaching.examples,
+        )
+        self._understood: Understanding | None = None
+        self._recent = MeasuredWindow(domain.measures, round(window / domain.control_step))
+        self._outside: dict[str, float] = {}
+        self._theta = space.make(strict=strict, **(style or {}))
+        self.reset(seed)
+
+    @classmethod
+    def open(cls, source: str | Path, **settings: Any) -> CoachSession:
+        """Opens a trained agent.
+
+        Args:
+            source: name of a domain that ships with weights, a run's folder, a checkpoint or a weights file.
+            **settings: as for the constructor.
+
+        Raises:
+            CheckpointError: if there is no such agent, or it is of another version.
+        """
+        agent = load_policy(source)
+        domain = domain_of(agent)
+        return cls(agent.actor, agent.space, domain, source=str(source), **settings)
+
+    # -- requests --------------------------------------------------------------------------------------------------
+
+    @property
+    def style(self) -> dict[str, float | str]:
+        """The request in force, by parameter name."""
+        return self.space.describe(self._theta)
+
+    @property
+    def controls(self) -> dict[str, float]:
+        """The live controls, such as the humanoid's course [deg]."""
+        return dict(self._control_values)
+
+    def set(self, **values: float | str) -> None:
+        """Asks for another style from the next observation on; what is not named stays as it is.
+
+        Args:
+            **values: a number per `Weight` or `Setpoint`, an option's name per `Choice`.
+
+        Raises:
+            ValueError: for an unknown name or option, NaN, or in strict mode a number outside the trained range. The
+                request in force then stays.
+        """
+        theta = self.space.make(strict=self.strict, **(self.style | values))
+        self._timeline.take_over()
+        self._request(theta, values)
+
+    def apply(self, preset: str) -> None:
+        """Asks for a preset.
+
+        Raises:
+            ValueError: if there is none of that name.
+        """
+        if preset not in self.presets:
+            raise ValueError(f"no preset named {preset!r}: expected one of {list(self.presets)}")
+        self.set(**self.presets[preset])
+
+    def steer(self, **values: float) -> None:
+        """Sets live controls from the next step on; a circular one wraps around, others stop at their ends.
+
+        Raises:
+            ValueError: for an unknown control or NaN.
+        """
+        for name in values:
+            if name not in self._controls:
+                raise ValueError(f"no live control named {name!r}: {self.domain.name} has {list(self._controls)}")
+        fitted = {name: self._controls[name].fit(float(value)) for name, value in values.items()}
+        self._timeline.take_over()
+        self._apply({"controls": fitted})
+
+    def say(self, phrase: str) -> Understanding:
+        """Asks in words: "shorter steps, arms up", "0.4 m", "a bit more", or a preset's name.
+
+        Returns:
+            What was understood, and what was not. Only what was understood is asked for.
+
+        Raises:
+            ValueError: in strict mode, for a number outside the trained range.
+        """
+        understood = self.understand(phrase)
+        self.follow(understood)
+        return understood
+
+    def understand(self, phrase: str) -> Understanding:
+        """What `say` takes a phrase to mean; asks for nothing yet, and may be called beside the thread that steps."""
+        preset = next((name for name in list(self.presets) if name.lower() == phrase.strip().lower()), None)
+        if preset is not None:
+            return Understanding(phrase, dict(self.presets[preset]), (f"preset {preset}",), ())
+        return self.grammar.read(phrase, self.style | self.controls, self._understood)
+
+    def follow(self, understood: Understanding) -> None:
+        """Asks for what was understood.
+
+        Raises:
+            ValueError: in strict mode, for a number outside the trained range.
+        """
+        style = {name: value for name, value in understood.changes.items() if name in self.space}
+        controls = {name: float(value) for name, value in understood.changes.items() if name in self._controls}
+        if style:
+            self.set(**style)
+        if controls:
+            self.steer(**controls)
+        self._understood = understood
+
+    def schedule(self, plan: Mapping[float, Mapping[str, float | str] | str]) -> None:
+        """Asks for styles at given times from now on [s], each a style or a preset's name; replaces an earlier plan.
+
+        Raises:
+            ValueError: for a negative time or a style that `set` would refuse; nothing is scheduled then.
+        """
+        agenda: dict[int, dict[str, Any]] = {}
+        for seconds, style in sorted(plan.items()):
+            if not 0.0 <= seconds < math.inf:
+                raise ValueError(f"the plan has the time {seconds}: expected seconds from now on, 0 or more")
+            if isinstance(style, str) and style not in self.presets:
+                raise ValueError(f"no preset named {style!r}: expected one of {list(self.presets)}")
+            values = self.presets[style] if isinstance(style, str) else dict(style)
+            theta = self.space.make(strict=self.strict, **(self.style | values))
+            request = {name: value for name, value in self.space.describe(theta).items() if name in values}
+            agenda[round(seconds / self.domain.control_step)] = {"style": request}
+        self._timeline.plan(agenda)
+
+    @property
+    def scheduled(self) -> int:
+        """Number of requests that are still to come, of a plan or a replay."""
+        return self._timeline.coming
+
+    def cancel(self) -> None:
+        """Drops the rest of a plan or replay; the request in force stays."""
+        self._timeline.cancel()
+
+    # -- acting ----------------------------------------------------------------------------------------------------
+
+    def reset(self, seed: int | None = None) -> None:
+        """Starts a new episode; with a seed the session starts over, and with it the recording.
+
+        Style and live controls stay; a plan is dropped.
+
+        Raises:
+            ValueError: if the seed is negative or has more than 63 bits.
+        """
+        if seed is None:
+            self.cancel()
+            self._apply({"reset": True})
+            return
+        check_seed(seed)
+        self._timeline = Timeline(
+            Recording(self.domain.name, self.source, seed, self.style, self.controls, self._episodes.endless)
+        )
+        self._steps_at_request = 0
+        self._complied_at: int | None = None
+        self._generator = torch.Generator().manual_seed(seed)
+        self._episodes.seed(seed)
+        self._steer_env()
+        self._begin_episode()
+
+    @property
+    def step_count(self) -> int:
+        """Steps since the session was last seeded."""
+        return self._timeline.step
+
+    @torch.no_grad()
+    def step(self) -> TensorDictBase:
+        """One control step under the request in force.
+
+        Returns:
+            The transition, batch shape (1,), as `env.step` gives it.
+
+        Raises:
+            ReplayMismatch: if a replay differs from its recording; a further `step` goes on without checking.
+        """
+        for event in self._timeline.due():
+            self._apply(event)
+        if self.ended is not None:
+            self._begin_episode()
+        transition = self._episodes.step(self.policy, self._theta)
+        self._recent.add(transition)
+        if self._complied_at is None and self._recent.complies():
+            self._complied_at = self.step_count + 1
+        self._timeline.advance(self._episodes.observation)
+        return transition
+
+    def run(self, seconds: float, on_step: Callable[[CoachSession], None] | None = None) -> None:
+        """Steps for so long, in simulated time [s]."""
+        for _ in range(round(seconds / self.domain.control_step)):
+            self.step()
+            if on_step is not None:
+                on_step(self)
+
+    # -- measuring -------------------------------------------------------------------------------------------------
+
+    def report(self) -> StyleReport:
+        """Requested against measured style over the window, which begins anew with each request and episode."""
+        summary = self._recent.summary()
+        return StyleReport(
+            requested=self.style,
+            measured={name: value for name, value in summary.items() if math.isfinite(value)},
+            unmeasured=tuple(name for name, value in summary.items() if not math.isfinite(value)),
+            seconds=len(self._recent) * self.domain.control_step,
+            outside=dict(self._outside),
+            asks=any(not isinstance(p, Weight) or self.style[p.name] for p in self.space.parameters),
+            complying=self._recent.complying(),
+            needs=self._recent.needs,
+            complied_after=None if self._complied_at is None else self._seconds(self._complied_at),
+            since_request=self._seconds(self.step_count),
+            episode=self._episodes.number,
+            episode_time=self._episodes.steps * self.domain.control_step,
+            ended=self.ended,
+            endings=dict(self._episodes.endings),
+        )
+
+    @property
+    def ended(self) -> str | None:
+        """Why the episode is over, None while it runs."""
+        return self._episodes.ended
+
+    @property
+    def env(self) -> EnvBase:
+        """The environment, of batch size 1, with its style transforms."""
+        return self._episodes.env
+
+    @property
+    def base_env(self) -> EnvBase:
+        """The domain's own environment, below the transforms."""
+        return self._episodes.base_env
+
+    def replica(self) -> CoachSession:
+        """Another session of the same agent, in an environment of its own."""
+        return CoachSession(
+            self.policy, self.space, self.domain, source=self.source, window=self.window, coaching=self.coaching
+        )
+
+    def close(self) -> None:
+        """Releases the environment."""
+        self._episodes.close()
+
+    # -- recording -------------------------------------------------------------------------------------------------
+
+    def recording(self) -> Recording:
+        """What happened since the session was last seeded, as a copy."""
+        return self._timeline.recording(self._episodes.observation)
+
+    def replay(self, recording: Recording) -> None:
+        """Starts over as recorded; the following `recording.steps` steps repeat the session bit for bit.
+
+        Any request, steering or reset in between takes over from the replay.
+
+        Raises:
+            ValueError: if the recording belongs to another domain, style space or set of controls; the session then
+                goes on as it was.
+        """
+        recording.check(self.domain.name, self.space, self._controls)
+        self._theta, self._outside = self.space.make(strict=True, **recording.style), {}
+        self._control_values |= recording.controls
+        self._episodes.endless = recording.endless
+        self.reset(recording.seed)
+        self._timeline.repeat(recording)
+
+    @property
+    def replaying(self) -> bool:
+        """Whether a replay is under way; false after its last step."""
+        return self._timeline.replayed is not None
+
+    # -- inside ----------------------------------------------------------------------------------------------------
+
+    def _apply(self, event: Mapping[str, Any]) -> None:
+        """Carries out an event now, and records it."""
+        if "style" in event:
+            self._request(self.space.make(**(self.style | event["style"])), event["style"])
+        if "controls" in event:
+            self._control_values |= event["controls"]
+            self._steer_env()
+            self._timeline.note({"controls": dict(event["controls"])})
+        if "reset" in event:
+            self._timeline.note({"reset": True})
+            self._begin_episode()
+
+    def _request(self, theta: Tensor, asked: Mapping[str, Any]) -> None:
+        """Puts a style in force; `asked` is what led to it, perhaps beyond the trained range."""
+        self._outside = {name: v for name, v in {**self._outside, **asked}.items() if self._is_outside(name, v)}
+        before = self.style
+        self._theta = theta
+        changed = {name: value for name, value in self.style.items() if value != before[name]}
+        if changed:
+            self._steps_at_request, self._complied_at = self.step_count, None
+            self._recent.clear()
+            self._timeline.note({"style": changed})
+
+    def _begin_episode(self) -> None:
+        # The first episode has the style that was asked for, and a replay those that were drawn.
+        if not self.hold and self._episodes.number and not self.replaying:
+            drawn = self.space.sample((), self._generator)
+            self._request(drawn, self.space.describe(drawn))
+        self._episodes.begin(self._theta)
+        self._recent.clear()
+
+    def _steer_env(self) -> None:
+        for name, value in self._control_values.items():
+            self._controls[name].apply(self.base_env, value)
+
+    def _is_outside(self, name: str, value: float | str) -> bool:
+        parameter = self.space[name]
+        if isinstance(parameter, Choice):
+            return False
+        return not np.float32(parameter.low) <= np.float32(value) <= np.float32(parameter.high)
+
+    def _seconds(self, step: int) -> float:
+        return (step - self._steps_at_request) * self.domain.control_step

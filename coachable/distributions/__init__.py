@@ -1,0 +1,1 @@
+"""Distributions over actions and returns: pure numerics."""

@@ -1,0 +1,226 @@
+"""Positive-part categorical heads with the regret-matching gradient, and samples from them (Appendix B).
+
+Pure torch. Several heads are handled at once: their values come concatenated, `(..., sum of sizes)`, and are computed
+on padded, `(..., heads, widest head)`, so that six gamepad heads cost as many kernels as one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, get_args
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from coachable.distributions.tanh_gaussian import at_least_float32
+
+RegretGradient = Literal["dpi", "du", "chain"]
+
+EPSILON = 1e-8
+"""Mass shared by the values of a head, so that none has probability zero (Appendix B)."""
+
+# Preferences beyond this all mean "the only choice"; keeps the sum of a head finite in float32.
+_LARGEST_PREFERENCE = 1e30
+# Exponential draws below one float32 rounding of a uniform draw are not representable; bounds y/pi by about 4e8.
+_SMALLEST_EXPONENTIAL = 2.0**-25
+
+
+class HeadLayout:
+    """How the values of several categorical heads lie in one concatenated tensor.
+
+    Args:
+        sizes: Number of values of each head, each at least 2.
+
+    Raises:
+        ValueError: If there is no head, or one has fewer than 2 values.
+
+    Example:
+        >>> layout = HeadLayout((2, 3))
+        >>> layout.pad(torch.tensor([1.0, 2.0, 3.0, 4.0, 5.0])).tolist()
+        [[1.0, 2.0, 0.0], [3.0, 4.0, 5.0]]
+    """
+
+    def __init__(self, sizes: Sequence[int]) -> None:
+        self.sizes = tuple(int(size) for size in sizes)
+        if not self.sizes or min(self.sizes) < 2:
+            raise ValueError(f"categorical heads need at least 2 values each, got sizes {tuple(sizes)}")
+        self.total = sum(self.sizes)
+        self.width = max(self.sizes)
+        self.uniform_width = min(self.sizes) == self.width
+        self._constants: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor, Tensor]] = {}
+
+    def __len__(self) -> int:
+        return len(self.sizes)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, HeadLayout) and self.sizes == other.sizes
+
+    def __hash__(self) -> int:
+        return hash(self.sizes)
+
+    def __repr__(self) -> str:
+        return f"HeadLayout({self.sizes})"
+
+    def __deepcopy__(self, memo: dict) -> HeadLayout:
+        return HeadLayout(self.sizes)
+
+    def __reduce__(self) -> tuple:
+        return HeadLayout, (self.sizes,)
+
+    def constants(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Index into the padded source, index back, and epsilon per padded entry (0 where there is no value)."""
+        key = (like.device, like.dtype)
+        if key not in self._constants:
+            into, back, epsilon, first = [], [], [], 0
+            for head, size in enumerate(self.sizes):
+                padding = self.width - size
+                into += [*range(first, first + size), *[self.total] * padding]
+                back += range(head * self.width, head * self.width + size)
+                epsilon += [EPSILON / size] * size + [0.0] * padding
+                first += size
+            self._constants[key] = (
+                torch.tensor(into, device=like.device),
+                torch.tensor(back, device=like.device),
+                torch.tensor(epsilon, device=like.device, dtype=like.dtype).view(len(self), self.width),
+            )
+        return self._constants[key]
+
+    def pad(self, values: Tensor) -> Tensor:
+        """Concatenated `(..., total)` to padded `(..., heads, width)`, zeros where a head is narrower."""
+        if not self.uniform_width:
+            values = F.pad(values, (0, 1)).index_select(-1, self.constants(values)[0])
+        return values.unflatten(-1, (len(self), self.width))
+
+    def concatenate(self, padded: Tensor) -> Tensor:
+        """Padded `(..., heads, width)` to concatenated `(..., total)`."""
+        values = padded.flatten(-2)
+        return values if self.uniform_width else values.index_select(-1, self.constants(padded)[1])
+
+
+class _RegretMatching(torch.autograd.Function):
+    """`x -> pi` whose backward returns the regret-matching gradient g', which is not the derivative."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor, epsilon: Tensor, mode: RegretGradient) -> Tensor:
+        positive = x.clamp(0.0, _LARGEST_PREFERENCE) + epsilon
+        total = positive.sum(-1, keepdim=True)
+        pi = positive / total
+        ctx.mode = mode
+        ctx.save_for_backward(pi, x < 0, total)
+        return pi
+
+    @staticmethod
+    def backward(ctx, grad_pi: Tensor):  # type: ignore[override]
+        pi, negative, total = ctx.saved_tensors
+        # Regret of value i: how much cheaper it is than the head's average, since g is the gradient of a loss.
+        regret = (grad_pi * pi).sum(-1, keepdim=True) - grad_pi
+        if ctx.mode == "du":
+            regret = regret / total
+        elif ctx.mode == "chain":
+            g = (-regret / total).masked_fill(negative, 0.0)
+            regret = (g * pi).sum(-1, keepdim=True) - g
+        return (-regret).masked_fill_(negative & (regret < 0), 0.0), None, None
+
+
+def regret_matching_probabilities(x: Tensor, layout: HeadLayout, gradient: RegretGradient = "dpi") -> Tensor:
+    """Probabilities of positive-part heads, `pi_i = (max(0, x_i) + eps) / sum_j (max(0, x_j) + eps)` (Appendix B).
+
+    The backward pass is one regression step of regret matching instead of the derivative: with `g` the gradient of the
+    loss and `rho_i = sum_j g_j pi_j - g_i`, `x_i` receives `-rho_i`, or 0 if `x_i < 0` and `rho_i < 0`. So a value of
+    probability zero that would have been cheaper than average comes back.
+
+    Args:
+        x: (..., layout.total) network outputs, heads concatenated.
+        layout: The heads.
+        gradient: What `g` is the gradient to. `"dpi"`: the probabilities (our reading: the true regret of every value,
+            whatever the scale of x). `"du"`: the positive parts before the division, `dpi` over their sum. `"chain"`:
+            x, literally, so that a value with x < 0 never returns.
+
+    Returns:
+        (..., layout.total) probabilities, float32 or wider; each head sums to 1.
+
+    Raises:
+        ValueError: If `gradient` is unknown.
+
+    Example:
+        >>> regret_matching_probabilities(torch.tensor([2.0, 1.0, 1.0, -1.0]), HeadLayout((4,))).tolist()
+        [0.5, 0.25, 0.25, 6.2...e-10]
+    """
+    if gradient not in get_args(RegretGradient):
+        raise ValueError(f"regret_gradient must be one of {get_args(RegretGradient)}, got {gradient!r}")
+    x = at_least_float32(x)
+    epsilon = layout.constants(x)[2]
+    return layout.concatenate(_RegretMatching.apply(layout.pad(x), epsilon, gradient))
+
+
+def exponential_noise(like: Tensor) -> Tensor:
+    """Standard exponential draws E, bounded away from 0; `-log E` is the Gumbel noise of the paper."""
+    return torch.empty_like(like).exponential_().clamp_min_(_SMALLEST_EXPONENTIAL)
+
+
+def relaxed_one_hots(pi: Tensor, layout: HeadLayout, noise: Tensor | None = None) -> Tensor:
+    """Gumbel-softmax samples at temperature 1, differentiable in `pi`.
+
+    `softmax(log pi + Z)` with Z = -log E is `(pi_i / E_i) / sum_j (pi_j / E_j)`: no logarithm of a small probability
+    and, in the gradient `dL/dpi_i = (y_i / pi_i)(g_i - sum_j g_j y_j)`, no division by one.
+
+    Args:
+        pi: (..., layout.total) probabilities.
+        layout: The heads.
+        noise: (..., layout.total) standard exponential draws; drawn here if None.
+
+    Returns:
+        (..., layout.total) relaxed one-hots; each head sums to 1.
+    """
+    noise = exponential_noise(pi) if noise is None else noise
+    weights = layout.pad(pi / noise)
+    return layout.concatenate(weights / weights.sum(-1, keepdim=True))
+
+
+def hard_one_hots(pi: Tensor, layout: HeadLayout, noise: Tensor | None = None) -> Tensor:
+    """Exact samples, `argmax(log pi + Z)` of each head as one-hots (Gumbel-max); no gradient.
+
+    Args:
+        pi: (..., layout.total) probabilities.
+        layout: The heads.
+        noise: (..., layout.total) standard exponential draws; drawn here if None.
+
+    Returns:
+        (..., layout.total) one-hots of the type of `pi`.
+
+    Example:
+        >>> hard_one_hots(torch.tensor([0.0, 1.0, 1.0, 0.0, 0.0]), HeadLayout((2, 3))).tolist()
+        [0.0, 1.0, 1.0, 0.0, 0.0]
+    """
+    pi = pi.detach()
+    noise = exponential_noise(pi) if noise is None else noise
+    return most_likely_one_hots(pi / noise, layout)
+
+
+def most_likely_one_hots(weights: Tensor, layout: HeadLayout) -> Tensor:
+    """One-hots of the largest weight of each head, the first one at ties; weights are not negative."""
+    padded = layout.pad(weights.detach())
+    one_hots = torch.zeros_like(padded).scatter_(-1, padded.argmax(-1, keepdim=True), 1.0)
+    return layout.concatenate(one_hots)
+
+
+def log_probabilities(pi: Tensor) -> Tensor:
+    """Logarithm of probabilities that stays finite, with gradient `1/pi`, for any probability a head can have."""
+    return pi.clamp_min(torch.finfo(pi.dtype).tiny).log()
+
+
+def categorical_entropy(pi: Tensor) -> Tensor:
+    """Exact entropy summed over the heads, `-sum_i pi_i log pi_i`.
+
+    Args:
+        pi: (..., total) probabilities of one or more heads, concatenated.
+
+    Returns:
+        (...,) entropy [nat].
+
+    Example:
+        >>> categorical_entropy(torch.tensor([0.5, 0.5, 0.25, 0.25, 0.25, 0.25])).item()  # log 2 + log 4
+        2.079...
+    """
+    return -(pi * log_probabilities(pi)).sum(-1)

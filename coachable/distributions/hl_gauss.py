@@ -1,0 +1,178 @@
+"""HL-Gauss: a scalar target becomes the histogram of a Gaussian around it (Imani and White 2018, arXiv 2403.03950)."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor, nn
+
+from coachable.distributions.tanh_gaussian import at_least_float32
+
+Support = Literal["edges", "centres"]
+
+# The bump of `initialise_value`: its width over that of the support (40 for the paper's), and the lowest logit.
+_INITIAL_WIDTH_RATIO = 1.0 / 40.0
+_INITIAL_FLOOR = -8.0
+
+
+class HLGauss:
+    """Bins over [v_min, v_max], encoding of scalars into them and decoding of logits over them.
+
+    Args:
+        v_min: Smallest value represented.
+        v_max: Largest value represented.
+        num_atoms: Number of bins.
+        sigma_ratio: Standard deviation of the Gaussian over the width of a bin.
+        support: `"edges"`: `num_atoms + 1` edges, the outer two on v_min and v_max. `"centres"`: the `num_atoms`
+            centres span [v_min, v_max], so that the outer edges lie half a bin outside.
+
+    Raises:
+        ValueError: If v_min >= v_max, num_atoms < 2, sigma_ratio <= 0, or `support` is unknown.
+
+    Example:
+        >>> bins = HLGauss(-600.0, 1000.0, 255)
+        >>> p = bins.encode(torch.tensor([12.5]))
+        >>> p.shape, round(bins.decode(p.log()).item(), 3)
+        (torch.Size([1, 255]), 12.5)
+    """
+
+    def __init__(
+        self,
+        v_min: float = -600.0,
+        v_max: float = 1000.0,
+        num_atoms: int = 255,
+        sigma_ratio: float = 0.75,
+        support: Support = "edges",
+    ) -> None:
+        if not (math.isfinite(v_min) and math.isfinite(v_max) and v_min < v_max):
+            raise ValueError(f"v_min must be less than v_max and both finite, got v_min={v_min}, v_max={v_max}")
+        if int(num_atoms) != num_atoms or num_atoms < 2:
+            raise ValueError(f"num_atoms must be an integer of at least 2, got {num_atoms}")
+        if not (sigma_ratio > 0 and math.isfinite(sigma_ratio)):
+            raise ValueError(f"sigma_ratio must be positive and finite, got {sigma_ratio}")
+        if support not in get_args(Support):
+            raise ValueError(f"hl_gauss_support must be one of {get_args(Support)}, got {support!r}")
+        self.v_min, self.v_max, self.num_atoms = float(v_min), float(v_max), int(num_atoms)
+        self.sigma_ratio = float(sigma_ratio)
+        self.support: Support = support
+        if support == "edges":
+            self.bin_width = (self.v_max - self.v_min) / self.num_atoms
+            self._first_edge = self.v_min
+        else:
+            self.bin_width = (self.v_max - self.v_min) / (self.num_atoms - 1)
+            self._first_edge = self.v_min - 0.5 * self.bin_width
+        self.sigma = self.sigma_ratio * self.bin_width
+        self._constants: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor]] = {}
+
+    def __repr__(self) -> str:
+        return (
+            f"HLGauss(v_min={self.v_min}, v_max={self.v_max}, num_atoms={self.num_atoms}, "
+            f"sigma_ratio={self.sigma_ratio}, support={self.support!r})"
+        )
+
+    def __deepcopy__(self, memo: dict) -> HLGauss:
+        return HLGauss(self.v_min, self.v_max, self.num_atoms, self.sigma_ratio, self.support)
+
+    def _edges_and_centres(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        # Computed in float64 and rounded once; cached because a kernel launch per constant would add up.
+        key = (like.device, like.dtype)
+        if key not in self._constants:
+            index = torch.arange(self.num_atoms + 1, dtype=torch.float64, device=like.device)
+            edges = self._first_edge + self.bin_width * index
+            centres = 0.5 * (edges[1:] + edges[:-1])
+            self._constants[key] = (edges.to(like.dtype), centres.to(like.dtype))
+        return self._constants[key]
+
+    def edges(self, like: Tensor) -> Tensor:
+        """Bin edges `(num_atoms + 1,)` with the device and type of `like`."""
+        return self._edges_and_centres(like)[0]
+
+    def centres(self, like: Tensor) -> Tensor:
+        """Bin centres `(num_atoms,)` with the device and type of `like`."""
+        return self._edges_and_centres(like)[1]
+
+    def encode(self, value: Tensor) -> Tensor:
+        """Probabilities of a Gaussian around each value, truncated to the support and renormalised.
+
+        Values outside [v_min, v_max] are moved to the border first: unclipped, float32 gives 0/0 a few standard
+        deviations outside.
+
+        Args:
+            value: (...,) targets.
+
+        Returns:
+            (..., num_atoms) probabilities, float32 or wider.
+        """
+        value = at_least_float32(value).clamp(self.v_min, self.v_max)
+        # erf = 2 Phi - 1; the factor cancels in the ratio.
+        cumulative = torch.erf((self.edges(value) - value.unsqueeze(-1)) / (math.sqrt(2.0) * self.sigma))
+        return cumulative.diff(dim=-1).div_(cumulative[..., -1:] - cumulative[..., :1])
+
+    def decode(self, logits: Tensor) -> Tensor:
+        """Mean of the distribution with the given logits.
+
+        Args:
+            logits: (..., num_atoms).
+
+        Returns:
+            (...,) values between the outer centres, float32 or wider.
+        """
+        return self.mean(at_least_float32(logits).softmax(-1))
+
+    def mean(self, probabilities: Tensor) -> Tensor:
+        """Mean of distributions over the bins, `(..., num_atoms)` to `(...,)`.
+
+        A product and a sum, not a matrix product: autocast would round the latter to bfloat16.
+        """
+        return (probabilities * self.centres(probabilities)).sum(-1)
+
+    def cross_entropy(self, logits: Tensor, value: Tensor) -> Tensor:
+        """Cross-entropy of `softmax(logits)` against the encoding of a scalar; its gradient is `softmax - p`.
+
+        Args:
+            logits: (..., num_atoms), may have leading dimensions that `value` lacks.
+            value: (...,) targets; no gradient.
+
+        Returns:
+            (...,) cross-entropies [nat], summed over bins.
+        """
+        return -(self.encode(value.detach()) * at_least_float32(logits).log_softmax(-1)).sum(-1)
+
+    def clipped_fraction(self, value: Tensor) -> Tensor:
+        """Fraction of the values outside [v_min, v_max], a scalar."""
+        return ((value < self.v_min) | (value > self.v_max)).to(at_least_float32(value).dtype).mean()
+
+
+def initialise_value(critic: nn.Module, bins: HLGauss, initial_value: float | None = 0.0) -> None:
+    """Make a fresh categorical critic predict `initial_value` for every input, in place.
+
+    With near-uniform logits it would predict the middle of the support, +200 for the paper's, and that optimism takes
+    tens of thousands of updates to decay through bootstrapping. The last linear layer is scaled by 0.01 and its bias
+    becomes a wide bump, `-((centre - initial_value) / b)^2 / 2`, at least -8, with b a fortieth of the support.
+
+    Args:
+        critic: Network whose last linear layer, in order of registration, has `bins.num_atoms` outputs.
+        bins: The support.
+        initial_value: Wanted prediction; None leaves the network as it is.
+
+    Raises:
+        ValueError: If the value lies outside the support, or the last linear layer has another width.
+    """
+    if initial_value is None:
+        return
+    if not bins.v_min <= initial_value <= bins.v_max:
+        raise ValueError(f"initial_value must lie in [{bins.v_min}, {bins.v_max}], got {initial_value}")
+    linears = [module for module in critic.modules() if isinstance(module, nn.Linear)]
+    if not linears or linears[-1].out_features != bins.num_atoms or linears[-1].bias is None:
+        found = linears[-1] if linears else None
+        raise ValueError(
+            f"the critic's last linear layer must have {bins.num_atoms} outputs and a bias, got {found}; "
+            "see make_hl_gauss_critic"
+        )
+    with torch.no_grad():
+        head = linears[-1]
+        head.weight.mul_(0.01)
+        distance = (bins.centres(head.weight) - initial_value) / (_INITIAL_WIDTH_RATIO * (bins.v_max - bins.v_min))
+        head.bias.copy_((-0.5 * distance.square()).clamp_min(_INITIAL_FLOOR))

@@ -1,0 +1,201 @@
+"""Distribution of mixed discrete-continuous actions: positive-part categorical heads and tanh-Gaussian axes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from coachable.distributions.action_heads import ActionHeads
+from coachable.distributions.categorical import (
+    HeadLayout,
+    categorical_entropy,
+    hard_one_hots,
+    log_probabilities,
+    most_likely_one_hots,
+    relaxed_one_hots,
+)
+from coachable.distributions.tanh_gaussian import (
+    at_least_float32,
+    sample_tanh_gaussian,
+    tanh_gaussian_entropy,
+    tanh_gaussian_log_prob,
+)
+
+
+class MixedAction(Distribution):
+    """Distribution of one action tensor: the one-hots of independent categorical heads, then tanh-Gaussian axes.
+
+    `sample` is what the environment executes, replay stores and targets use: hard one-hots. `relaxed_action` is
+    differentiable in every parameter and belongs in the policy loss alone. There is no `rsample` for categorical
+    heads, so that no TorchRL component can draw relaxed actions by accident.
+
+    Args:
+        probs: (..., heads.num_categorical) probabilities; None without categorical heads.
+        loc: (..., heads.axes) location of the axes before the tanh; None without axes.
+        scale: (..., heads.axes) standard deviation before the tanh; None without axes.
+        heads: Components of the action.
+        low: Lower bound of the axes, a number or (axes,).
+        high: Upper bound of the axes.
+
+    Example:
+        >>> heads = ActionHeads((2,), axes=1)
+        >>> pi = MixedAction(torch.tensor([0.0, 1.0]), torch.zeros(1), torch.ones(1), heads=heads)
+        >>> pi.sample().shape, pi.deterministic_sample.tolist()
+        (torch.Size([3]), [0.0, 1.0, 0.0])
+    """
+
+    arg_constraints: dict = {}  # noqa: RUF012  # torch reads a class attribute
+
+    def __init__(
+        self,
+        probs: Tensor | None = None,
+        loc: Tensor | None = None,
+        scale: Tensor | None = None,
+        *,
+        heads: ActionHeads,
+        low: Tensor | float = -1.0,
+        high: Tensor | float = 1.0,
+    ) -> None:
+        if (probs is None) != (not heads.categorical) or (loc is None) != (not heads.axes):
+            raise ValueError(f"give probs for categorical heads and loc and scale for axes, and only then: {heads}")
+        self.heads = heads
+        self.probs = None if probs is None else at_least_float32(probs)
+        self.loc = None if loc is None else at_least_float32(loc)
+        self.scale = None if scale is None else at_least_float32(scale)
+        self._unit_box = isinstance(low, (int, float)) and isinstance(high, (int, float)) and (low, high) == (-1, 1)
+        self._low, self._high = low, high
+        leading = self.probs if self.probs is not None else self.loc
+        assert leading is not None  # ActionHeads has at least one component
+        super().__init__(leading.shape[:-1], torch.Size((heads.action_dim,)), validate_args=False)
+
+    @property
+    def has_rsample(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether `sample` is differentiable: only without categorical heads."""
+        return not self.heads.categorical
+
+    def _join(self, one_hots: Tensor | None, axes: Tensor | None) -> Tensor:
+        if axes is not None and not self._unit_box:
+            low = torch.as_tensor(self._low, device=axes.device, dtype=axes.dtype)
+            high = torch.as_tensor(self._high, device=axes.device, dtype=axes.dtype)
+            axes = torch.lerp(low.expand_as(axes), high.expand_as(axes), 0.5 * (axes + 1.0))
+        return torch.cat([part for part in (one_hots, axes) if part is not None], -1)
+
+    def _log_volume(self, like: Tensor) -> Tensor | float:
+        """Logarithm of the factor by which the bounds of the axes stretch a volume."""
+        if self._unit_box:
+            return 0.0
+        half = 0.5 * (torch.as_tensor(self._high) - torch.as_tensor(self._low)).to(like)
+        return half.expand(self.heads.axes).log().sum()
+
+    def relaxed_action(self) -> Tensor:
+        """Differentiable sample (..., action_dim): Gumbel-softmax one-hots at temperature 1, reparameterised axes."""
+        return self._draw(relaxed_one_hots)
+
+    def hard_action(self) -> Tensor:
+        """Exact sample (..., action_dim) with hard one-hots, reparameterised in the axes only."""
+        return self._draw(hard_one_hots)
+
+    def relaxed_sample(self) -> tuple[Tensor, Tensor]:
+        """`relaxed_action`, and the log-density (...,) of this one sample, both differentiable.
+
+        The axes are scored exactly. Categorical heads contribute the relaxed `sum_i y_i log pi_i` (our choice: a
+        one-sample estimate has no other path through a categorical sample).
+        """
+        return self._draw_and_score(relaxed_one_hots)
+
+    def hard_sample(self) -> tuple[Tensor, Tensor]:
+        """`hard_action` and its log-density (...,)."""
+        return self._draw_and_score(hard_one_hots)
+
+    def _draw(self, one_hots_of: Callable[[Tensor, HeadLayout], Tensor]) -> Tensor:
+        one_hots = None if self.probs is None else one_hots_of(self.probs, self.heads.layout)
+        axes = None
+        if self.loc is not None and self.scale is not None:
+            axes = torch.tanh(self.loc + self.scale * torch.randn_like(self.loc))
+        return self._join(one_hots, axes)
+
+    def _draw_and_score(self, one_hots_of: Callable[[Tensor, HeadLayout], Tensor]) -> tuple[Tensor, Tensor]:
+        one_hots, axes = None, None
+        log_prob: Tensor | float = 0.0
+        if self.probs is not None:
+            one_hots = one_hots_of(self.probs, self.heads.layout)
+            log_prob = (one_hots * log_probabilities(self.probs)).sum(-1)
+        if self.loc is not None and self.scale is not None:
+            axes, density = sample_tanh_gaussian(self.loc, self.scale)
+            log_prob = log_prob + density.sum(-1) - self._log_volume(density)
+        return self._join(one_hots, axes), torch.as_tensor(log_prob)
+
+    def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Hard sample (*sample_shape, ..., action_dim), no gradient."""
+        with torch.no_grad():
+            return self._expanded(sample_shape).hard_action()
+
+    def sample_and_log_prob(self, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
+        """Hard sample without gradient and its differentiable log-density."""
+        action = self.sample(sample_shape)
+        return action, self.log_prob(action)
+
+    def rsample(self, sample_shape: Sequence[int] = ()) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Reparameterised sample of axes; categorical heads have none."""
+        return self.rsample_and_log_prob(sample_shape)[0]
+
+    def rsample_and_log_prob(self, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
+        """Reparameterised sample of axes and its log-density, as TorchRL's losses ask for it."""
+        if self.heads.categorical:
+            raise NotImplementedError(
+                "categorical heads have no reparameterised hard sample: use a loss that draws relaxed actions itself "
+                "(RACLoss, CatRACLoss, CategoricalSACLoss), or sample()"
+            )
+        return self._expanded(sample_shape).hard_sample()
+
+    def _expanded(self, sample_shape: Sequence[int]) -> MixedAction:
+        if not len(sample_shape):
+            return self
+        parts = (None if p is None else p.expand(*sample_shape, *p.shape) for p in (self.probs, self.loc, self.scale))
+        return MixedAction(*parts, heads=self.heads, low=self._low, high=self._high)
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Log-density (...,) of a given action with hard one-hots."""
+        one_hots, axes = self.heads.split(value)
+        log_prob: Tensor | float = 0.0
+        if self.probs is not None:
+            log_prob = (one_hots * log_probabilities(self.probs)).sum(-1)
+        if self.loc is not None and self.scale is not None:
+            if not self._unit_box:
+                low = torch.as_tensor(self._low, device=axes.device, dtype=axes.dtype)
+                axes = 2.0 * (axes - low) / (torch.as_tensor(self._high).to(low) - low) - 1.0
+            density = tanh_gaussian_log_prob(axes, self.loc, self.scale)
+            log_prob = log_prob + density.sum(-1) - self._log_volume(density)
+        return torch.as_tensor(log_prob)
+
+    def entropy_estimate(self, num_samples: int = 1000, shared_noise: bool = True) -> Tensor:
+        """Sum over the components: exact categorical entropies, sampled entropies of the axes (Appendix B).
+
+        Args:
+            num_samples: Draws per axis.
+            shared_noise: Whether the states share their draws, see `tanh_gaussian_entropy`.
+
+        Returns:
+            (...,) entropy [nat], differentiable.
+        """
+        entropy: Tensor | float = 0.0
+        if self.probs is not None:
+            entropy = categorical_entropy(self.probs)
+        if self.loc is not None and self.scale is not None:
+            axes = tanh_gaussian_entropy(self.loc, self.scale, num_samples, shared_noise=shared_noise)
+            entropy = entropy + axes.sum(-1) + self._log_volume(axes)
+        return torch.as_tensor(entropy)
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """Most likely value of every head, tanh of the location of every axis; what evaluation executes."""
+        one_hots = None if self.probs is None else most_likely_one_hots(self.probs, self.heads.layout)
+        return self._join(one_hots, None if self.loc is None else torch.tanh(self.loc))
+
+    @property
+    def mode(self) -> Tensor:
+        """The deterministic action."""
+        return self.deterministic_sample

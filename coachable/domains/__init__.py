@@ -1,0 +1,1 @@
+"""What a domain adds to the library: its styles, metrics, pictures, evaluations."""

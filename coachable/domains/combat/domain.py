@@ -1,0 +1,57 @@
+"""Declaration of the combat domain."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+from coachable.domain import Domain
+from coachable.domains.combat.fights import evaluate_fights
+from coachable.domains.combat.metrics import CombatMeasures
+from coachable.domains.combat.render import CombatRenderer
+from coachable.domains.combat.styles import combat_style_reward, combat_style_space, single_styles
+from coachable.envs.combat.constants import CONTROL_STEP, EPISODE_STEPS
+from coachable.envs.combat.env import CombatEnv
+from coachable.envs.combat.features import observation_groups
+
+
+def make_combat_env(
+    num_envs: int = 128, seed: int | None = None, num_threads: int | None = None, **options: Any
+) -> CombatEnv:
+    """A `CombatEnv` that emits `components` for the measures. `num_threads` is not used: threads are torch's own."""
+    return CombatEnv(num_envs, seed=seed, components=True, **options)
+
+
+def _as_trained(settings: Mapping[str, Any]) -> Domain:
+    """With the machines, styles and observation of a training, and its length of a fight."""
+    options = {name: value for name, value in settings.items() if name not in ("_target_", "num_envs", "components")}
+    styles: Sequence[str] | None = settings.get("styles")
+    make_space = partial(combat_style_space, styles, settings.get("reward_scale", "sim"))
+    return replace(
+        DOMAIN,
+        make_env=partial(make_combat_env, **options),
+        make_space=make_space,
+        measures=CombatMeasures(styles),
+        grid=single_styles(make_space()),
+        episode_steps=settings.get("episode_steps", EPISODE_STEPS),
+        observation_groups=observation_groups(settings.get("observation", "full")),
+    )
+
+
+DOMAIN = Domain(
+    name="combat",
+    make_env=make_combat_env,
+    make_space=combat_style_space,
+    make_reward=combat_style_reward,
+    measures=CombatMeasures(),
+    make_renderer=CombatRenderer,
+    grid=single_styles(combat_style_space()),
+    control_step=CONTROL_STEP,
+    episode_steps=EPISODE_STEPS,
+    columns={"won": ".0%", "damage": ".0f", "style_score": ".2f"},
+    observation_groups=observation_groups("full"),
+    as_trained=_as_trained,
+    evaluation=evaluate_fights,
+)

@@ -1,0 +1,300 @@
+"""What a fighter does under every style: damage matrix, wins, parts, response to a weight, switches (paper)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import matplotlib
+import numpy as np
+import torch
+
+from coachable.domains.combat.coached_fight import (
+    SOURCES,
+    STATES,
+    CoachedFights,
+    draw_timeline,
+    fight_coached,
+    requests_of,
+)
+from coachable.domains.combat.styles import single_styles
+from coachable.envs.combat.tables import MACHINES, SITES, STYLES, UNSEEN_MACHINES
+from coachable.evaluation.figures import readable
+from coachable.evaluation.rollouts import record_episodes
+from coachable.evaluation.settings import EvaluationSettings
+from coachable.evaluation.statistics import rank_correlation
+from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_csv
+from coachable.evaluation.sweep import WeightSweep, sweep_weights
+from coachable.styles import StyleSpace
+from coachable.transforms import coachable_env
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+if TYPE_CHECKING:
+    from coachable.domain import Domain
+    from coachable.training.weights import LoadedPolicy
+
+PARTS = STYLES[8:11]
+_COMPOSED_WEAPON = "corrosive_blastsling"  # whose ammunition carries several elements
+_PAIRS = ("Apex Thunderjaw", "Slaughterspine")  # of these, two at once are out of distribution
+_OUTCOMES = ("won", "died", "out_of_bounds", "timeout")
+
+
+def composed_styles(space: StyleSpace) -> list[dict[str, float]]:
+    """The blastsling together with each of acid, plasma and adhesive, as far as the space has them (paper)."""
+    if _COMPOSED_WEAPON not in space.names:
+        return []
+    high = dict(zip(space.names, space.high.tolist(), strict=True))
+    elements = [name for name in ("acid", "plasma", "adhesive") if name in space.names]
+    neutral = dict.fromkeys(space.names, 0.0)
+    return [neutral | {name: high[name] for name in (_COMPOSED_WEAPON, element)} for element in elements]
+
+
+def style_label(cell: Mapping[str, float]) -> str:
+    """How tables name a style: "default", "melee", "no skykiller", "corrosive_blastsling + acid"."""
+    named = [name if value > 0 else f"no {name}" for name, value in cell.items() if value]
+    return " + ".join(named) or "default"
+
+
+def evaluate_fights(
+    domain: Domain,
+    agent: LoadedPolicy,
+    out: Path,
+    settings: EvaluationSettings,
+) -> str:
+    """Fight every machine in every style and write tables, figures and a report.
+
+    Files: `damage.csv` (what was done under which style), `wins.csv` (by style and machine), `unseen.csv` (wins against
+    machines and pairs that no training has), `outcomes.csv` (by machine), `sweep.csv` (share of a style's damage over
+    its weight), `switches.csv` (what follows when the style switches during fights), `timeline.csv` (some fights in a
+    row, step by step), `damage.png`, `sweep.png`, `timeline.png`, `report.md`, `summary.json`.
+
+    Args:
+        domain: combat, as the agent was trained in.
+        agent: the policy; samples its actions, as in training.
+        out: folder, created if missing.
+        settings: `episodes` fights per style and machine, at sites drawn at random, of at most `steps`, and
+            `switch_episodes` sequences of fights with a style that switches, each as long; none for an agent with fewer
+            than two styles of damage.
+
+    Returns:
+        The report, Markdown.
+    """
+    episodes, seed, progress = settings.episodes, settings.seed, settings.progress
+    out.mkdir(parents=True, exist_ok=True)
+    space, steps = agent.space, settings.steps or domain.episode_steps
+    cells = single_styles(space) + composed_styles(space)
+    labels = [style_label(cell) for cell in cells]
+    machines = list(agent.config["env"].get("machines") or MACHINES)
+    options: dict[str, Any] = {"episodes": episodes, "steps": steps, "seed": seed, "progress": progress}
+    fights = fight_matrix(domain, agent, cells, [(name,) for name in machines], **options)
+    damage, wins = damage_rows(fights, labels), _win_rows(fights, labels, machines)
+    outcomes = _outcomes(fights, machines)
+    alone = fight_matrix(domain, agent, cells, [(name,) for name in UNSEEN_MACHINES], **options)
+    pairs = fight_matrix(domain, agent, cells, [(name, name) for name in _PAIRS], **options)
+    unseen = [
+        one | two
+        for one, two in zip(
+            _win_rows(alone, labels, list(UNSEEN_MACHINES)),
+            _win_rows(pairs, labels, [f"two {name}" for name in _PAIRS]),
+            strict=True,
+        )
+    ]
+    sweeps = settings.sweeps
+    if sweeps is None:
+        sweeps = sweep_weights(domain, agent.actor, agent.space, points=7, **options)
+    sweep = _sweep_rows(sweeps)
+    tables = {"damage": damage, "wins": wins, "unseen": unseen, "outcomes": outcomes, "sweep": sweep}
+    coached = None
+    if settings.switch_episodes and len(requests_of(space)) > 1:
+        sequences = settings.switch_episodes
+        coached = fight_coached(domain, agent, sequences=sequences, steps=steps, seed=seed, progress=progress)
+        timeline = coached.timeline()
+        tables |= {"switches": coached.switches(), "timeline": timeline}
+        draw_timeline(timeline, out / "timeline.png")
+    for name, rows in tables.items():
+        if rows:
+            write_csv(rows, out / f"{name}.csv")
+    draw_damage(damage, out / "damage.png")
+    draw_sweep(sweep, out / "sweep.png")
+    scores = {row["style"]: row["style_score"] for row in damage if row["style_score"] is not None}
+    summary = {
+        "style_score": scores,
+        "win_rate": {row["style"]: row["won"] for row in damage},
+        "rank_correlation": _correlations(sweep),
+        "fights_per_style": len(machines) * episodes,
+        "switching": {row["style"]: row for row in tables.get("switches", [])}.get("all styles"),
+        "seed": seed,
+    }
+    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    report = _report(agent, tables, summary, episodes, steps, seed)
+    if coached is not None:
+        report += _switch_report(coached, tables["switches"])
+    (out / "report.md").write_text(report)
+    return report
+
+
+def fight_matrix(
+    domain: Domain,
+    agent: LoadedPolicy,
+    cells: Sequence[Mapping[str, float]],
+    opponents: Sequence[tuple[str, ...]],
+    *,
+    episodes: int,
+    steps: int,
+    seed: int,
+    progress: bool,
+) -> dict[str, np.ndarray]:
+    """Sums over each fight, by what was measured: (styles, opponents, episodes); an opponent is one machine or two."""
+    space, shape = agent.space, (len(cells), len(opponents), episodes)
+    theta = torch.stack([space.make(strict=True, **cell) for cell in cells])
+    theta = theta.repeat_interleave(len(opponents) * episodes, 0)
+    simulation: Any = domain.make_env(num_envs=len(theta), seed=seed, num_enemies=len(opponents[0]))
+    sites = np.random.default_rng(seed).choice(SITES, len(opponents) * episodes)
+    names = [machines for machines in opponents for _ in range(episodes)] * len(cells)
+    simulation.assign(names, [str(site) for site in sites] * len(cells))
+    env = coachable_env(simulation, space, domain.make_reward(space), seed=seed)
+    label = f"{len(cells)} styles x {len(opponents)} opponents x {episodes} fights" if progress else None
+    record = record_episodes(env, agent.actor, theta, domain.measures, steps=steps, seed=seed, progress=label)
+    env.close()
+    sums = domain.measures.summarise(record.measures, record.alive)
+    sums["timeout"] = 1.0 - sums["won"] - torch.maximum(sums["died"], sums["out_of_bounds"])
+    sums["seconds"] = record.alive.sum(0) * domain.control_step
+    return {name: value.reshape(shape).double().numpy() for name, value in sums.items()}
+
+
+def damage_rows(fights: Mapping[str, np.ndarray], labels: Sequence[str]) -> list[dict[str, Any]]:
+    """Per requested style: share of all damage by source and in each elemental state, units removed per fight."""
+    rows = []
+    for index, label in enumerate(labels):
+        total = max(fights["damage"][index].sum(), 1e-9)
+        row: dict[str, Any] = {"style": label, "won": float(fights["won"][index].mean())}
+        row |= {name: float(fights[name][index].sum() / total) for name in (*SOURCES, *STATES)}
+        row |= {name: float(fights[name][index].mean()) for name in PARTS}
+        asked = label if label in row and label not in PARTS else None
+        row["style_score"] = row[asked] if asked else None
+        row["damage_per_fight"] = float(fights["damage"][index].mean())
+        row["seconds"] = float(fights["seconds"][index].mean())
+        rows.append(row)
+    return rows
+
+
+def _win_rows(fights: Mapping[str, np.ndarray], labels: Sequence[str], machines: Sequence[str]) -> list[dict[str, Any]]:
+    return [
+        {"style": label, **dict(zip(machines, fights["won"][index].mean(-1).tolist(), strict=True))}
+        for index, label in enumerate(labels)
+    ]
+
+
+def _outcomes(fights: Mapping[str, np.ndarray], machines: Sequence[str]) -> list[dict[str, Any]]:
+    return [
+        {"machine": machine, **{name: int(fights[name][:, index].sum()) for name in _OUTCOMES}}
+        for index, machine in enumerate(machines)
+    ]
+
+
+def _sweep_rows(sweeps: Sequence[WeightSweep]) -> list[dict[str, Any]]:
+    """Share of the damage that counts for a weight, from 0 to its far end; units removed per fight for parts."""
+    rows = []
+    for sweep in sweeps:
+        for position, value in enumerate(sweep.values):
+            done, damage = sweep.episodes[sweep.weight][position], sweep.episodes["damage"][position]
+            share = done.mean() if sweep.weight in PARTS else done.sum() / max(damage.sum(), 1e-9)
+            won = float(sweep.episodes["won"][position].mean())
+            rows.append({"style": sweep.weight, "weight": float(value), "style_score": float(share), "won": won})
+    return rows
+
+
+def _correlations(sweep: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Rank correlation of score and weight."""
+    found = {}
+    for name in dict.fromkeys(row["style"] for row in sweep):
+        points = [row for row in sweep if row["style"] == name]
+        weights, scores = (np.array([row[key] for row in points]) for key in ("weight", "style_score"))
+        found[name] = rank_correlation(weights, scores)
+    return found
+
+
+def draw_damage(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """The damage matrix: columns are requested styles, rows what was done (paper)."""
+    kinds = [*SOURCES, *STATES]
+    shares = np.array([[row[kind] for row in rows] for kind in kinds])
+    figure, axes = plt.subplots(figsize=(2.5 + 0.62 * len(rows), 2.2 + 0.36 * len(kinds)), layout="constrained")
+    axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
+    for (i, j), share in np.ndenumerate(shares):
+        axes.text(j, i, f"{share:.2f}", ha="center", va="center", fontsize=7, color="white" if share > 0.6 else "black")
+    axes.axhline(len(SOURCES) - 0.5, color="0.4", lw=1)
+    names = [readable(row["style"]) for row in rows]
+    axes.set_xticks(range(len(rows)), [f"{n}\n{row['won']:.0%} won" for n, row in zip(names, rows, strict=True)])
+    axes.tick_params(axis="x", labelrotation=60, labelsize=8)
+    axes.set_yticks(range(len(kinds)), list(map(readable, kinds)), fontsize=8)
+    axes.set(xlabel="requested style", title="share of the damage (below the line: while the state was active)")
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def draw_sweep(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Style score over the weight, one panel per style."""
+    names = list(dict.fromkeys(row["style"] for row in rows))
+    columns = min(len(names), 5)
+    count = -(-len(names) // columns)
+    size = (2.6 * columns, 2.4 * count)
+    figure, grid = plt.subplots(count, columns, figsize=size, squeeze=False, layout="constrained")
+    for panel, name in zip(grid.flat, names, strict=False):
+        points = [row for row in rows if row["style"] == name]
+        panel.plot([p["weight"] for p in points], [p["style_score"] for p in points], marker="o", ms=4, label="score")
+        panel.plot([p["weight"] for p in points], [p["won"] for p in points], ls="--", marker="x", ms=4, label="won")
+        panel.set(title=readable(name), xlabel="weight")
+        panel.set_ylim(-0.05, None)
+        panel.grid(alpha=0.3)
+    for panel in list(grid.flat)[len(names) :]:
+        panel.set_visible(False)
+    grid[0, 0].legend(fontsize=7)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def _report(
+    agent: LoadedPolicy,
+    tables: Mapping[str, Sequence[Mapping[str, Any]]],
+    summary: Mapping[str, Any],
+    episodes: int,
+    steps: int,
+    seed: int,
+) -> str:
+    text = "# combat: requested and measured style\n\n"
+    text += f"{policy_sentence(agent)}; {episodes} fights of at most {steps} "
+    text += f"steps per style and machine, seed {seed}.\n\n![damage by style](damage.png)\n\n"
+    scores = ["" if row["style_score"] is None else f"{row['style_score']:.2f}" for row in tables["damage"]]
+    table = [{**row, "score": score} for row, score in zip(tables["damage"], scores, strict=True)]
+    columns = {"style": "", "won": ".0%", "score": "", "damage_per_fight": ".0f", "seconds": ".0f"}
+    text += markdown_table(table, columns | dict.fromkeys(PARTS, ".2f"))
+    text += "\nScore: share of the damage that counts for the requested style. Parts: units removed per fight.\n"
+    for name, title in {"wins": "Wins by machine", "unseen": "Wins against what no training has"}.items():
+        columns = {column: "" if column == "style" else ".0%" for column in tables[name][0]}
+        text += f"\n## {title}\n\n" + markdown_table(tables[name], columns)
+    text += "\n## Outcomes\n\n" + markdown_table(tables["outcomes"], dict.fromkeys(tables["outcomes"][0], ""))
+    text += "\n## Weight and score\n\n![score over weight](sweep.png)\n\nRank correlation: "
+    return text + ", ".join(f"{name} {value:.2f}" for name, value in summary["rank_correlation"].items()) + ".\n"
+
+
+def _switch_report(coached: CoachedFights, rows: Sequence[Mapping[str, Any]]) -> str:
+    steps, sequences = coached.requests.shape
+    period, ends = coached.period * coached.control_step, coached.outcomes()
+    text = f"\n## Style switched every {period:g} s\n\n![damage, hits and health over time](timeline.png)\n\n"
+    text += "One sequence of fights, asked for every style in turn. "
+    text += (
+        f"{sequences} such sequences of {steps * coached.control_step:g} s, the others with styles in random order: "
+    )
+    text += f"{ends['fights']} fights ended, {ends['won']} of them won.\n\n"
+    if rows:
+        formats = {"style": "", "switches": "", "complied": ".0%", "median_seconds": ".1f", "share": ".0%"}
+        text += markdown_table(rows, formats)
+    return text + (
+        "\nComplied: damage that counts for the style was done before the next switch. Median: seconds from the "
+        "switch to the first of it (not complied: infinite). Share: of the damage between the switch and the next one. "
+        "Where a fight ends the next one starts, and the way to the machine counts.\n"
+    )

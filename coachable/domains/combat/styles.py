@@ -1,0 +1,62 @@
+"""Styles of the combat domain: 18 weights, their ranges and the training mixture (paper, Appendix C)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import get_args
+
+from coachable.envs.combat.rewards import REWARD_SCALES
+from coachable.envs.combat.tables import check_styles, load_table
+from coachable.styles import StyleReward, StyleSpace, Weight, WeightedSum
+from coachable.styles.mixtures import Single, style_mixture
+
+
+def combat_style_space(
+    styles: Sequence[str] | None = None,
+    reward_scale: str = "sim",
+    combat_component: Single = "continuous_one_hot",
+) -> StyleSpace:
+    """The style weights and the mixture that they are drawn from at every reset.
+
+    Args:
+        styles: names of the weights, as in `CombatEnv(styles=...)`; all 18 if None.
+        reward_scale: "sim" ranges fit the damage rates of this simulator, "paper" are the paper's.
+        combat_component: third component of the mixture, see `coachable.styles.mixtures.style_mixture`.
+
+    Raises:
+        ValueError: if a name or an option is unknown.
+    """
+    names = check_styles(styles)
+    if reward_scale not in REWARD_SCALES:
+        raise ValueError(f"reward_scale is {reward_scale!r}: expected one of {REWARD_SCALES}")
+    if combat_component not in get_args(Single):
+        raise ValueError(f"combat_component is {combat_component!r}: expected one of {get_args(Single)}")
+    table = load_table("styles")
+    low = [table.number(name, f"{reward_scale}_low") for name in names]
+    high = [table.number(name, f"{reward_scale}_high") for name in names]
+    weights = [
+        Weight(name, a, b, help=table.rows[name]["help"], evaluation=(a if -a == b else 0.0, b))
+        for name, a, b in zip(names, low, high, strict=True)
+    ]
+    space = StyleSpace(weights, name="combat")
+    return space.with_sampler(style_mixture(space, combat_component))
+
+
+def single_styles(space: StyleSpace) -> list[dict[str, float]]:
+    """No style, then each weight alone at the ends of the range that reports sweep (the lower end if it is not 0)."""
+    neutral = dict.fromkeys(space.names, 0.0)
+    cells = [neutral]
+    for weight in space.parameters:
+        assert isinstance(weight, Weight)
+        low, high = weight.evaluation_range
+        cells += [neutral | {weight.name: end} for end in (high, low) if end]
+    return cells
+
+
+def combat_style_reward(space: StyleSpace) -> StyleReward:
+    """Style part of the reward, sum_i w_i g_i: `style_features` holds the g_i in the order of the space's weights.
+
+    Args:
+        space: of `combat_style_space`, with the same styles as the environment.
+    """
+    return StyleReward(space, {"styles": WeightedSum(space.names)})

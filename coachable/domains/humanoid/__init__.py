@@ -1,0 +1,6 @@
+"""The DeepMind Control humanoid, walking with a requested arm pose and step length."""
+
+from coachable.domains.humanoid.events import humanoid_events
+from coachable.domains.humanoid.styles import humanoid_style_reward, humanoid_style_space
+
+__all__ = ["humanoid_events", "humanoid_style_reward", "humanoid_style_space"]

@@ -1,0 +1,64 @@
+"""Measured style of the humanoid: how it walked, beside what was asked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from coachable.domains.humanoid.styles import POSES, pose_bounds_deg
+from coachable.envs.humanoid.features import COMPLETED, LENGTH, NUM_ARM_JOINTS
+from coachable.envs.humanoid.observation import OBSERVATION_GROUPS
+from coachable.keys import STYLE, STYLE_FEATURES
+
+POSE_TOLERANCE_DEG = 10.0
+LENGTH_TOLERANCE = 0.06  # [m], a step this close to the request complies
+_FORWARD_SPEED = sum(width for _, width, _ in OBSERVATION_GROUPS[:4])  # first of `com_velocity`
+
+
+class HumanoidMeasures:
+    """Forward speed, arms in pose, realised step length and its error.
+
+    Attributes:
+        lower: (3, 6) joint bounds of the poses less the tolerance [rad].
+        upper: (3, 6) joint bounds of the poses plus the tolerance [rad].
+    """
+
+    needs = "a footstep"
+    """What it takes to tell whether the walker complies."""
+
+    def __init__(self) -> None:
+        bounds = torch.from_numpy(np.deg2rad(pose_bounds_deg())).float()
+        slack = float(np.deg2rad(POSE_TOLERANCE_DEG))
+        self.lower, self.upper = bounds[..., 0] - slack, bounds[..., 1] + slack
+
+    def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
+        """See `StyleMeasures.step`. A step length is NaN in env steps without a strike."""
+        theta = transition.get(STYLE)
+        features = transition.get(("next", STYLE_FEATURES))
+        pose = theta[:, : len(POSES)].argmax(-1)
+        arms = features[:, :NUM_ARM_JOINTS]
+        held = ((arms >= self.lower[pose]) & (arms <= self.upper[pose])).all(-1)
+        struck = features[:, COMPLETED] > 0
+        length = torch.where(struck, features[:, LENGTH], torch.nan)
+        return {
+            "forward_speed": transition.get(("next", "observation"))[:, _FORWARD_SPEED],
+            "pose_held": held.float(),
+            "step_length": length,
+            "step_length_error": (length - theta[:, len(POSES)]).abs(),
+        }
+
+    def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
+        """See `StyleMeasures.summarise`: means over the steps that count."""
+        return {name: torch.where(alive, values, torch.nan).nanmean(0) for name, values in record.items()}
+
+    def complies(self, record: Mapping[str, Tensor]) -> Tensor:
+        """See `StyleMeasures.complies`: a strike of the requested length, with the arms in pose."""
+        return (record["pose_held"] > 0) & (record["step_length_error"] < LENGTH_TOLERANCE)
+
+    def judged(self, record: Mapping[str, Tensor]) -> Tensor:
+        """(T, N) bool: a foot struck."""
+        return ~torch.isnan(record["step_length"])

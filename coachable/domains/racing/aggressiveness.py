@@ -1,0 +1,15 @@
+"""Declaration of the domain racing_aggressiveness."""
+
+from coachable.domains.racing.domain import racing_domain
+from coachable.domains.racing.families import CARS
+from coachable.domains.racing.races import evaluate_aggressiveness
+from coachable.envs.racing.race.scenarios import rolling_start
+
+DOMAIN = racing_domain(
+    "aggressiveness",
+    cars=CARS,
+    grid={"longitudinal": (0.5, 1.0, 1.5), "lateral": (0.0, 0.25, 0.5, 0.75, 1.0)},
+    columns={"contact": ".2%", "place": ".2f"},
+    evaluation=evaluate_aggressiveness,
+    scenarios=rolling_start(CARS),
+)

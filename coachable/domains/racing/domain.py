@@ -1,0 +1,76 @@
+"""Declarations of the three racing domains, one per family of style."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+from coachable.domain import Domain
+from coachable.domains.racing.families import racing_family
+from coachable.domains.racing.metrics import RacingMeasures
+from coachable.domains.racing.render import RacingRenderer
+from coachable.envs.racing.env import EPISODE_STEPS
+from coachable.envs.racing.physics.simulation import CONTROL_STEP
+from coachable.envs.racing.race.observation import COURSE_POINTS, observation_groups
+from coachable.envs.racing.race.scenarios import rolling_start
+
+# Of a training's environment, what an agent is not shown or measured with: how many cars learn, among whom, how their
+# episodes start, what they are rewarded for.
+_OF_TRAINING = ("_target_", "family", "num_envs", "scenarios", "conditions", "weights", "driver")
+
+
+def racing_domain(
+    family: str,
+    cars: int,
+    grid: Mapping[str, Sequence[Any]] | Sequence[Mapping[str, Any]],
+    columns: Mapping[str, str],
+    evaluation: Callable[..., str],
+    **options: Any,
+) -> Domain:
+    """The domain of a family of style.
+
+    Args:
+        family: drift, resources or aggressiveness.
+        cars: of a race.
+        grid: see `Domain`.
+        columns: what is published beside survival, pace, time off course and changes of the steering command.
+        evaluation: what `coachable evaluate` calls.
+        **options: of the environment, where an agent is shown and measured otherwise than it is trained.
+    """
+    make_env, make_space, make_reward = racing_family(family)
+
+    def as_trained(settings: Mapping[str, Any]) -> Domain:
+        """With the track, the car and the observation of a training, and its length of an episode."""
+        chosen = {name: value for name, value in settings.items() if name not in _OF_TRAINING}
+        chosen |= {"compiled": False, "device": "cpu", **options}
+        chosen.setdefault("opponents", chosen.get("cars", cars) > 1)
+        coached = {}
+        if cars == 1 and (met := chosen.pop("cars", 1)) > 1:  # measured alone, whoever was there when it learnt
+            coached = {"cars": met, "scenarios": rolling_start(met)}
+        pool, points = chosen.get("car") == "pool", chosen.get("course_points", COURSE_POINTS)
+        return replace(
+            domain,
+            make_env=partial(make_env, **chosen),
+            coached=coached,
+            episode_steps=chosen.get("episode_steps", domain.episode_steps),
+            observation_groups=observation_groups(chosen["opponents"], pool, points),
+        )
+
+    domain = Domain(
+        name=f"racing_{family}",
+        make_env=partial(make_env, **options),
+        make_space=make_space,
+        make_reward=make_reward,
+        measures=RacingMeasures(family),
+        make_renderer=RacingRenderer,
+        grid=grid,
+        control_step=CONTROL_STEP,
+        episode_steps=EPISODE_STEPS,
+        columns={"survived": ".0%", "pace": ".1f", "off": ".1%", "steering_change": ".2f"} | dict(columns),
+        observation_groups=observation_groups(cars > 1, pool=False),
+        as_trained=as_trained,
+        evaluation=evaluation,
+    )
+    return domain

@@ -1,0 +1,17 @@
+"""Declaration of the domain racing_drift."""
+
+from coachable.domains.racing.domain import racing_domain
+from coachable.domains.racing.drifts import evaluate_drift
+from coachable.envs.racing.race.features import DRIFT_NAMES
+
+_NONE: dict[str, float] = dict.fromkeys(DRIFT_NAMES, 0.0)
+_ALL: dict[str, float] = dict.fromkeys(DRIFT_NAMES, 5.0)
+_REAR = ("slip_angle_rear", "slip_ratio_rear")  # together they make the car slide
+
+DOMAIN = racing_domain(
+    "drift",
+    cars=1,
+    grid=[*({**_NONE, **dict.fromkeys(_REAR, weight)} for weight in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)), _ALL],
+    columns={"slip_angle_front": ".1f", "slip_angle_rear": ".1f"},
+    evaluation=evaluate_drift,
+)

@@ -1,0 +1,149 @@
+"""How far a car drives sideways under rising drift weights, and what that costs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import matplotlib
+import numpy as np
+
+from coachable.domains.racing.metrics import DRIFT_ANGLE_DEG, GRIP_ANGLE_DEG
+from coachable.envs.racing.race.features import DRIFT_NAMES
+from coachable.envs.racing.race.scenarios import Scenario
+from coachable.evaluation.settings import EvaluationSettings
+from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
+from coachable.evaluation.style_grid import evaluate_grid, markdown_table, policy_sentence, write_csv
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+if TYPE_CHECKING:
+    from coachable.domain import Domain
+    from coachable.training.weights import LoadedPolicy
+
+ANGLE = "slip_angle_rear"
+SWEEPS = {  # weights that rise together
+    "rear slip angle": (ANGLE,),
+    "rear slip angle and ratio": (ANGLE, "slip_ratio_rear"),
+    "all four": DRIFT_NAMES,
+}
+WEIGHTS = (-0.4, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
+_STARTS = (Scenario("solo", 1.0, "solo"),)
+_METRICS = ("slip_angle_rear", "slip_angle_front", "pace", "off", "turns", "survived")
+
+
+def evaluate_drift(
+    domain: Domain,
+    agent: LoadedPolicy,
+    out: Path,
+    settings: EvaluationSettings,
+) -> str:
+    """Drive under rising weights, of the rear slip angle alone, with the ratio, and of all four, from ordinary starts.
+
+    Files: `drift.csv` (by weight), `drift.png`, `report.md`, `summary.json`.
+
+    Args:
+        domain: racing_drift, as the agent was trained in.
+        agent: the policy; acts deterministically.
+        out: folder, created if missing.
+        settings: `episodes` per weight, each from its own place on the track.
+
+    Returns:
+        The report, Markdown.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    cells = [dict.fromkeys(names, weight) for names in SWEEPS.values() for weight in WEIGHTS]
+    grid = evaluate_grid(
+        domain,
+        agent.actor,
+        agent.space,
+        episodes=settings.episodes,
+        steps=settings.steps,
+        seed=settings.seed,
+        cells=cells,
+        progress=settings.progress,
+        env_options={"scenarios": _STARTS},
+    )
+    values = {name: value.reshape(len(SWEEPS), len(WEIGHTS), -1) for name, value in grid.episodes.items()}
+    rows = [
+        row
+        for index, sweep in enumerate(SWEEPS)
+        for row in _rows(sweep, {name: value[index] for name, value in values.items()})
+    ]
+    weights = np.repeat(np.array(WEIGHTS)[:, None], settings.episodes, 1).ravel()
+    summary: dict[str, Any] = {}
+    for index, sweep in enumerate(SWEEPS):
+        own = [row for row in rows if row["sweep"] == sweep]
+        summary[sweep] = {
+            "rank_correlation": rank_correlation(weights, values[ANGLE][index].ravel()),
+            "angle_at_none": own[WEIGHTS.index(0.0)][ANGLE],
+            "angle_at_full": own[-1][ANGLE],
+            "pace_kept_at_full": own[-1]["pace_kept"],
+            "most_turns": max(row["most_turns"] for row in own),
+        }
+    summary |= {"episodes_per_weight": settings.episodes, "seed": settings.seed}
+    write_csv(rows, out / "drift.csv")
+    draw_drift(rows, out / "drift.png")
+    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    report = _report(agent, rows, summary, grid.steps)
+    (out / "report.md").write_text(report)
+    return report
+
+
+def _rows(sweep: str, episodes: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
+    """Means by weight, with 95 % intervals of the angle, of values (weights, episodes)."""
+    neutral = float(np.nanmean(episodes["pace"][WEIGHTS.index(0.0)]))
+    rows = []
+    for index, weight in enumerate(WEIGHTS):
+        low, high = bootstrap_interval(episodes[ANGLE][index])
+        row: dict[str, Any] = {"sweep": sweep, "weight": weight}
+        row |= {name: float(np.nanmean(episodes[name][index])) for name in _METRICS}
+        row |= {"angle_low": low, "angle_high": high, "pace_kept": row["pace"] / max(neutral, 1e-9)}
+        rows.append(row | {"most_turns": float(np.nanmax(episodes["turns"][index]))})
+    return rows
+
+
+def draw_drift(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Mean rear slip angle with its 95 % interval, and pace, over the weight, a line per sweep."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.8), layout="constrained")
+    for sweep, marker in zip(SWEEPS, "ovs", strict=True):
+        own = [row for row in rows if row["sweep"] == sweep]
+        weights, angle = [row["weight"] for row in own], np.array([row[ANGLE] for row in own])
+        error = np.abs(np.array([[row["angle_low"], row["angle_high"]] for row in own]) - angle[:, None]).T
+        left.errorbar(weights, angle, error, marker=marker, capsize=3)
+        right.plot(weights, [row["pace_kept"] for row in own], marker=marker, label=sweep)
+    for line in (DRIFT_ANGLE_DEG, GRIP_ANGLE_DEG):
+        left.axhline(line, color="0.6", lw=1, ls=":")
+    left.set(xlabel="requested weight", ylabel="slip angle of the rear tyres [deg], 95 %")
+    right.set(xlabel="requested weight", ylabel="progress, share of that at 0")
+    right.legend(fontsize=8, loc="lower left")  # of both: on the left the lines leave no room
+    for panel in (left, right):
+        panel.set_ylim(0.0, None)
+        panel.grid(alpha=0.3)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Mapping[str, Any], steps: int) -> str:
+    text = "# racing, drift: requested and measured style\n\n"
+    text += f"{policy_sentence(agent)}; {summary['episodes_per_weight']} episodes of "
+    text += f"{steps} steps per weight, ordinary starts, the other weights 0, seed {summary['seed']}.\n\n"
+    text += "![slip angle over weight](drift.png)\n\n"
+    formats = {
+        "sweep": "",
+        "weight": "g",
+        "slip_angle_rear": ".1f",
+        "slip_angle_front": ".1f",
+        "pace": ".1f",
+        "pace_kept": ".0%",
+    }
+    text += markdown_table(rows, formats | {"off": ".1%", "turns": ".1f", "most_turns": ".0f", "survived": ".0%"})
+    text += (
+        "\nSlip angles in degrees (0 below 5 m/s), pace in m/s along the track, turns: largest rotation against the "
+    )
+    text += "track in one direction, in whole turns, mean and most over episodes.\n\n"
+    ranks = ", ".join(f"{sweep} {summary[sweep]['rank_correlation']:.2f}" for sweep in SWEEPS)
+    return text + f"Rank correlation of weight and rear slip angle: {ranks}.\n"

@@ -1,0 +1,64 @@
+"""What replay keeps tables of in racing: rare or hard moments (Kompella et al. 2023; racing.md, section 5.3)."""
+
+from __future__ import annotations
+
+import math
+
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from coachable.domains.racing.families import check_family
+from coachable.envs.racing.race.features import DRIFT_NAMES, OVERTAKE, anyone_near
+from coachable.envs.racing.race.observation import own_columns
+from coachable.keys import STYLE_FEATURES
+from coachable.replay import PredicateEvents
+
+SLIDE = math.radians(20.0)  # mean slip angle of the rear tyres
+TOW = 0.3  # strength of a slipstream that counts
+
+
+def racing_events(family: str = "resources") -> PredicateEvents:
+    """Tables of a family's training.
+
+    "recovery" (three wheels off the track) in all families; "slide" (rear slip angle above 20 degrees) alone on the
+    track; "contact", "overtake" (metres gained on a car ahead) and "slipstream" in races.
+
+    Args:
+        family: drift, resources or aggressiveness.
+
+    Raises:
+        ValueError: if there is no such family.
+    """
+    check_family(family)
+    tables = {"recovery": _off_course}
+    if family == "aggressiveness":
+        tables |= {"contact": _contact, "overtake": _overtake, "slipstream": _slipstream}
+    else:
+        tables |= {"slide": _slide}
+    return PredicateEvents(tables)
+
+
+def _flags(steps: TensorDictBase) -> Tensor:
+    """Off course, wall, contact, (N, 3)."""
+    return steps["next", "observation"][..., own_columns("flags")]
+
+
+def _off_course(steps: TensorDictBase) -> Tensor:
+    return _flags(steps)[..., 0] > 0.5
+
+
+def _contact(steps: TensorDictBase) -> Tensor:
+    return _flags(steps)[..., 2] > 0.5
+
+
+def _slide(steps: TensorDictBase) -> Tensor:
+    return steps["next", STYLE_FEATURES][..., DRIFT_NAMES.index("slip_angle_rear")] > SLIDE
+
+
+def _overtake(steps: TensorDictBase) -> Tensor:
+    features = steps["next", STYLE_FEATURES]
+    return (features[..., OVERTAKE] > 0.0) & anyone_near(features)
+
+
+def _slipstream(steps: TensorDictBase) -> Tensor:
+    return steps["next", "observation"][..., -1] > TOW

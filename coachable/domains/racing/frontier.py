@@ -1,0 +1,284 @@
+"""Lap time against tyre wear and fuel without learning: a dynamic programme over speeds on a fixed line (racing.md, 8).
+
+    python -m coachable.domains.racing.frontier docs/results/racing
+
+The car is a point mass with a friction ellipse, an engine and brakes. A lap is cut into stages of about 6 m; in each
+the programme chooses throttle or brakes so as to minimise lap time + λ · resource. Sweeping λ gives the trade-off that
+any driver of this line is bound to, but for what a point mass leaves out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coachable.envs.racing.circuit.circuits import load_track
+from coachable.envs.racing.circuit.line import minimum_curvature_line
+from coachable.envs.racing.circuit.profile import Envelope
+from coachable.envs.racing.circuit.track import Track
+from coachable.envs.racing.physics.parameters import Car, Resources, load_car
+from coachable.envs.racing.physics.powertrain import (
+    ENGINE_EFFICIENCY,
+    FRICTION_SHARE,
+    FUEL_DENSITY,
+    FUEL_ENERGY,
+    IDLE_RATE,
+)
+from coachable.envs.racing.physics.tyres import WEAR_ENERGY
+from coachable.envs.racing.race.driver import line_geometry
+
+STAGE = 6.0  # [m], about
+SPEEDS = np.linspace(12.0, 100.0, 353)  # [m/s]
+THROTTLE = np.linspace(0.0, 1.0, 12)  # share of the engine's power; 0 is coasting
+BRAKE = np.array([0.15, 0.3, 0.5, 0.75, 0.9, 1.0])  # share of the braking that the ellipse leaves
+RESOURCES = ("tyre", "fuel")
+TANK = 100.0  # [l]
+WORN = 0.75  # mean wear that ends a stint
+_TOO_FAST = 1e4  # [s], cost of a speed that the corner does not allow
+_CRUISE = (0.56, 0.34)  # engine speed over its highest at no and at full power: the middle of the gearbox's shift band
+
+
+Rows = list[dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Lap:
+    """One lap of the programme's driver.
+
+    Attributes:
+        time: [s].
+        fuel: [l].
+        wear: mean of the tyres.
+        speeds: (S,) at the start of each stage [m/s].
+    """
+
+    time: float
+    fuel: float
+    wear: float
+    speeds: np.ndarray
+
+
+class LapProgramme:
+    """The cheapest ways round a track for one car.
+
+    Args:
+        track: circuit.
+        car: parameters, numbers.
+        resources: wear and fuel rates; the latter's exponent decides how much part throttle saves.
+        fuel: load, half a tank by default [l].
+        line: (n,) offset from the centre line [m]; default the line of least curvature.
+
+    Example:
+        >>> programme = LapProgramme(load_track("ring"), load_car("gt3"), Resources(wear=1.0, fuel=1.0))
+        >>> [lap] = programme.laps("fuel", [0.0])
+        >>> 18 < lap.time < 22
+        True
+    """
+
+    def __init__(
+        self, track: Track, car: Car, resources: Resources, *, fuel: float = TANK / 2, line: np.ndarray | None = None
+    ) -> None:
+        curvature, spacing = line_geometry(track, minimum_curvature_line(track) if line is None else line)
+        ends = np.concatenate([[0.0], np.cumsum(spacing)])
+        count = max(3, round(ends[-1] / STAGE))
+        self.step = float(ends[-1] / count)
+        middle = (np.arange(count) + 0.5) * self.step
+        self.curvature = np.abs(np.interp(middle, ends, np.append(curvature, curvature[0])))
+        self.car, self.resources, self.envelope = car, resources, Envelope(car, fuel=fuel)
+        self._tables()
+
+    def laps(self, resource: str, prices: Sequence[float]) -> list[Lap]:
+        """The cheapest lap for each price.
+
+        Args:
+            resource: "tyre" or "fuel".
+            prices: λ, seconds per unit of mean wear or per litre.
+
+        Raises:
+            ValueError: if the resource is unknown.
+        """
+        if resource not in RESOURCES:
+            raise ValueError(f"unknown resource {resource!r}: expected tyre or fuel")
+        price = np.asarray(prices, dtype=float)[:, None, None]
+        count = len(self.curvature)
+        value = np.zeros((len(prices), len(SPEEDS)))
+        choice = np.zeros((count, len(prices), len(SPEEDS)), dtype=np.int64)
+        for stage in range(2 * count - 1, -1, -1):  # the second lap is the first one's future
+            k = stage % count
+            after, cost, allowed = self._stage(k)
+            spent = cost["time"] + price * cost[resource]
+            total = spent + self._ahead(value, after)
+            total = np.where(allowed, total, _TOO_FAST)
+            choice[k] = total.argmin(-1)
+            value = total.min(-1)
+        return self._drive(choice)
+
+    def _tables(self) -> None:
+        """What every speed and choice of pedals gives on a straight, (V, U)."""
+        car, envelope = self.car, self.envelope
+        v = SPEEDS[:, None]
+        power = THROTTLE[None, :]
+        rev = _CRUISE[0] + _CRUISE[1] * power
+        engine = rev * car.rpm_max * (2 * math.pi / 60.0)  # [rad/s]
+        drag_power = car.engine_brake * (0.3 + 0.7 * rev) * engine
+        # Acceleration by the engine: what full throttle gives at this speed, in proportion, less the engine brake.
+        self._pull = power * envelope.engine(v) - (1.0 - power) * car.efficiency * drag_power / envelope.mass / v
+        burning = car.power * power**self.resources.fuel_exponent + FRICTION_SHARE * drag_power
+        rate = np.where(power > 0.02, burning / (ENGINE_EFFICIENCY * FUEL_ENERGY), 0.0)
+        rate = self.resources.fuel * np.maximum(rate, IDLE_RATE) / FUEL_DENSITY
+        idle = np.full(len(BRAKE), self.resources.fuel * IDLE_RATE / FUEL_DENSITY)
+        self._fuel_rate = np.concatenate([rate[0], idle])  # (U,) [l/s]
+        self._friction, self._drag = envelope.friction(SPEEDS), envelope.drag(SPEEDS)
+        self._driven = np.minimum(envelope.traction(SPEEDS) / self._friction, 1.0)
+
+    def _stage(self, k: int) -> tuple[np.ndarray, dict[str, np.ndarray], np.ndarray]:
+        """Speeds after stage k (V, U), what it costs (V, U) or (U,) each, and which choices the tyres allow."""
+        lateral = (SPEEDS**2 * self.curvature[k])[:, None]
+        friction, driven = self._friction[:, None], self._driven[:, None]
+        left = np.sqrt(np.clip(friction**2 - lateral**2, 0.0, None))
+        pull = np.minimum(self._pull, driven * left)
+        braked = -BRAKE[None, :] * left
+        tyre = np.concatenate([pull, braked], axis=1)  # acceleration by the tyres
+        after = np.sqrt(np.clip(SPEEDS[:, None] ** 2 + 2 * self.step * (tyre - self._drag[:, None]), 1.0, None))
+        seconds = 2 * self.step / (SPEEDS[:, None] + after)
+        # Only the driven axle pulls; all wheels brake.
+        share = np.concatenate([np.broadcast_to(driven, pull.shape), np.ones_like(braked)], axis=1)
+        power = share * self._slip_power(tyre / share, lateral) + (1.0 - share) * self._slip_power(0.0, lateral)
+        wear = self.resources.wear * self.envelope.mass * power * seconds / 4 / WEAR_ENERGY
+        allowed = np.broadcast_to(lateral <= friction, after.shape) & (after >= SPEEDS[0]) & (after <= SPEEDS[-1])
+        return after, {"time": seconds, "fuel": self._fuel_rate * seconds, "tyre": wear}, allowed
+
+    def _slip_power(self, along: Any, across: np.ndarray) -> np.ndarray:
+        """Power that sliding tyres take, per mass [W/kg], of accelerations: the tyre curve inverted."""
+        car, speed = self.car, SPEEDS[:, None]
+        total = np.sqrt(along**2 + across**2) + 1e-9
+        used = np.minimum(total / self._friction[:, None], 1.0)
+        slip = np.tan(np.arcsin(used) / car.shape) / math.tan(math.pi / 2 / car.shape)
+        return speed * slip * (car.peak_slip_ratio * along**2 + math.tan(car.peak_slip_angle) * across**2) / total
+
+    @staticmethod
+    def _ahead(value: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """Values (Λ, V) at speeds (V, U), by linear interpolation: (Λ, V, U)."""
+        place = np.clip((after - SPEEDS[0]) / (SPEEDS[1] - SPEEDS[0]), 0.0, len(SPEEDS) - 1.0)
+        below = np.minimum(place.astype(np.int64), len(SPEEDS) - 2)
+        part = place - below
+        return value[:, below] * (1.0 - part) + value[:, below + 1] * part
+
+    def _drive(self, choice: np.ndarray) -> list[Lap]:
+        """Two laps by each of the choices (S, Λ, V); the second counts."""
+        count, prices = choice.shape[:2]
+        each = np.arange(prices)
+        speed = np.full(prices, 40.0)
+        spent: dict[str, np.ndarray] = {}
+        trace = np.zeros((count, prices))
+        for _ in range(2):
+            spent = {name: np.zeros(prices) for name in ("time", "fuel", "tyre")}
+            for k in range(count):
+                trace[k] = speed
+                after, cost, allowed = self._stage(k)
+                fastest = np.flatnonzero(allowed.any(1))[-1]
+                place = np.clip((speed - SPEEDS[0]) / (SPEEDS[1] - SPEEDS[0]), 0.0, fastest)
+                low = np.minimum(place.astype(np.int64), max(fastest - 1, 0))
+                part = place - low
+                pedals = choice[k, each, low], choice[k, each, low + 1]
+
+                def mean(table: np.ndarray, low=low, part=part, pedals=pedals) -> np.ndarray:
+                    return (1.0 - part) * table[low, pedals[0]] + part * table[low + 1, pedals[1]]
+
+                for name in spent:
+                    spent[name] += mean(np.broadcast_to(cost[name], after.shape))
+                speed = mean(after)
+        time, fuel, wear = (spent[name] for name in ("time", "fuel", "tyre"))
+        return [Lap(float(time[i]), float(fuel[i]), float(wear[i]), trace[:, i]) for i in range(prices)]
+
+
+def sweep(car: str, resource: str, prices: Sequence[float], *, exponent: float = 2.5, track: str = "lakeside") -> Rows:
+    """Rows of the trade-off, first the fastest lap, as dictionaries.
+
+    Args:
+        car: name of a shipped car.
+        resource: "tyre" or "fuel".
+        prices: λ in seconds per lap at the fastest lap's use: 1 means that a whole lap's resource is worth 1 s.
+        exponent: n of the fuel law.
+        track: name of a shipped circuit.
+    """
+    rates = Resources.calibrated(car)
+    programme = LapProgramme(load_track(track), load_car(car), Resources(rates.wear, rates.fuel, exponent))
+    [free] = programme.laps(resource, [0.0])
+    use = {"tyre": free.wear, "fuel": free.fuel}[resource]
+    rows = []
+    for price, lap in zip([0.0, *prices], [free, *programme.laps(resource, [p / use for p in prices])], strict=True):
+        spent = {"tyre": lap.wear, "fuel": lap.fuel}[resource]
+        rows.append(
+            {
+                "car": car,
+                "resource": resource,
+                "fuel_exponent": exponent,
+                "price": price,
+                "lap_time": lap.time,
+                "seconds_lost": lap.time - free.time,
+                "fuel_per_lap": lap.fuel,
+                "wear_per_lap": lap.wear,
+                "range_gain": use / spent - 1.0,
+            }
+        )
+    return rows
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Writes frontier.csv and frontier.png."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path, help="folder")
+    out: Path = parser.parse_args(arguments).out
+    out.mkdir(parents=True, exist_ok=True)
+    prices = [1.0, 2.0, 4.0, 6.0, 9.0, 12.0, 16.0, 24.0]
+    curves = [
+        sweep(car, resource, prices, exponent=exponent)
+        for car in ("gt3", "x2019")
+        for resource, exponent in (("tyre", 2.5), ("fuel", 2.5), ("fuel", 1.0))
+    ]
+    with (out / "frontier.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(curves[0][0]))
+        writer.writeheader()
+        for row in (row for rows in curves for row in rows):
+            writer.writerow({k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()})
+    draw(curves, out / "frontier.png")
+
+
+def draw(curves: Sequence[Rows], path: Path) -> None:
+    """Range gained against seconds lost per lap, one curve per car and resource."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 4.2), dpi=120)
+    axes = figure.add_subplot()
+    styles = {("tyre", 2.5): "-", ("fuel", 2.5): "--", ("fuel", 1.0): ":"}
+    for rows in curves:
+        first = rows[0]
+        label = "tyre life" if first["resource"] == "tyre" else f"fuel range, n = {first['fuel_exponent']:g}"
+        axes.plot(
+            [row["seconds_lost"] for row in rows],
+            [100 * row["range_gain"] for row in rows],
+            styles[first["resource"], first["fuel_exponent"]],
+            color={"gt3": "#1f77b4", "x2019": "#d62728"}[first["car"]],
+            marker="o",
+            markersize=3,
+            label=f"{first['car']}, {label}",
+        )
+    axes.set(xlim=(0, 6), ylim=(0, 120), xlabel="lap time lost [s]", ylabel="range gained [%]")
+    axes.set_title("Lakeside: what a point mass can trade (n = 2.5 is the game-like fuel law)", fontsize=10)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    figure.tight_layout()
+    FigureCanvasAgg(figure).print_png(path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,315 @@
+"""Races of five agents with different margins: wins, places, overtakes, contacts of a pair, ahead or behind (paper).
+
+Two of five cars get the lateral margin under test, the other three moderate ones. The pair starts last ("pursuer") or
+first ("leader"), as in Werner et al. (2023).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import matplotlib
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from coachable.domains.racing.metrics import TelemetryMeasures
+from coachable.envs.racing.physics.simulation import CONTROL_STEP
+from coachable.envs.racing.race.features import anyone_beside
+from coachable.envs.racing.race.run import Run
+from coachable.envs.racing.race.scenarios import rolling_start
+from coachable.evaluation.rollouts import record_episodes
+from coachable.evaluation.settings import EvaluationSettings
+from coachable.evaluation.statistics import bootstrap_interval, rank_correlation, wilson_interval
+from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_csv
+from coachable.keys import STYLE_FEATURES
+from coachable.transforms import coachable_env
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+if TYPE_CHECKING:
+    from coachable.domain import Domain
+    from coachable.training.weights import LoadedPolicy
+
+CARS = 5
+SETTINGS = {"pursuer": (3, 4), "leader": (0, 1)}  # slots of the pair, 0 in front
+LATERAL = (0.0, 0.25, 0.5, 0.75, 1.0)  # [m], of the pair
+OTHERS = tuple(product((0.5, 0.75), repeat=3))  # [m], of the other three
+LONGITUDINAL = 0.0  # [m], of all: the lateral margin alone is to act
+LAPS = 4
+RACE_STEPS = 10_000
+START_STEPS = 600  # a minute, in which the field sorts itself out
+_AGAIN = 1.0  # [s], after which touching counts as another contact
+_PASSED = 5.0  # [m], about a car's length: as far ahead of another who was ahead, a car has overtaken it
+_METRICS = {
+    "win_rate": "wins",
+    "places_gained": "places gained",
+    "overtakes": "overtakes per race",
+    "contacts": "contacts per race",
+}
+_RANKED = _METRICS | {"places_later": "places gained after the first minute", "beside": "time beside others"}
+
+
+class _RaceMeasures(TelemetryMeasures):
+    """Also whether any opponent is beside, closer than the largest margin."""
+
+    def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
+        beside = anyone_beside(transition.get(("next", STYLE_FEATURES)), within=LATERAL[-1])
+        return super().step(transition) | {"beside": beside.float()}
+
+
+def evaluate_aggressiveness(
+    domain: Domain,
+    agent: LoadedPolicy,
+    out: Path,
+    settings: EvaluationSettings,
+) -> str:
+    """Race pairs with rising lateral margins against three other copies of the agent.
+
+    Files: `races.csv` (by setting and margin), `radar.png`, `report.md`, `summary.json`.
+
+    Args:
+        domain: racing_aggressiveness, as the agent was trained in.
+        agent: the policy of all five cars; acts deterministically.
+        out: folder, created if missing.
+        settings: `episodes` races per setting, margin and combination of the others' margins, of which there are eight.
+            A race ends when the first car has driven four laps, or after `steps`, by default 10000.
+
+    Returns:
+        The report, Markdown.
+    """
+    episodes, seed = settings.episodes, settings.seed
+    out.mkdir(parents=True, exist_ok=True)
+    cells = [(setting, lateral) for setting in SETTINGS for lateral in LATERAL]
+    races = [(setting, lateral, others) for setting, lateral in cells for others in OTHERS for _ in range(episodes)]
+    found = _race(domain, agent, races, len(cells), settings)
+    rows = _rows(cells, {name: values.reshape(len(cells), -1, 2) for name, values in found.items()})
+    summary: dict[str, Any] = {
+        setting: {
+            name: rank_correlation(
+                *(np.array([r[key] for r in rows if r["setting"] == setting]) for key in ("lateral", name))
+            )
+            for name in _RANKED
+        }
+        for setting in SETTINGS
+    }
+    summary |= {"races_per_row": len(OTHERS) * episodes, "seed": seed}
+    write_csv(rows, out / "races.csv")
+    draw_radar(rows, out / "radar.png")
+    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    report = _report(agent, rows, summary)
+    (out / "report.md").write_text(report)
+    return report
+
+
+def _race(
+    domain: Domain,
+    agent: LoadedPolicy,
+    races: Sequence[tuple[str, float, tuple[float, ...]]],
+    cells: int,
+    settings: EvaluationSettings,
+) -> dict[str, np.ndarray]:
+    """What `_pair_results` finds in each race, (races, 2); those of all cells start alike."""
+    space, count = agent.space, len(races)
+    theta = space.default.repeat(CARS, count, 1)
+    theta[..., space.slices["longitudinal"]] = LONGITUDINAL
+    pair = np.zeros((CARS, count), dtype=bool)
+    for race, (setting, margin, others) in enumerate(races):
+        lateral = list(others)
+        for slot in SETTINGS[setting]:
+            lateral.insert(slot, margin)
+            pair[slot, race] = True
+        theta[:, race, space.slices["lateral"]] = torch.tensor(lateral)[:, None]
+    measured, length = race_alike(
+        domain,
+        agent,
+        theta,
+        _RaceMeasures("distance", "contact", "off"),
+        settings,
+        copies=cells,
+        steps=settings.steps or RACE_STEPS,
+        scenarios=rolling_start(CARS),
+    )
+    values, slots = {name: value.numpy() for name, value in measured.items()}, np.arange(CARS)
+    cars = [
+        _pair_results({name: value[:, :, race] for name, value in values.items()}, slots, pair[:, race], LAPS * length)
+        for race in range(count)
+    ]
+    return {name: np.stack([car[name] for car in cars]) for name in cars[0]}
+
+
+def race_alike(
+    domain: Domain,
+    agent: LoadedPolicy,
+    theta: Tensor,
+    measures: TelemetryMeasures,
+    settings: EvaluationSettings,
+    *,
+    copies: int,
+    steps: int,
+    **options: Any,
+) -> tuple[dict[str, Tensor], float]:
+    """Races between copies of an agent on equal terms. Cars go by the slots they start from, 0 in front.
+
+    Args:
+        domain: as the agent was trained in.
+        agent: the policy of all cars; acts deterministically.
+        theta: (A, B, d) styles of A cars in B races.
+        measures: what is measured.
+        settings: seed, and whether to show a progress bar.
+        copies: of each start: race b starts like race b + B / copies.
+        steps: of each race; stranded cars are put back on the track.
+        **options: of the environment.
+
+    Returns:
+        What is measured, (T, A, B) each, and the length of the track [m].
+    """
+    cars, races, _ = theta.shape
+    simulation: Any = domain.make_env(
+        num_envs=cars * races,
+        cars=cars,
+        controlled=cars,
+        driver=None,
+        episode_steps=steps + 1,
+        put_back=True,
+        copies=copies,
+        **options,
+    )
+    env = coachable_env(simulation, agent.space, domain.make_reward(agent.space), seed=settings.seed)
+    # Who starts where is drawn with the start: look, then start again with the same seed.
+    env.set_seed(settings.seed)
+    env.reset()
+    distance = Run(*simulation.run.unbind(0)).distance  # 0 for the first car, then negative
+    car_at = (-distance.reshape(cars, races)).argsort(0)  # each slot
+    rows = theta.gather(0, car_at.argsort(0)[..., None].expand_as(theta))
+    record = record_episodes(
+        env,
+        agent.actor,
+        rows.reshape(cars * races, -1),
+        measures,
+        steps=steps,
+        seed=settings.seed,
+        progress=f"{races} races of {cars} cars" if settings.progress else None,
+    )
+    env.close()
+    measured = {name: values.reshape(-1, cars, races) for name, values in record.measures.items()}
+    by_slot = {name: values.gather(1, car_at.expand_as(values)) for name, values in measured.items()}
+    return by_slot, simulation.course.length
+
+
+def _pair_results(
+    race: Mapping[str, np.ndarray], slots: np.ndarray, chosen: np.ndarray, finish: float
+) -> dict[str, np.ndarray]:
+    """Of the two chosen cars of one race, whose steps are (T, A): values (2,)."""
+    distance = race["distance"]
+    done = np.flatnonzero(distance.max(1) >= finish)
+    end = int(done[0]) + 1 if len(done) else len(distance)
+    places, early = ((-distance[step - 1]).argsort().argsort() for step in (end, min(START_STEPS, end)))
+    cars = np.flatnonzero(chosen).tolist()
+    touched = race["contact"][:end] > 0
+    return {
+        "top_two": (places < 2)[chosen].astype(float),
+        "won": (places == 0)[chosen].astype(float),
+        "places_gained": (slots - places)[chosen].astype(float),
+        "places_later": (early - places)[chosen].astype(float),
+        "overtakes": np.array([_overtakes(distance[:end], car) for car in cars], dtype=float),
+        "contacts": np.array([_count(touched[:, car]) for car in cars], dtype=float),
+        "beside": race["beside"][:end, chosen].mean(0),
+        "off": race["off"][:end, chosen].mean(0),
+        "metres": distance[end - 1, chosen].astype(float),
+    }
+
+
+def _count(touched: np.ndarray) -> int:
+    """Contacts of one car, steps (T,) bool; those within a second of the last one are the same."""
+    steps = np.flatnonzero(touched)
+    return int((np.diff(steps, prepend=-np.inf) > _AGAIN / CONTROL_STEP).sum()) if len(steps) else 0
+
+
+def _overtakes(distance: np.ndarray, car: int) -> int:
+    """How often a car overtook one of the others, from the distances (T, A) of all [m]."""
+    gap = distance[:, [car]] - np.delete(distance, car, axis=1)
+    return sum(int((np.diff(np.sign(one[np.abs(one) >= _PASSED])) > 0.0).sum()) for one in gap.T)
+
+
+def _rows(cells: Sequence[tuple[str, float]], found: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
+    """Means by setting and margin with 95 % intervals, of values (cells, races, 2)."""
+    rows = []
+    for index, (setting, lateral) in enumerate(cells):
+        of = {name: values[index] for name, values in found.items()}
+        row: dict[str, Any] = {"setting": setting, "lateral": lateral, "races": len(of["won"])}
+        row["win_rate"] = float(of["top_two"].mean())
+        row["win_rate_low"], row["win_rate_high"] = wilson_interval(int(of["top_two"].sum()), of["top_two"].size)
+        row["either_won"] = float(of["won"].max(1).mean())
+        for name in ("places_gained", "places_later", "overtakes", "contacts", "beside"):
+            per_race = of[name].mean(1)
+            row[name] = float(per_race.mean())
+            row[f"{name}_low"], row[f"{name}_high"] = bootstrap_interval(per_race)
+        rows.append(row | {"off": float(of["off"].mean()), "kilometres": float(of["metres"].mean() / 1000.0)})
+    return rows
+
+
+def draw_radar(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """One radar per setting, one polygon per margin; every axis runs from the lowest to the highest value on it."""
+    angles = np.linspace(0.0, 2.0 * np.pi, len(_METRICS), endpoint=False) + np.pi / 2
+    figure, axes = plt.subplots(
+        1, len(SETTINGS), figsize=(9.5, 4.6), subplot_kw={"projection": "polar"}, layout="constrained"
+    )
+    for panel, setting in zip(axes, SETTINGS, strict=True):
+        own = [row for row in rows if row["setting"] == setting]
+        table = np.array([[row[name] for name in _METRICS] for row in own])
+        low, high = table.min(0), table.max(0)
+        scaled = 0.15 + 0.85 * (table - low) / np.maximum(high - low, 1e-9)
+        for index, row in enumerate(own):
+            color = plt.get_cmap("viridis")(0.9 * index / max(len(own) - 1, 1))
+            closed = np.append(scaled[index], scaled[index, 0])
+            panel.plot(
+                np.append(angles, angles[0]), closed, color=color, marker="o", ms=3, label=f"{row['lateral']:g} m"
+            )
+        labels = [f"{text}\n{a:.2f} to {b:.2f}" for text, a, b in zip(_METRICS.values(), low, high, strict=True)]
+        panel.set_xticks(angles, labels, fontsize=8)
+        panel.tick_params(axis="x", pad=26)  # clear of the circle, left and right
+        panel.set_yticks([])
+        panel.set_ylim(0.0, 1.05)
+        panel.set_title(setting)
+    axes[-1].legend(title="lateral margin", loc="upper left", bbox_to_anchor=(1.1, 1.0), fontsize=8)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Mapping[str, Any]) -> str:
+    text = "# racing, aggressiveness: requested margin and what came of it\n\n"
+    text += f"{policy_sentence(agent)} in all five cars; {summary['races_per_row']} "
+    text += (
+        f"races per row, {LAPS} laps, rolling start, seed {summary['seed']}. Two cars, which start last (pursuer) or "
+    )
+    text += (
+        f"first (leader), keep the lateral margin, the other three 0.5 or 0.75 m; longitudinal {LONGITUDINAL:g} m.\n\n"
+    )
+    text += "![radar](radar.png)\n\n"
+    formats = {"setting": "", "lateral": "g", "win_rate": ".0%", "either_won": ".0%", "places_gained": "+.2f"}
+    formats |= {
+        "places_later": "+.2f",
+        "overtakes": ".1f",
+        "contacts": ".1f",
+        "beside": ".1%",
+        "off": ".1%",
+        "kilometres": ".1f",
+    }
+    text += markdown_table(rows, formats)
+    text += "\nWin rate: share of the pair that ends among the first two. Overtakes, contacts: per car and race; a "
+    text += f"car has overtaken who was ahead when it is {_PASSED:g} m ahead; contacts within a second count once. "
+    text += "Places later: gained after the first minute. "
+    text += f"Beside: share of the time with another car alongside, less than {LATERAL[-1]:g} m away."
+    text += "\n\nRank correlation with the margin: "
+    parts = [
+        f"{setting}: " + ", ".join(f"{_RANKED[name]} {value:.2f}" for name, value in summary[setting].items())
+        for setting in SETTINGS
+    ]
+    return text + "; ".join(parts) + ".\n"

@@ -1,0 +1,350 @@
+"""What saving tyres or fuel gains and costs: stints under rising weights, beside the frontier (paper, Figure 2)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import matplotlib
+import numpy as np
+import torch
+
+from coachable.domains.racing.frontier import TANK, WORN, sweep
+from coachable.domains.racing.metrics import TelemetryMeasures
+from coachable.domains.racing.traffic import draw_traffic, race_in_traffic, traffic_report, traffic_response
+from coachable.envs.racing.circuit.circuits import load_track
+from coachable.envs.racing.physics.parameters import Resources
+from coachable.envs.racing.physics.simulation import CONTROL_STEP
+from coachable.envs.racing.race.scenarios import Conditions, Scenario
+from coachable.evaluation.rollouts import record_episodes
+from coachable.evaluation.settings import EvaluationSettings
+from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
+from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_csv
+from coachable.transforms import coachable_env
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+if TYPE_CHECKING:
+    from coachable.domain import Domain
+    from coachable.training.weights import LoadedPolicy
+
+WEIGHTS = {"fuel": "fuel", "tyre": "tire"}  # resource to its style weight
+SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the largest weight
+COMPARED = 6  # flying laps of each stint whose times are compared; the first lap is on cold tyres
+STINT_STEPS = 9000  # 15 minutes
+TRIAL_STEPS = 3600
+_COLD = 40.0  # [°C]
+_PRICES = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 9.0, 12.0, 16.0, 24.0, 40.0, 70.0)  # of the frontier, see `LapProgramme.laps`
+_SOLO = (Scenario("solo", 1.0, "solo"),)
+
+
+@dataclass(frozen=True)
+class Stint:
+    """What one car did.
+
+    Attributes:
+        laps: times of its completed laps, from where it started, the first one included [s].
+        clean: of each lap, whether it never had three wheels off the track.
+        left: resource left at the end of each lap: litres, or wear.
+        per_km: resource used per kilometre after the first lap, or in all if there is no other.
+    """
+
+    laps: np.ndarray
+    clean: np.ndarray
+    left: np.ndarray
+    per_km: float
+
+    @property
+    def compared(self) -> float:
+        """Mean time of the laps that are compared; NaN without any [s]."""
+        flying = self.laps[1 : 1 + COMPARED]
+        return float(flying.mean()) if len(flying) else float("nan")
+
+
+def evaluate_resources(
+    domain: Domain,
+    agent: LoadedPolicy,
+    out: Path,
+    settings: EvaluationSettings,
+) -> str:
+    """Drive stints under rising weights of one resource at a time, and a time trial without any.
+
+    As in the paper, the other resource is switched off. Files: `stints.csv` (by resource and weight), `laps.csv` (every
+    lap), `stints.png` (resource left and lap times over laps), `tradeoff.png` (range against pace, with the frontier),
+    `report.md`, `summary.json`. An agent that was trained among others also races them, see `race_in_traffic`:
+    `traffic.csv`, `traffic.png`.
+
+    Args:
+        domain: racing_resources, as the agent was trained in.
+        agent: the policy; acts deterministically.
+        out: folder, created if missing.
+        settings: `episodes` stints per weight, each from its own place on the track, of `steps`, by default 9000,
+            15 minutes.
+
+    Returns:
+        The report, Markdown.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    trained, episodes, seed = agent.config.get("env", {}), settings.episodes, settings.seed
+    car, track = trained.get("car", "x2019"), trained.get("track", "lakeside")
+    rates = Resources.calibrated(car)
+    options: dict[str, Any] = {"steps": settings.steps or STINT_STEPS, "seed": seed, "progress": settings.progress}
+    rows: list[dict[str, Any]] = []
+    every: list[dict[str, Any]] = []
+    frontiers: dict[str, list[dict[str, float]]] = {}
+    for resource, name in WEIGHTS.items():
+        only = replace(rates, **{"wear" if resource == "fuel" else "fuel": 0.0})
+        frontiers[resource] = frontier(track, car, resource)
+        high = dict(zip(agent.space.names, agent.space.high.tolist(), strict=True))[name]
+        cells = [{name: share * high} for share in SHARES]
+        conditions = Conditions(fuel=TANK, heat=_COLD)
+        stints = _drive(domain, agent, cells, episodes, only, conditions, resource, label=resource, **options)
+        rows += _rows(resource, [cell[name] for cell in cells], stints, frontiers[resource])
+        for cell, group in zip(cells, stints, strict=True):
+            for number, stint in enumerate(group):
+                every += [
+                    {"resource": resource, "weight": cell[name], "stint": number, "lap": lap + 1}
+                    | {"time": float(time), "left": float(stint.left[lap]), "clean": bool(stint.clean[lap])}
+                    for lap, time in enumerate(stint.laps)
+                ]
+    options["steps"] = min(options["steps"], TRIAL_STEPS)
+    [trial] = _drive(
+        domain, agent, [{}], max(episodes, 10), rates, Conditions(fuel=TANK / 2), "fuel", label="trial", **options
+    )
+    summary = _summary(rows, trial, frontiers["fuel"][0]["lap_time"], episodes, seed)
+    traffic = race_in_traffic(domain, agent, settings) if trained.get("cars", 1) > 1 else []
+    if traffic:
+        summary["traffic"] = traffic_response(traffic)
+        write_csv(traffic, out / "traffic.csv")
+        draw_traffic(traffic, out / "traffic.png")
+    write_csv(rows, out / "stints.csv")
+    if every:
+        write_csv(every, out / "laps.csv")
+    draw_stints(every, out / "stints.png")
+    draw_tradeoff(rows, frontiers, out / "tradeoff.png")
+    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    report = _report(agent, rows, summary, seed, episodes)
+    if traffic:
+        report += traffic_report(traffic, summary["traffic"])
+    (out / "report.md").write_text(report)
+    return report
+
+
+def frontier(track: str, car: str, resource: str) -> list[dict[str, float]]:
+    """Lap time [s] and range [km] of a point mass on a fixed line, the fastest lap first (racing.md, section 8).
+
+    Args:
+        track: name of a shipped circuit.
+        car: name of a shipped car.
+        resource: "tyre" or "fuel".
+    """
+    length = load_track(track).length / 1000.0
+    stock, spent = (WORN, "wear_per_lap") if resource == "tyre" else (TANK, "fuel_per_lap")
+    laps = sweep(car, resource, _PRICES, track=track)
+    return [{"lap_time": lap["lap_time"], "range_km": length * stock / lap[spent]} for lap in laps]
+
+
+def _drive(
+    domain: Domain,
+    agent: LoadedPolicy,
+    cells: Sequence[Mapping[str, float]],
+    episodes: int,
+    rates: Resources,
+    conditions: Conditions,
+    resource: str,
+    *,
+    label: str,
+    steps: int,
+    seed: int,
+    progress: bool,
+) -> list[list[Stint]]:
+    """Stints of each cell, each from its own place on the track."""
+    space, count = agent.space, len(cells) * episodes
+    theta = torch.stack([space.make(strict=True, **cell) for cell in cells]).repeat_interleave(episodes, 0)
+    simulation: Any = domain.make_env(
+        num_envs=count, scenarios=_SOLO, conditions=conditions, resources=rates, episode_steps=steps + 1
+    )
+    env = coachable_env(simulation, space, domain.make_reward(space), seed=seed)
+    bar = f"{label}: {count} stints" if progress else None
+    record = record_episodes(
+        env,
+        agent.actor,
+        theta,
+        TelemetryMeasures("distance", "fuel", "wear", "off"),
+        steps=steps,
+        seed=seed,
+        progress=bar,
+    )
+    env.close()
+    measured = {name: values.double().numpy() for name, values in record.measures.items()}
+    alive = record.alive.numpy()
+    stints = [_stint(measured, alive, row, simulation.course.length, resource) for row in range(count)]
+    return [stints[i * episodes : (i + 1) * episodes] for i in range(len(cells))]
+
+
+def _stint(measured: Mapping[str, np.ndarray], alive: np.ndarray, row: int, length: float, resource: str) -> Stint:
+    """From the steps (T, N) of all cars."""
+    driven = {name: values[:, row][alive[:, row]] for name, values in measured.items()}
+    distance, off = driven["distance"], np.cumsum(driven["off"])
+    left = driven["fuel" if resource == "fuel" else "wear"]
+    running = left > 0.0 if resource == "fuel" else left < 1.0  # beyond that nothing is used up any more
+    distance, off, left = distance[running], off[running], left[running]
+    furthest = np.maximum.accumulate(distance)
+    ends = length * np.arange(1, int(furthest[-1] // length) + 1)
+    steps = np.searchsorted(furthest, ends)  # in which each lap ends
+    before = np.where(steps > 0, furthest[np.maximum(steps - 1, 0)], 0.0)
+    crossed = CONTROL_STEP * (steps + (ends - before) / (furthest[steps] - before))
+    first, last = (steps[0], steps[-1]) if len(steps) > 1 else (0, -1)  # the first lap has the start in it
+    return Stint(
+        laps=np.diff(crossed, prepend=0.0),
+        clean=np.diff(off[steps], prepend=0.0) == 0.0,
+        left=left[steps],
+        per_km=abs(left[last] - left[first]) / max((distance[last] - distance[first]) / 1000.0, 1e-9),
+    )
+
+
+def _rows(
+    resource: str, weights: Sequence[float], stints: Sequence[Sequence[Stint]], bound: Sequence[Mapping[str, float]]
+) -> list[dict[str, Any]]:
+    """Per weight: range, pace, and what both are against weight 0."""
+    rows = []
+    capacity = TANK if resource == "fuel" else WORN
+    reach = np.array([[capacity / max(stint.per_km, 1e-9) for stint in group] for group in stints])
+    pace = np.array([[stint.compared for stint in group] for group in stints])
+    for index, weight in enumerate(weights):
+        low, high = bootstrap_interval(reach[index])
+        lap_time = float(np.nanmean(pace[index])) if np.isfinite(pace[index]).any() else float("nan")
+        clean = np.concatenate([stint.clean for stint in stints[index]])
+        rows.append(
+            {
+                "resource": resource,
+                "weight": weight,
+                "range_km": float(reach[index].mean()),
+                "range_km_low": low,
+                "range_km_high": high,
+                "range_gain": float(reach[index].mean() / reach[0].mean() - 1.0),
+                "lap_time": lap_time,
+                "seconds_lost": lap_time - float(np.nanmean(pace[0])) if np.isfinite(pace[0]).any() else float("nan"),
+                "frontier_km": range_at(bound, lap_time),
+                "laps": len(clean),
+                "clean_laps": float(clean.mean()) if len(clean) else 0.0,
+            }
+        )
+    return rows
+
+
+def range_at(bound: Sequence[Mapping[str, float]], lap_time: float) -> float:
+    """Range of the frontier at a lap time [km]; NaN outside its points.
+
+    Args:
+        bound: points of `frontier`, the fastest lap first.
+        lap_time: [s].
+    """
+    times = [point["lap_time"] for point in bound]
+    if not times[0] <= lap_time <= times[-1]:
+        return float("nan")
+    return float(np.interp(lap_time, times, [point["range_km"] for point in bound]))
+
+
+def _summary(
+    rows: Sequence[Mapping[str, Any]], trial: Sequence[Stint], estimate: float, episodes: int, seed: int
+) -> dict[str, Any]:
+    flying = [stint.laps[1:] for stint in trial if len(stint.laps) > 1]
+    times = np.concatenate(flying) if flying else np.array([])
+    clean = np.concatenate([stint.clean for stint in trial])
+    summary: dict[str, Any] = {
+        "trial": {
+            "laps": len(times),
+            "mean_lap": float(times.mean()) if len(times) else None,
+            "best_lap": float(times.min()) if len(times) else None,
+            "quasi_steady_state": estimate,
+            "over_estimate": float(times.mean() / estimate - 1.0) if len(times) else None,
+            "clean_laps": float(clean.mean()) if len(clean) else 0.0,
+        }
+    }
+    for resource in WEIGHTS:
+        own = [row for row in rows if row["resource"] == resource]
+        weights, reach = (np.array([row[name] for row in own]) for name in ("weight", "range_km"))
+        summary[resource] = {
+            "rank_correlation": rank_correlation(weights, reach),
+            "range_gain": own[-1]["range_gain"],
+            "seconds_lost": own[-1]["seconds_lost"],
+        }
+    return summary | {"stints_per_weight": episodes, "seed": seed}
+
+
+def draw_stints(laps: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Resource left and lap times over laps, one column per resource, one line per weight (means over stints)."""
+    figure, axes = plt.subplots(2, len(WEIGHTS), figsize=(9.5, 6.4), squeeze=False, layout="constrained")
+    labels = {"fuel": "fuel left [l]", "tyre": "mean tyre wear"}
+    for column, (resource, name) in enumerate(WEIGHTS.items()):
+        own = [lap for lap in laps if lap["resource"] == resource]
+        weights = sorted({lap["weight"] for lap in own})
+        for index, weight in enumerate(weights):
+            color = plt.get_cmap("viridis")(0.9 * index / max(len(weights) - 1, 1))
+            numbers = sorted({lap["lap"] for lap in own if lap["weight"] == weight})
+            for row, key in enumerate(("left", "time")):
+                means = [
+                    np.mean([lap[key] for lap in own if lap["weight"] == weight and lap["lap"] == number])
+                    for number in numbers
+                ]
+                axes[row, column].plot(numbers, means, marker="o", ms=3, color=color, label=f"{name} {weight:g}")
+        axes[0, column].set(
+            ylabel=labels[resource], title=f"{resource} ({'tyre wear' if column == 0 else 'fuel use'} off)"
+        )
+        axes[1, column].set(xlabel="lap", ylabel="lap time [s]")
+        for panel in axes[:, column]:
+            panel.grid(alpha=0.3)
+        axes[0, column].legend(fontsize=8)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def draw_tradeoff(
+    rows: Sequence[Mapping[str, Any]], frontiers: Mapping[str, Sequence[Mapping[str, float]]], path: Path
+) -> None:
+    """Range over lap time, the agent's beside the frontier's."""
+    figure, panels = plt.subplots(1, len(frontiers), figsize=(9.5, 4.0), squeeze=False, layout="constrained")
+    for axes, (resource, bound) in zip(panels[0], frontiers.items(), strict=True):
+        own = [row for row in rows if row["resource"] == resource]
+        times, ranges = ([point[name] for point in bound] for name in ("lap_time", "range_km"))
+        axes.plot(times, ranges, ls="--", label="point mass on a fixed line")
+        axes.plot([row["lap_time"] for row in own], [row["range_km"] for row in own], marker="o", label="agent")
+        for row in own:
+            axes.annotate(f"{row['weight']:.0f}", (row["lap_time"], row["range_km"]), fontsize=8)
+        axes.set(xlabel="lap time [s]", ylabel="range [km]", title=f"{resource}, weight beside each point")
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def _report(
+    agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Mapping[str, Any], seed: int, episodes: int
+) -> str:
+    trial = summary["trial"]
+    text = "# racing, resources: requested and measured style\n\n"
+    text += f"{policy_sentence(agent)}; {episodes} stints per weight, seed {seed}. "
+    text += "The other resource is switched off, as in the paper; tyres start at 40 °C, with a full tank.\n\n"
+    text += "![stints](stints.png) ![range against pace](tradeoff.png)\n\n"
+    formats = {"resource": "", "weight": ".0f", "range_km": ".1f", "range_gain": "+.0%", "lap_time": ".2f"}
+    formats |= {"seconds_lost": "+.2f", "frontier_km": ".1f", "laps": "", "clean_laps": ".0%"}
+    text += markdown_table(rows, formats)
+    text += f"\nRange: until the tank is empty, or until the tyres are worn by {WORN:.0%} on average, at the mean use. "
+    text += (
+        f"Lap time: mean of {COMPARED} laps from the second one on. Frontier: range of a point mass on a fixed line "
+    )
+    text += "at the same lap time (nan where it has none so slow). Clean: never three wheels off the track.\n\n"
+    ranks = ", ".join(f"{name} {summary[name]['rank_correlation']:.2f}" for name in WEIGHTS)
+    text += f"Rank correlation of weight and range: {ranks}.\n\n## Time trial, no saving asked\n\n"
+    if not trial["laps"]:
+        return text + "No car finished a flying lap.\n"
+    return text + (
+        f"{trial['laps']} flying laps on half a tank, wear and fuel on: mean {trial['mean_lap']:.2f} s, best "
+        f"{trial['best_lap']:.2f} s; quasi-steady state {trial['quasi_steady_state']:.2f} s, the mean is "
+        f"{trial['over_estimate']:+.1%} above it; clean laps {trial['clean_laps']:.0%}.\n"
+    )

@@ -1,0 +1,126 @@
+"""Styles of racing: drift, tyre and fuel saving, aggressiveness. Ranges and laws are the paper's (Appendix C)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from coachable.envs.racing.race.features import (
+    DEFEND,
+    DRIFT,
+    DRIFT_NAMES,
+    FUEL,
+    OVERTAKE,
+    TIRE,
+    gap_columns,
+)
+from coachable.styles import (
+    Mixture,
+    PointMass,
+    Product,
+    Sampler,
+    Setpoint,
+    Shared,
+    StyleReward,
+    StyleSpace,
+    Term,
+    Uniform,
+    Weight,
+    WeightedSum,
+)
+
+_DRIFT_BOUNDS = (-0.4, 5.0)
+_TIRE_BOUNDS = (-60.0, 12000.0)
+_FUEL_BOUNDS = (-3.0, 105.0)
+
+
+def _three_way(neutral: float, bounds: tuple[float, float]) -> Mixture:
+    """Neutral with a probability, otherwise negative or positive, equally likely."""
+    low, high = bounds
+    side = (1.0 - neutral) / 2
+    return Mixture([PointMass(0.0), Uniform(low, 0.0), Uniform(0.0, high)], [neutral, side, side])
+
+
+def drift_style_space() -> StyleSpace:
+    """Weights of slip angle and slip ratio, front and rear: 0.5 δ(0) + 0.25 U(-0.4, 0) + 0.25 U(0, 5) each."""
+    low, high = _DRIFT_BOUNDS
+    helps = ("front tyres sideways", "rear tyres sideways", "front wheels locking or spinning", "rear wheels spinning")
+    parameters = [Weight(name, low, high, help=text) for name, text in zip(DRIFT_NAMES, helps, strict=True)]
+    return StyleSpace(parameters, Product([_three_way(0.5, _DRIFT_BOUNDS)] * 4), name="racing_drift")
+
+
+def resource_style_space() -> StyleSpace:
+    """Overtake and defend U(0, 2); tire 0.1 δ(0) + 0.45 U(-60, 0) + 0.45 U(0, 12000); fuel likewise with -3 and 105."""
+    parameters = [
+        Weight("overtake", 0.0, 2.0, help="gain on cars ahead"),
+        Weight("defend", 0.0, 2.0, help="keep cars behind"),
+        Weight("tire", *_TIRE_BOUNDS, help="save tyres"),
+        Weight("fuel", *_FUEL_BOUNDS, help="save fuel"),
+    ]
+    laws = [Uniform(0.0, 2.0), Uniform(0.0, 2.0), _three_way(0.1, _TIRE_BOUNDS), _three_way(0.1, _FUEL_BOUNDS)]
+    return StyleSpace(parameters, Product(laws), name="racing_resources")
+
+
+def aggressiveness_style_space(cars: int = 1) -> StyleSpace:
+    """Margins to other cars: longitudinal U(0, 2) m, lateral U(0, 1) m.
+
+    Args:
+        cars: of a race, if all of them are to get the same style, as in the paper; they then have to be the rows of a
+            `RacingEnv` in which every car is controlled.
+    """
+    parameters = [
+        Setpoint("longitudinal", 0.0, 2.0, unit="m", help="distance to keep ahead and behind"),
+        Setpoint("lateral", 0.0, 1.0, unit="m", help="distance to keep beside"),
+    ]
+    law: Sampler = Uniform((0.0, 0.0), (2.0, 1.0))
+    return StyleSpace(parameters, law if cars == 1 else Shared(law, cars), name="racing_aggressiveness")
+
+
+def drift_style_reward(space: StyleSpace) -> StyleReward:
+    """Σ w_i g_i over mean slip angles [rad] and slip ratios of the axles."""
+    return StyleReward(space, {"drift": WeightedSum(DRIFT_NAMES, DRIFT)})
+
+
+def resource_style_reward(space: StyleSpace, *, gained: float = 1.0, defended: float | None = None) -> StyleReward:
+    """Σ w_i g_i: metres gained ahead and behind, minus mean wear, minus fuel [l].
+
+    Args:
+        space: `resource_style_space`.
+        gained: how often metres gained count; once in the paper.
+        defended: how often those on cars behind count, by default as often.
+    """
+    terms = {
+        "overtaking": WeightedSum(("overtake",), slice(OVERTAKE, OVERTAKE + 1)),
+        "defending": WeightedSum(("defend",), slice(DEFEND, DEFEND + 1)),
+        "saving": WeightedSum(("tire", "fuel"), slice(TIRE, FUEL + 1)),
+    }
+    return StyleReward(space, terms, {"overtaking": gained, "defending": gained if defended is None else defended})
+
+
+def aggressiveness_style_reward(space: StyleSpace, *, weight: float = 1.0, apart: float = 1.0) -> StyleReward:
+    """Σ over near opponents of weight · (min(0, d_lon - ξ_lon) + min(0, d_lat - ξ_lat)).
+
+    Args:
+        space: `aggressiveness_style_space`.
+        weight: per metre that a margin is short, in each control step; the paper has none.
+        apart: share of the weight of a gap along one axis while the cars do not overlap along the other, as the
+            lateral gap to a car straight ahead. 1 charges both gaps of every near car, as the paper's formula does; 0
+            those only that more room would widen.
+
+    Raises:
+        ValueError: if `apart` is not in [0, 1].
+    """
+    if not 0.0 <= apart <= 1.0:
+        raise ValueError(f"apart is {apart}: expected a share between 0 and 1")
+
+    def margins(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
+        long, lat, near = gap_columns(features)
+        too_long = torch.clamp(long - style["longitudinal"].unsqueeze(-1), max=0.0)
+        too_lat = torch.clamp(lat - style["lateral"].unsqueeze(-1), max=0.0)
+        too_long = torch.where(lat == 0.0, too_long, apart * too_long)
+        too_lat = torch.where(long == 0.0, too_lat, apart * too_lat)
+        return weight * (near * (too_long + too_lat)).sum(-1)
+
+    return StyleReward(space, {"margins": Term(margins, parameters=("longitudinal", "lateral"))})

@@ -1,0 +1,1 @@
+"""Circuits: centre line, width, the racing line and its speed profile."""

@@ -1,0 +1,125 @@
+"""Quasi-steady-state speeds along a line: what friction, power and brakes allow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from coachable.envs.racing.physics.dynamics import AIR_DENSITY, GRAVITY
+from coachable.envs.racing.physics.parameters import Car
+from coachable.envs.racing.physics.powertrain import FUEL_DENSITY
+
+LOAD_TRANSFER = 0.96  # share of the ideal grip that is left when the load shifts between wheels
+SPEED_MAX = 110.0  # [m/s]
+_RPM = 60.0 / (2.0 * np.pi)
+_SHIFT_UP = 0.98  # of the highest engine speed, at full throttle
+_LAPS = 2  # so that the end of the lap fits its start
+
+
+@dataclass(frozen=True)
+class Envelope:
+    """Largest accelerations of a car as a point mass [m/s²], of numpy arrays of speeds [m/s].
+
+    Attributes:
+        car: parameters, numbers.
+        fuel: [l].
+        grip: factor of the friction coefficient.
+        braking: share of the friction that the brakes can use.
+    """
+
+    car: Car
+    fuel: float = 30.0
+    grip: float = 1.0
+    braking: float = 1.0
+
+    @property
+    def mass(self) -> float:
+        """Car and fuel [kg]."""
+        return self.car.mass + FUEL_DENSITY * self.fuel
+
+    def friction(self, speed: np.ndarray) -> np.ndarray:
+        """Along the road in any direction."""
+        load = self.mass * GRAVITY + 0.5 * AIR_DENSITY * self.car.lift_area * speed**2
+        coefficient = self.car.grip + self.car.grip_per_load * 1e-3 * (load / 4 - self.car.reference_load)
+        return LOAD_TRANSFER * self.grip * coefficient * load / self.mass
+
+    def drag(self, speed: np.ndarray) -> np.ndarray:
+        """Of air and rolling."""
+        air = 0.5 * AIR_DENSITY * self.car.drag_area * speed**2 / self.mass
+        return air + self.car.rolling_resistance * GRAVITY
+
+    def engine(self, speed: np.ndarray) -> np.ndarray:
+        """At full throttle in the best gear, less what it takes to spin up the wheels and the engine."""
+        car = self.car
+        wheel = np.maximum(speed, 3.0) / car.wheel_radius  # [rad/s]
+        wheels = 2 * (car.wheel_inertia_front + car.wheel_inertia_rear)
+        best = np.zeros_like(wheel)
+        for gear in car.gears:
+            ratio = gear * car.final_drive
+            omega = np.maximum(wheel * ratio, car.rpm_idle / _RPM)
+            force = np.minimum(car.torque, car.power / omega) * ratio * car.efficiency / car.wheel_radius
+            spinning = (wheels + car.engine_inertia * ratio**2) / car.wheel_radius**2
+            # The gearbox shifts up at 98 % of the highest speed.
+            gain = np.where((omega * _RPM <= _SHIFT_UP * car.rpm_max) | (gear == car.gears[-1]), force, 0.0)
+            best = np.maximum(best, gain / (self.mass + spinning))
+        return best
+
+    def traction(self, speed: np.ndarray) -> np.ndarray:
+        """Share of the friction that the driven axle has, with the load moved to it."""
+        car = self.car
+        share = car.front_axle / (car.front_axle + car.rear_axle)
+        driven = (1 - car.drive_share_front) * share + car.drive_share_front * (1 - share)
+        both = 1.0 if 0.0 < car.drive_share_front < 1.0 else driven + 0.12
+        return self.friction(speed) * min(both, 1.0)
+
+
+def cornering_speed(envelope: Envelope, curvature: np.ndarray) -> np.ndarray:
+    """Highest steady speed at each curvature, by bisection [m/s]."""
+    low, high = np.full(curvature.shape, 3.0), np.full(curvature.shape, SPEED_MAX)
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        fits = middle**2 * np.abs(curvature) <= envelope.friction(middle)
+        low, high = np.where(fits, middle, low), np.where(fits, high, middle)
+    return low
+
+
+def speed_profile(envelope: Envelope, curvature: np.ndarray, spacing: np.ndarray | float) -> np.ndarray:
+    """Fastest speeds (n,) on a closed line within the friction ellipse, engine and brakes [m/s].
+
+    Args:
+        envelope: of the car.
+        curvature: (n,) of the line [1/m].
+        spacing: distance from each point to the next [m].
+    """
+    n = len(curvature)
+    step = np.broadcast_to(np.asarray(spacing, dtype=float), (n,))
+    speed = cornering_speed(envelope, curvature)
+    grid = np.linspace(3.0, SPEED_MAX, 200)
+    engine = envelope.engine(grid)
+    for _ in range(_LAPS):  # braking, backwards
+        for i in range(n - 1, -1, -1):
+            ahead = speed[(i + 1) % n]
+            room = _left(float(envelope.friction(ahead)), ahead**2 * curvature[i])
+            room = envelope.braking * room + envelope.drag(ahead)
+            speed[i] = min(speed[i], np.sqrt(ahead**2 + 2 * room * step[i]))
+    for _ in range(_LAPS):  # accelerating, forwards
+        for i in range(n):
+            now, following = speed[i], (i + 1) % n
+            share = _left(
+                float(envelope.traction(now)), now**2 * curvature[i] * envelope.traction(now) / envelope.friction(now)
+            )
+            gain = min(share, float(np.interp(now, grid, engine))) - envelope.drag(now)
+            speed[following] = min(speed[following], np.sqrt(max(now**2 + 2 * gain * step[i], 1.0)))
+    return speed
+
+
+def _left(friction: float, used: float) -> float:
+    """Longitudinal part of the friction circle."""
+    return float(np.sqrt(max(friction**2 - used**2, 0.0)))
+
+
+def lap_time(speed: np.ndarray, spacing: np.ndarray | float) -> float:
+    """Of a speed profile [s]."""
+    following = np.roll(speed, -1)
+    return float(np.sum(2 * np.asarray(spacing) / (speed + following)))

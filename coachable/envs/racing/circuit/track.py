@@ -1,0 +1,306 @@
+"""Tracks: a closed centre line with curvature and widths, sampled at equal distances."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from coachable.envs.racing.physics.surface import Arc, locate
+
+SPACING = 4.0  # [m], about, between nodes
+WIDTH_MIN = 3.0  # [m], half-width, below which cars do not fit
+COLUMNS = ("x", "y", "tx", "ty", "curvature", "left", "right", "margin")
+_CLOSURE = 1.0  # [m], gap between the ends of a centre line that still counts as closed
+_FINE = 0.25  # [m], step of the integration
+
+
+@dataclass(frozen=True)
+class Track:
+    """A circuit.
+
+    Attributes:
+        name: for reports.
+        table: (n, 8) float64, rows at equal distances along the centre line with the columns of `COLUMNS`: position,
+            unit tangent, curvature (positive to the left), half-widths to the left and right, distance from the edge
+            to the wall [m].
+        spacing: distance between rows [m].
+    """
+
+    name: str
+    table: Tensor
+    spacing: float
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+    @property
+    def length(self) -> float:
+        """Of the centre line [m]."""
+        return self.spacing * len(self.table)
+
+    @classmethod
+    def from_csv(cls, path: str | Path, name: str | None = None, margin: float = 10.0) -> Track:
+        """A circuit from a file with the columns x, y, w_right, w_left [m], one line per point of the centre line.
+
+        Lines that start with # are comments. The points are joined by a periodic cubic spline.
+
+        Args:
+            path: file.
+            name: default: the file's name.
+            margin: distance from the edge of the track to the wall [m].
+
+        Raises:
+            ValueError: if a line is no four finite numbers, the track is open, crosses itself, or is too narrow.
+        """
+        path = Path(path)
+        rows = []
+        with path.open(newline="") as file:
+            for number, row in enumerate(csv.reader(file), start=1):
+                if not row or row[0].lstrip().startswith("#"):
+                    continue
+                try:
+                    values = [float(value) for value in row[:4]]
+                except ValueError:
+                    if not rows:  # a header
+                        continue
+                    values = []
+                if len(values) != 4 or not all(math.isfinite(v) for v in values):
+                    raise ValueError(f"{path}, line {number}: got {row}, expected x, y, w_right, w_left in metres")
+                rows.append(values)
+        if len(rows) < 8:
+            raise ValueError(f"{path} has {len(rows)} points: expected at least 8 on a closed centre line")
+        points = np.array(rows)
+        return cls.from_points(points[:, :2], points[:, 3], points[:, 2], name or path.stem, margin)
+
+    @classmethod
+    def from_points(
+        cls, points: np.ndarray, left: np.ndarray, right: np.ndarray, name: str = "track", margin: float = 10.0
+    ) -> Track:
+        """A circuit through the points (n, 2) of its centre line, with half-widths (n,) [m]."""
+        from scipy.interpolate import CubicSpline  # slow to import, and needed here only
+
+        ends = np.linalg.norm(points[0] - points[-1])
+        steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        if ends < 1e-6:  # the first point repeated
+            points, left, right, steps = points[:-1], left[:-1], right[:-1], steps[:-1]
+        elif ends > max(3.0 * steps.max(), _CLOSURE):
+            raise ValueError(f"track {name!r} is open: {ends:.1f} m between its ends, expected a closed centre line")
+        closed = np.vstack([points, points[:1]])
+        knots = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+        spline = CubicSpline(knots, closed, bc_type="periodic")
+        fine = np.linspace(0.0, knots[-1], 1 + math.ceil(knots[-1] / _FINE))
+        arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(spline(fine), axis=0), axis=1))])
+        count = max(8, round(arc[-1] / SPACING))
+        at = np.interp(np.arange(count) * arc[-1] / count, arc, fine)
+        velocity, bend = spline(at, 1), spline(at, 2)
+        speed = np.linalg.norm(velocity, axis=1)
+        curvature = (velocity[:, 0] * bend[:, 1] - velocity[:, 1] * bend[:, 0]) / speed**3
+        widths = [np.interp(at, knots, np.append(w, w[:1])) for w in (left, right)]
+        columns = [*spline(at).T, *(velocity / speed[:, None]).T, curvature, *widths, np.full(count, margin)]
+        return cls(name, torch.from_numpy(np.stack(columns, axis=1)), float(arc[-1] / count))
+
+    @classmethod
+    def from_turns(
+        cls,
+        turns: Sequence[tuple[float, float, float]],
+        *,
+        solve: tuple[int, int] | None = None,
+        width: float = 12.0,
+        margin: float = 10.0,
+        name: str = "track",
+    ) -> Track:
+        """A circuit of straights and turns whose curvature rises and falls linearly.
+
+        Args:
+            turns: (straight before [m], angle [deg, positive to the left], radius [m]) each; the angles add up to
+                ±360.
+            solve: indices of the two turns whose straights are adjusted so that the track closes.
+            width: of the track [m].
+            margin: distance from the edge to the wall [m].
+            name: for reports.
+
+        Raises:
+            ValueError: if the angles do not close, no such straights exist, or the track crosses itself.
+        """
+        total = sum(angle for _, angle, _ in turns)
+        if abs(abs(total) - 360.0) > 1e-6:
+            raise ValueError(f"track {name!r} is open: its turns add up to {total:g} degrees, expected 360 or -360")
+        straights = [straight for straight, _, _ in turns]
+        if solve is not None:
+            straights = _close(turns, straights, solve, name)
+        pieces = []
+        for straight, (_, angle, radius) in zip(straights, turns, strict=True):
+            pieces += [(straight, 0.0, 0.0), *_turn(angle, radius)]
+        points, headings, curvatures, arc = _integrate(pieces)
+        if np.linalg.norm(points[-1] - points[0]) > 1e-3:
+            gap = np.linalg.norm(points[-1] - points[0])
+            raise ValueError(f"track {name!r} is open: {gap:.2f} m between its ends; name two straights to `solve`")
+        count = round(arc[-1] / SPACING)
+        at = np.arange(count) * arc[-1] / count
+        x, y, heading, curvature = (
+            np.interp(at, arc, values) for values in (points[:, 0], points[:, 1], headings, curvatures)
+        )
+        half = np.full(count, width / 2)
+        columns = [x, y, np.cos(heading), np.sin(heading), curvature, half, half, np.full(count, margin)]
+        return cls(name, torch.from_numpy(np.stack(columns, axis=1)), float(arc[-1] / count))
+
+
+def _turn(angle: float, radius: float) -> list[tuple[float, float, float]]:
+    """Ramp, arc and ramp as (length, curvature at the start, curvature at the end)."""
+    arc = radius * math.radians(abs(angle))
+    ramp = min(0.45 * arc, 45.0)
+    curvature = math.copysign(1.0 / radius, angle)
+    return [(ramp, 0.0, curvature), (arc - ramp, curvature, curvature), (ramp, curvature, 0.0)]
+
+
+def _integrate(pieces: list[tuple[float, float, float]]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Positions, headings, curvatures and distances along pieces of linear curvature, at most `_FINE` apart."""
+    nodes, weights = np.polynomial.legendre.leggauss(4)
+    position, heading, distance = np.zeros(2), 0.0, 0.0
+    points, headings = [position[None]], [np.zeros(1)]
+    curvatures: list[np.ndarray] = [np.array([pieces[0][1]])]
+    distances: list[np.ndarray] = [np.zeros(1)]
+    for length, first, last in pieces:
+        if length <= 0.0:
+            continue
+        count = math.ceil(length / _FINE)
+        h, slope = length / count, (last - first) / length
+        start = h * np.arange(count)
+        inner = start[:, None] + h * (nodes + 1) / 2
+        direction = heading + first * inner + slope * inner**2 / 2
+        steps = h / 2 * np.stack([np.cos(direction) @ weights, np.sin(direction) @ weights], axis=1)
+        along = start + h
+        points.append(position + np.cumsum(steps, axis=0))
+        headings.append(heading + first * along + slope * along**2 / 2)
+        curvatures.append(first + slope * along)
+        distances.append(distance + along)
+        position, heading, distance = points[-1][-1], headings[-1][-1], distances[-1][-1]
+    return tuple(np.concatenate(parts) for parts in (points, headings, curvatures, distances))  # type: ignore
+
+
+def _close(
+    turns: Sequence[tuple[float, float, float]], straights: list[float], solve: tuple[int, int], name: str
+) -> list[float]:
+    """The straights with two of them changed so that the track ends where it starts."""
+    pieces, headings, heading = [], [], 0.0
+    for index, (_, angle, radius) in enumerate(turns):
+        headings.append(heading)
+        pieces += [(0.0 if index in solve else straights[index], 0.0, 0.0), *_turn(angle, radius)]
+        heading += math.radians(angle)
+    gap = _integrate(pieces)[0][-1]
+    directions = np.array([[math.cos(headings[i]), math.sin(headings[i])] for i in solve]).T
+    if abs(np.linalg.det(directions)) < 1e-3:
+        raise ValueError(f"track {name!r}: the straights {solve} are parallel, name two others to `solve`")
+    lengths = np.linalg.solve(directions, -gap)
+    if lengths.min() < 0.0:
+        raise ValueError(
+            f"track {name!r} does not close: straights {solve} would be {lengths.round(1).tolist()} m long"
+        )
+    closed = list(straights)
+    closed[solve[0]], closed[solve[1]] = lengths.tolist()
+    return closed
+
+
+def clearance(track: Track, apart: float = 60.0) -> float:
+    """Smallest distance between centre-line points that lie at least `apart` m from each other along the track [m]."""
+    points = track.table[:, :2]
+    distance = torch.cdist(points, points)
+    index = torch.arange(len(points))
+    along = (index[:, None] - index).abs()
+    along = torch.minimum(along, len(points) - along) * track.spacing
+    return float(distance[along >= min(apart, track.length / 4)].min())
+
+
+def _check(track: Track) -> None:
+    table, name = track.table, track.name
+    if table.ndim != 2 or table.shape[1] != len(COLUMNS) or len(table) < 8:
+        raise ValueError(f"track {name!r} has a table of shape {tuple(table.shape)}: expected (n, {len(COLUMNS)})")
+    if not torch.isfinite(table).all():
+        raise ValueError(f"track {name!r} holds NaN or infinite numbers")
+    left, right, margin, curvature = table[:, 5], table[:, 6], table[:, 7], table[:, 4]
+    narrow = float(torch.minimum(left, right).min())
+    if narrow < WIDTH_MIN:
+        raise ValueError(f"track {name!r} is {narrow:.2f} m wide on one side: expected at least {WIDTH_MIN} m")
+    inner = torch.where(curvature > 0, left, right) + margin
+    tight = float((inner * curvature.abs()).max())
+    if tight > 0.95:
+        raise ValueError(
+            f"track {name!r}: a wall lies beyond the centre of a turn (ratio {tight:.2f}): reduce width or margin"
+        )
+    gap = table[0, :2] - (table[-1, :2] + track.spacing * table[-1, 2:4])
+    if float(gap.norm()) > track.spacing:
+        raise ValueError(f"track {name!r} is open: {float(gap.norm()):.1f} m between its ends")
+    widest = float((left + right).max())
+    if clearance(track) < widest:
+        raise ValueError(f"track {name!r} crosses itself, or comes within {widest:.1f} m of itself")
+
+
+class Course(torch.nn.Module):
+    """A track's table on a device, and where points are on it.
+
+    Args:
+        track: circuit.
+        device: of the table.
+        dtype: of the table.
+    """
+
+    def __init__(self, track: Track, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
+        super().__init__()
+        self.length, self.spacing, self.count = track.length, track.spacing, len(track.table)
+        self.register_buffer("table", track.table.to(device, dtype).contiguous())
+        self.table: Tensor
+
+    def node(self, s: Tensor) -> Tensor:
+        """Index of the node nearest to a distance along the track."""
+        return torch.remainder(torch.round(s / self.spacing).to(torch.int64), self.count)
+
+    def frame(self, node: Tensor) -> Tensor:
+        """Rows of the table, (8, ...)."""
+        return torch.stack([self.table[:, column][node] for column in range(8)])
+
+    def project(self, x: Tensor, y: Tensor, s: Tensor) -> tuple[Tensor, Arc, Tensor]:
+        """Distance along the track, position relative to the centre line, and frame of the nearest node.
+
+        Two look-ups: each projects on the arc at a node, which moves the second to the nearest node.
+
+        Args:
+            x: (N,) [m].
+            y: (N,) [m].
+            s: (N,) a distance along the track close to the result, within a few dozen metres.
+
+        Returns:
+            s in [0, length), the arc, and the frame (8, N).
+        """
+        node = self.node(s)
+        frame = self.frame(node)
+        arc = locate(x, y, *frame[:5].unbind(0))
+        node = self.node(node * self.spacing + arc.ahead.clamp(-40.0, 40.0))
+        frame = self.frame(node)
+        arc = locate(x, y, *frame[:5].unbind(0))
+        s = torch.remainder(node * self.spacing + arc.ahead.clamp(-self.spacing, self.spacing), self.length)
+        return s, arc, frame
+
+    def find(self, x: Tensor, y: Tensor) -> tuple[Tensor, Arc, Tensor]:
+        """Like `project`, from anywhere: looks at every node."""
+        distance = (x[..., None] - self.table[:, 0]) ** 2 + (y[..., None] - self.table[:, 1]) ** 2
+        return self.project(x, y, distance.argmin(-1) * self.spacing)
+
+    def place(self, s: Tensor, offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Position of a point beside the centre line, and the direction of the track there [rad]."""
+        node = self.node(s)
+        x, y, tx, ty, curvature = self.frame(node)[:5].unbind(0)
+        ahead = torch.remainder(s - node * self.spacing + self.length / 2, self.length) - self.length / 2
+        angle = curvature * ahead
+        # Along the arc: chord by the series of sine and versine, which is exact enough within half a spacing.
+        forward = ahead * (1 - angle * angle / 6)
+        side = 0.5 * angle * ahead
+        cos, sin = torch.cos(angle), torch.sin(angle)
+        dx, dy = forward - offset * sin, side + offset * cos
+        return x + dx * tx - dy * ty, y + dx * ty + dy * tx, torch.atan2(ty, tx) + angle

@@ -1,0 +1,1 @@
+"""Cars: tyres, powertrain, body, contacts; batched, without control flow."""

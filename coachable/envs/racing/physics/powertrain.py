@@ -1,0 +1,118 @@
+"""Engine, automatic gearbox, differential and fuel."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from coachable.envs.racing.physics.parameters import MAX_GEARS, Car, Resources
+
+SHIFT_TIME = 0.05  # [s] of torque cut
+FUEL_DENSITY = 0.745  # [kg/l]
+ENGINE_EFFICIENCY = 0.36
+FUEL_ENERGY = 43e6  # [J/kg]
+FRICTION_SHARE = 0.6  # of the engine brake that burns fuel while the throttle is open
+IDLE_RATE = 1e-4  # [kg/s]
+DIFFERENTIAL = 60.0  # [N m s/rad]
+DIFFERENTIAL_MAX = 400.0  # [N m]
+_RPM = 60.0 / (2.0 * math.pi)
+
+
+class Drive(NamedTuple):
+    """What the engine does to the wheels in one substep, (N,) each."""
+
+    torque: Tensor  # of all driven wheels together [N m]
+    resistance: Tensor  # engine brake at the wheels, not negative [N m]
+    inertia: Tensor  # of the engine, as felt by all driven wheels together [kg m²]
+    gear: Tensor
+    shift_time: Tensor
+    fuel: Tensor  # [l]
+
+
+def gear_ratio(car: Car, gear: Tensor) -> Tensor:
+    """Total ratio, engine to wheels."""
+    ratio = torch.zeros_like(gear) + car.gears[0] * car.final_drive
+    for index in range(1, MAX_GEARS):
+        ratio = torch.where(gear > index + 0.5, car.gears[index] * car.final_drive, ratio)
+    return ratio
+
+
+def engine_speed(car: Car, ratio: Tensor, wheel_speed: Tensor) -> Tensor:
+    """Speed of the engine [rpm], from the mean speed of the driven wheels [rad/s]; never below idle."""
+    rpm = wheel_speed * ratio * _RPM
+    return torch.maximum(rpm, torch.zeros_like(rpm) + car.rpm_idle)
+
+
+def full_torque(car: Car, omega: Tensor) -> Tensor:
+    """Torque at full throttle [N m] at an engine speed [rad/s]."""
+    return torch.minimum(torch.zeros_like(omega) + car.torque, car.power / omega)
+
+
+def drive_wheels(
+    car: Car,
+    resources: Resources,
+    throttle: Tensor,
+    wheel_speed: Tensor,
+    gear: Tensor,
+    shift_time: Tensor,
+    fuel: Tensor,
+    h: float,
+) -> Drive:
+    """One substep of the engine and the automatic gearbox (racing.md, 3.1).
+
+    Partial throttle shifts up earlier, which saves fuel under the game-like law.
+
+    Args:
+        car: parameters.
+        resources: fuel rate and law.
+        throttle: (N,) in [0, 1].
+        wheel_speed: (N,) mean of the driven wheels [rad/s].
+        gear: (N,).
+        shift_time: (N,) left of the torque cut [s].
+        fuel: (N,) [l].
+        h: substep [s].
+    """
+    ratio = gear_ratio(car, gear)
+    rpm = engine_speed(car, ratio, wheel_speed)
+    below = engine_speed(car, gear_ratio(car, gear - 1.0), wheel_speed)
+    settled = shift_time <= 0.0
+    up = settled & (rpm > car.rpm_max * (0.62 + 0.36 * throttle)) & (gear < car.top_gear - 0.5)
+    down = settled & (below < car.rpm_max * (0.50 + 0.32 * throttle)) & (gear > 1.5)
+    gear = torch.where(up, gear + 1.0, torch.where(down, gear - 1.0, gear))
+    shift_time = torch.where(up | down, SHIFT_TIME, torch.clamp(shift_time - h, min=0.0))
+
+    ratio = gear_ratio(car, gear)
+    rpm = engine_speed(car, ratio, wheel_speed)
+    omega = rpm / _RPM
+    pulling = (shift_time <= 0.0) & (rpm <= car.rpm_max) & (fuel > 0.0)
+    applied = torch.where(pulling, throttle, 0.0)
+    full = full_torque(car, omega)
+    drag = car.engine_brake * (0.3 + 0.7 * torch.clamp(rpm / car.rpm_max, max=1.0))
+
+    power = torch.clamp(applied * full * omega / car.power, 0.0, 1.0)
+    if resources.fuel_exponent != 1.0:
+        power = power**resources.fuel_exponent
+    burning = car.power * power + FRICTION_SHARE * drag * omega * (throttle > 0.02)
+    mass_rate = resources.fuel * torch.clamp(burning / (ENGINE_EFFICIENCY * FUEL_ENERGY), min=IDLE_RATE)
+    fuel = torch.clamp(fuel - h * mass_rate / FUEL_DENSITY, min=0.0)
+    return Drive(
+        torque=applied * full * ratio * car.efficiency,
+        resistance=(1.0 - throttle) * drag * ratio * car.efficiency,
+        inertia=car.engine_inertia * ratio * ratio,
+        gear=gear,
+        shift_time=shift_time,
+        fuel=fuel,
+    )
+
+
+def differential(left: Tensor, right: Tensor) -> Tensor:
+    """Torque that a viscous differential moves from the faster left wheel to the right one [N m]."""
+    return torch.clamp(DIFFERENTIAL * (left - right), -DIFFERENTIAL_MAX, DIFFERENTIAL_MAX)
+
+
+def driven(share: Any) -> Any:
+    """1 where an axle is driven, 0 where its share of the torque is 0."""
+    return (share > 0.0).to(share.dtype) if isinstance(share, Tensor) else float(share > 0.0)

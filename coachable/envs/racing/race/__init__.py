@@ -1,0 +1,1 @@
+"""What happens on a circuit: rules, starts, rivals, what a driver sees."""

@@ -1,0 +1,170 @@
+"""`LineFollower`: a scripted driver with traction control, as baseline and as opponent."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from coachable.envs.racing.circuit.profile import Envelope, speed_profile
+from coachable.envs.racing.circuit.track import Track
+from coachable.envs.racing.physics.dynamics import total_mass
+from coachable.envs.racing.physics.parameters import Car
+from coachable.envs.racing.physics.state import CarState
+from coachable.envs.racing.physics.tyres import tangent
+from coachable.envs.racing.race.run import Run, TyreView, look_around, tyre_view
+
+if TYPE_CHECKING:
+    from coachable.envs.racing.env import RacingEnv
+
+_PREVIEW = (5.0, 0.4)  # [m] and [s], distance at which it aims
+_LAG = 0.1  # [s], until a steering command is carried out
+_YAW_TIME = 0.3  # [s], in which it corrects its yaw rate
+_FRONT_MAX = 0.97  # of the front tyres' grip that it steers for
+_PEDAL_TIME = 0.4  # [s], in which it corrects its speed
+_REACTION = 0.1  # [s], looked ahead in the speed profile: one control step
+_GAP_TIME = 0.35  # [s], to a car ahead in the same lane
+_BRAKING = 0.75  # of the friction: with fixed brake shares the rear wheels lock first
+_LANE = 2.2  # [m]
+_LOST_SPEED = 14.0  # [m/s], off the road or across it
+
+
+class LineFollower:
+    """Aims at a point ahead on its line and keeps to a speed profile; slows down behind others.
+
+    It asks of the front tyres the slip angle that the wanted lateral force needs, counted from the direction in which
+    the front axle moves: that steers into slides by itself. Pedals follow the accelerations of the profile, as far as
+    the tyres' combined slip allows. It feels the grip of its tyres, and slows down where there is less than the profile
+    counts on.
+
+    Args:
+        track: circuit.
+        car: parameters, numbers.
+        grip: share of the tyres' grip that the profile uses.
+        line: (n,) offset of its line from the centre line at each node [m]; default 0.
+        lanes: offsets [m] from that line that successive cars of a race take, so that they do not queue up.
+
+    Example:
+        >>> from coachable.envs.racing import RacingEnv
+        >>> env = RacingEnv(num_envs=2, track="ring", seed=0)
+        >>> driver = LineFollower(env.track, env.garage.typical)
+        >>> driver(env, env.reset()["observation"]).shape
+        torch.Size([2, 2])
+    """
+
+    def __init__(
+        self,
+        track: Track,
+        car: Car,
+        *,
+        grip: float = 0.9,
+        line: np.ndarray | None = None,
+        lanes: tuple[float, ...] = (0.0,),
+    ) -> None:
+        if not 0.0 < grip <= 1.2:
+            raise ValueError(f"grip is {grip}: expected a share of the tyres' grip, such as 0.9")
+        curvature, spacing = line_geometry(track, line)
+        self.line = torch.as_tensor(np.zeros(len(track.table)) if line is None else line, dtype=torch.float32)
+        envelope = Envelope(car, grip=grip, braking=_BRAKING)
+        profile = speed_profile(envelope, curvature, spacing)
+        gain = (np.roll(profile, -1) ** 2 - profile**2) / (2 * spacing) + envelope.drag(profile)
+        self.speeds = torch.as_tensor(profile, dtype=torch.float32)
+        self.gains = torch.as_tensor(gain, dtype=torch.float32)  # acceleration that engine or brakes must provide
+        self.car, self.lanes = car, lanes
+        # How far the tyre curve of `slip_curve` is inverted: force share sin(C atan(B ρ)), ρ = tan α / tan α_p.
+        self._stiffness = math.tan(math.pi / 2 / car.shape)
+        self._peak = tangent(car.peak_slip_angle)
+
+    def __call__(self, env: RacingEnv, observation: Tensor, share: Tensor | float = 1.0) -> Tensor:
+        """Actions (M, 2) for the last M cars of an env.
+
+        Args:
+            env: whose cars it drives.
+            observation: (M, D), not used: it looks at the state.
+            share: of its grip that each car of the env uses, (N,).
+        """
+        m = len(observation)
+        if self.speeds.device != observation.device:
+            for name in ("speeds", "gains", "line"):
+                setattr(self, name, getattr(self, name).to(observation.device))
+        state, run = CarState(*env.state.unbind(0)), Run(*env.run.unbind(0))
+        tyres = tyre_view(env.garage.car, env.simulation.wheels, env.state, env.compound[0])
+        speed = torch.sqrt(state.vx**2 + state.vy**2)
+        steer = self._steer(env, state, run, tyres, speed)
+        pedal = self._pedal(env, state, run, tyres, speed, share)
+        return torch.stack([steer, pedal], dim=-1)[len(speed) - m :]
+
+    def _steer(self, env: RacingEnv, state: CarState, run: Run, tyres: TyreView, speed: Tensor) -> Tensor:
+        """Steering in [-1, 1] towards a point ahead on the line."""
+        car, course = self.car, env.course
+        number = torch.arange(len(speed), device=speed.device) // env.races
+        lanes = torch.tensor(self.lanes, device=speed.device)[number % len(self.lanes)]
+        distance = _PREVIEW[0] + _PREVIEW[1] * speed
+        ahead = run.s + distance
+        x, y, _ = course.place(ahead, self.line[course.node(ahead)] + lanes)
+        forward_speed = state.vx.clamp(min=3.0)
+        bearing = torch.atan2(y - state.y, x - state.x) - state.yaw
+        bearing = torch.remainder(bearing + math.pi, 2 * math.pi) - math.pi
+        off = bearing - torch.atan2(state.vy, forward_speed)  # between the way it moves and the way to the point
+        curvature = 2.0 * torch.sin(off.clamp(-0.5 * math.pi, 0.5 * math.pi)) / distance
+        base = car.front_axle + car.rear_axle
+        turn_in = car.yaw_inertia * (speed * curvature - state.yaw_rate) / _YAW_TIME
+        force = (total_mass(car, state.fuel) * speed**2 * curvature * car.rear_axle + turn_in) / base
+        share = force / (tyres.grip * tyres.load)[:2].sum(0)
+        share = share.clamp(-_FRONT_MAX, _FRONT_MAX)
+        slip = torch.atan(self._peak / self._stiffness * torch.tan(torch.asin(share) / car.shape))
+        # Which way the front axle will move, seen from the car, when the command has been carried out.
+        drift = state.vy + _LAG * (state.ay - state.yaw_rate * forward_speed)
+        steer = torch.atan2(drift + car.front_axle * state.yaw_rate, forward_speed) + slip
+        lost = (bearing.abs() > 0.5 * math.pi) & (speed < _LOST_SPEED)
+        steer = torch.where(lost, torch.sign(bearing) * car.steer_max, steer)
+        return (steer / car.steer_max).clamp(-1.0, 1.0)
+
+    def _pedal(
+        self, env: RacingEnv, state: CarState, run: Run, tyres: TyreView, speed: Tensor, share: Tensor | float
+    ) -> Tensor:
+        """Throttle (positive) or brake (negative) in [-1, 1]."""
+        car = self.car
+        node = env.course.node(run.s + _REACTION * speed)
+        expected = car.grip + car.grip_per_load * 1e-3 * (tyres.load.mean(0) - car.reference_load)
+        grip = share * (tyres.grip.mean(0) / expected).clamp(max=1.0)  # of cold, worn or hard tyres
+        wanted = self.speeds[node] * torch.sqrt(grip)
+        wanted = torch.where((run.off > 0.5) | (run.along < 0.7), wanted.clamp(max=_LOST_SPEED), wanted)
+        if env.cars > 1:
+            wanted = torch.minimum(wanted, self._behind(env, run, speed))
+        force = total_mass(car, state.fuel) * (self.gains[node] * grip + (wanted - speed) / _PEDAL_TIME)
+        slip = torch.sqrt((tyres.ratio / car.peak_slip_ratio) ** 2 + (tyres.side / self._peak) ** 2)
+        throttle = (force * speed.clamp(min=10.0) / (car.efficiency * car.power)).clamp(0.0, 1.0)
+        brake = (-force * car.wheel_radius / car.brake_torque).clamp(0.0, 1.0)
+        driven = slip[2:].amax(0) if car.drive_share_front == 0.0 else slip.amax(0)
+        throttle = throttle * ((1.0 - driven) / 0.3).clamp(0.0, 1.0)
+        brake = brake * ((1.1 - slip[2:].amax(0)) / 0.4).clamp(0.0, 1.0) * ((1.4 - slip.amax(0)) / 0.4).clamp(0.1, 1.0)
+        return throttle - brake
+
+    @staticmethod
+    def _behind(env: RacingEnv, run: Run, speed: Tensor) -> Tensor:
+        """Speed that keeps the time gap to the next car in the same lane."""
+        split = (env.cars, env.races)
+        others = look_around(run.s.reshape(split), run.offset.reshape(split), env.group, env.course.length)
+        in_lane = (others.gap > 0.0) & (others.aside.abs() < _LANE)
+        gap = torch.where(in_lane, others.gap, 1e4)
+        theirs = torch.stack([speed.reshape(split).roll(-k, 0) for k in range(1, env.cars)])
+        nearest = gap.argmin(0, keepdim=True)
+        room = gap.gather(0, nearest)[0] - 5.5 - _GAP_TIME * speed.reshape(split)
+        return (theirs.gather(0, nearest)[0] + 0.8 * room).clamp(min=3.0).reshape(-1)
+
+
+def line_geometry(track: Track, line: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """Curvature (n,) of a line beside the centre line, and the distances (n,) between its points [m]."""
+    table = track.table.numpy()
+    if line is None:
+        return table[:, 4], np.full(len(table), track.spacing)
+    points = table[:, :2] + line[:, None] * np.stack([-table[:, 3], table[:, 2]], axis=1)
+    following, before = np.roll(points, -1, axis=0), np.roll(points, 1, axis=0)
+    a, b, c = (np.linalg.norm(v, axis=1) for v in (following - points, points - before, following - before))
+    first, second = points - before, following - points
+    area = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+    return 2.0 * area / (a * b * c), a

@@ -1,0 +1,72 @@
+"""Which car each race drives."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from coachable.envs.racing.physics.parameters import Car, car_pool, load_car
+from coachable.envs.racing.race.counter_rng import uniforms
+
+POOL = "pool"
+_BASE, _RATE = 0.1, 0.05  # of the adaptive sampling: p in proportion to 0.1 + mean spins
+
+
+class Garage:
+    """One shipped car for everybody, or a pool from which each race draws one model for all of its cars.
+
+    Cars that spin are drawn more often: p in proportion to 0.1 + EMA(spins per car and episode) (our choice, for the
+    paper's adaptive sampling).
+
+    Args:
+        name: of a shipped car, or "pool".
+        cars: A.
+        races: B.
+        device: where.
+    """
+
+    def __init__(self, name: str, cars: int, races: int, device: torch.device) -> None:
+        self.pooled = name == POOL
+        self.typical = load_car("gt3" if self.pooled else name)
+        self.cars, self.device = cars, device
+        self.car: Car = self.typical
+        if self.pooled:
+            self.pool = car_pool().to(device)  # (P, 530)
+            self.spinning = torch.zeros(self.pool.shape[1], device=device)
+            self.model = torch.zeros(races, dtype=torch.int64, device=device)
+            self._assemble()
+
+    def reset(self, seed: int) -> None:
+        """Forgets which cars spin."""
+        if self.pooled:
+            self.spinning.zero_()
+
+    def draw(self, races: Tensor, seeds: Tensor, episode: Tensor, spins: Tensor) -> None:
+        """New models for the races (B,) bool, after noting how often (A · B,) their old ones spun."""
+        mean = spins.reshape(self.cars, -1).mean(0)
+        ended = races & (episode > 1)
+        total = torch.zeros_like(self.spinning).index_add_(0, self.model, torch.where(ended, mean, 0.0))
+        count = torch.zeros_like(self.spinning).index_add_(0, self.model, ended.to(mean.dtype))
+        change = total / count.clamp(min=1.0) - self.spinning
+        self.spinning = self.spinning + _RATE * torch.where(count > 0, change, 0.0)
+        odds = (_BASE + self.spinning).cumsum(0)
+        u = uniforms(seeds ^ 0x5DEECE66D, episode, 1, 1)[0, 0]
+        drawn = torch.bucketize(u * odds[-1], odds[:-1], right=True)
+        self.model = torch.where(races, drawn, self.model)
+        self._assemble()
+
+    def state(self) -> dict[str, Any]:
+        """Tensors for exact resumption."""
+        return {"spinning": self.spinning.clone(), "model": self.model.clone()} if self.pooled else {}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Restores what `state` returned."""
+        if self.pooled:
+            self.spinning = state["spinning"].to(self.device, copy=True)
+            self.model = state["model"].to(self.device, copy=True)
+            self._assemble()
+
+    def _assemble(self) -> None:
+        self.car = Car.unpack(self.pool[:, self.model].repeat(1, self.cars))

@@ -1,0 +1,173 @@
+"""What a driver sees, scaled by known ranges."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from coachable.envs.racing.circuit.track import Course
+from coachable.envs.racing.physics.contact import Bodies, partner
+from coachable.envs.racing.physics.dynamics import WheelSet
+from coachable.envs.racing.physics.parameters import COMPOUNDS, Car
+from coachable.envs.racing.physics.powertrain import engine_speed, full_torque, gear_ratio
+from coachable.envs.racing.physics.state import HEATS, SPINS, WEARS, CarState
+from coachable.envs.racing.race.run import Others, Run, TyreView
+
+COURSE_POINTS = 20
+COURSE_TIME = 6.0  # [s] of travel that the course points cover
+_COURSE_SPEED_MIN = 10.0  # [m/s], so that a slow car sees further than its bonnet
+OPPONENTS = 4
+_OPPONENT_GROUPS = (("opponents", 8 * OPPONENTS), ("slipstream", 1))
+OPPONENT_COLUMNS = sum(width for _, width in _OPPONENT_GROUPS)
+_SEEN = 150.0  # [m]
+
+
+def observation_groups(opponents: bool, pool: bool, course_points: int = COURSE_POINTS) -> tuple[tuple[str, int], ...]:
+    """Name and width of each block, in order. What drivers see of opponents comes last."""
+    groups = [
+        ("motion", 5),
+        ("tyre_load", 4),
+        ("slip_ratio", 4),
+        ("slip_angle", 4),
+        ("place", 5),
+        ("flags", 3),
+        ("controls", 7),
+        ("powertrain", 3),
+        ("tyre_heat", 4),
+        ("tyre_wear", 4),
+        ("tyre_grip", 4),
+        ("fuel", 1),
+        ("compound", len(COMPOUNDS)),
+    ]
+    if pool:
+        groups.append(("car", 8))
+    groups.append(("course", 4 * course_points))
+    if opponents:
+        groups += _OPPONENT_GROUPS
+    return tuple(groups)
+
+
+def own_columns(name: str) -> slice:
+    """Where a block up to the compound is, which is the same in every race.
+
+    Raises:
+        KeyError: if there is no such block.
+    """
+    first = 0
+    for block, width in observation_groups(False, pool=False):
+        if block == name:
+            return slice(first, first + width)
+        first += width
+    raise KeyError(f"no block {name!r} in the observation")
+
+
+def own_car(car: Car, wheels: WheelSet, packed: Tensor, run: Run, tyres: TyreView, length: float) -> list[Tensor]:
+    """Columns of the car itself, up to the fuel."""
+    s = CarState(*packed.unbind(0))
+    share = car.drive_share_front
+    spins = packed[SPINS]
+    mean_speed = share * 0.5 * (spins[0] + spins[1]) + (1.0 - share) * 0.5 * (spins[2] + spins[3])
+    rpm = engine_speed(car, gear_ratio(car, s.gear), mean_speed)
+    torque = s.throttle * full_torque(car, rpm * (2.0 * math.pi / 60.0)) * (rpm <= car.rpm_max)
+    phase = run.s * (2.0 * math.pi / length)
+    half = 0.5 * (run.left + run.right)
+    columns = [s.vx / 50.0, s.vy / 20.0, s.yaw_rate / 2.0, s.ax / 20.0, s.ay / 20.0]
+    columns += (tyres.load / 5000.0).unbind(0)
+    columns += torch.clamp(tyres.ratio * 3.0, -3.0, 3.0).unbind(0)
+    columns += torch.clamp(tyres.side * 3.0, -3.0, 3.0).unbind(0)
+    columns += [phase.sin(), phase.cos(), (run.offset + 0.5 * (run.right - run.left)) / half, run.across, run.along]
+    columns += [run.off, run.wall, run.contact]
+    columns += [s.steer / car.steer_max, s.throttle, s.brake]
+    columns += [run.steer, run.pedal, run.steer_before, run.pedal_before]
+    columns += [rpm / car.rpm_max, s.gear / 8.0, torque / car.torque]
+    columns += ((packed[HEATS] - 90.0) / 60.0).unbind(0)
+    columns += packed[WEARS].unbind(0)
+    columns += (tyres.grip / 1.5).unbind(0)
+    return [*columns, s.fuel / 100.0]
+
+
+def car_columns(car: Car) -> Tensor:
+    """What sort of car it is, (N, 8), for races with different cars; the car's fields must be tensors."""
+    base = car.front_axle + car.rear_axle
+    columns = (
+        car.mass / 1500.0,
+        car.power / 500e3,
+        car.torque / 600.0,
+        car.front_axle / base,
+        car.grip / 1.5,
+        car.lift_area / 3.0,
+        car.drag_area,
+        car.drive_share_front,
+    )
+    return torch.stack(columns, dim=-1)
+
+
+def course_ahead(course: Course, packed: Tensor, run: Run, points: int) -> Tensor:
+    """Left and right edge of the track ahead in the car's frame, (N, 4 points) [100 m].
+
+    Points are spaced evenly in time, up to six seconds at the present speed.
+    """
+    s = CarState(*packed.unbind(0))
+    speed = torch.clamp(torch.sqrt(s.vx * s.vx + s.vy * s.vy), min=_COURSE_SPEED_MIN)
+    times = torch.arange(1, points + 1, device=packed.device, dtype=packed.dtype) * (COURSE_TIME / points)
+    ahead = run.s[:, None] + speed[:, None] * times  # (N, points)
+    node = course.node(ahead)
+    x, y, tx, ty, _, left, right, _ = course.frame(node).unbind(0)
+    past = torch.remainder(ahead - node * course.spacing + 0.5 * course.length, course.length) - 0.5 * course.length
+    dx = x + past * tx - s.x[:, None]
+    dy = y + past * ty - s.y[:, None]
+    cos, sin = torch.cos(s.yaw)[:, None], torch.sin(s.yaw)[:, None]
+    forward, side = dx * cos + dy * sin, dy * cos - dx * sin
+    tangent_x, tangent_y = tx * cos + ty * sin, ty * cos - tx * sin
+    edges = (
+        forward - left * tangent_y,
+        side + left * tangent_x,
+        forward + right * tangent_y,
+        side - right * tangent_x,
+    )
+    return torch.cat(edges, dim=1) * 0.01
+
+
+def _squeezed(distance: Tensor) -> Tensor:
+    """Of a distance [m] something near 1 at 50 m, in which half a metre between cars side by side still counts."""
+    return torch.asinh(distance * 0.5) * 0.25
+
+
+def opponents_seen(bodies: Bodies, others: Others) -> Tensor:
+    """The four nearest others by signed gap, (N, 32): place, velocity, heading, gap, mask, each in the ego frame."""
+    cars = bodies.x.shape[0]
+    blocks = []
+    for k in range(1, cars):
+        other = partner(bodies, k)
+        dx, dy, dvx, dvy = other.x - bodies.x, other.y - bodies.y, other.vx - bodies.vx, other.vy - bodies.vy
+        c, s = bodies.cos, bodies.sin
+        blocks.append(
+            torch.stack(
+                [
+                    _squeezed(dx * c + dy * s),
+                    _squeezed(dy * c - dx * s),
+                    (dvx * c + dvy * s) / 20.0,
+                    (dvy * c - dvx * s) / 20.0,
+                    other.sin * c - other.cos * s,
+                    other.cos * c + other.sin * s,
+                    others.gap[k - 1] / 100.0,
+                    torch.ones_like(dx),
+                ]
+            )
+        )
+    table = torch.stack(blocks)  # (A - 1, 8, A, B)
+    seen = others.gap.abs() < _SEEN
+    if cars - 1 > OPPONENTS:
+        nearest = others.gap.abs().argsort(0)[:OPPONENTS]
+        table = table.gather(0, nearest[:, None].expand(-1, 8, -1, -1))
+        seen, gap = seen.gather(0, nearest), others.gap.gather(0, nearest)
+    else:
+        gap = others.gap
+    order = torch.where(seen, gap, torch.inf).argsort(0)
+    table = table.gather(0, order[:, None].expand(-1, 8, -1, -1)) * seen.gather(0, order)[:, None]
+    empty = OPPONENTS - table.shape[0]
+    if empty > 0:
+        table = torch.cat([table, table.new_zeros(empty, *table.shape[1:])])
+    return table.reshape(8 * OPPONENTS, -1).T

@@ -1,0 +1,277 @@
+"""Between two control steps: what the cars are told to do, and what became of it. Pure functions, fit for compiling."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from coachable.envs.racing.circuit.track import Course
+from coachable.envs.racing.physics.dynamics import WheelSet
+from coachable.envs.racing.physics.parameters import Car
+from coachable.envs.racing.physics.simulation import CONTROL_STEP, bodies_of
+from coachable.envs.racing.physics.state import HEATS, ROW, WEARS, CarInputs, CarState
+from coachable.envs.racing.physics.surface import beyond
+from coachable.envs.racing.physics.tyres import heat_loss
+from coachable.envs.racing.race.observation import (
+    COURSE_POINTS,
+    OPPONENT_COLUMNS,
+    car_columns,
+    course_ahead,
+    opponents_seen,
+    own_car,
+)
+from coachable.envs.racing.race.run import (
+    FRAME,
+    SLIPSTREAM_DRAG,
+    SLIPSTREAM_LIFT,
+    Others,
+    Run,
+    look_around,
+    slipstream,
+    tyre_view,
+    wrap,
+)
+from coachable.envs.racing.race.task import Outcome, TaskWeights, contacts, metres_gained, style_features, task_reward
+
+WRONG_WAY_TIME = 3.0  # [s]
+STOPPED_TIME = 3.0  # [s]
+STOPPED_SPEED = 1.0  # [m/s]
+_BEHIND_WALL = 3.0  # [m], further out than a car can be pushed back from
+TELEMETRY = (
+    "distance",  # [m] from where the first car of the group started
+    "speed",  # [m/s]
+    "offset",  # from the centre line [m]
+    "progress",  # in this step [m]
+    "wear",  # mean of the tyres
+    "fuel",  # [l]
+    "off",  # flags
+    "wall",
+    "contact",
+    "place",  # 1 is first of the group
+    "beta",  # body slip angle [rad]
+    "heading",  # relative to the track [rad]
+)
+
+
+class Verdict(NamedTuple):
+    """Result of one control step."""
+
+    state: Tensor  # (29, N)
+    run: Tensor  # (25, N)
+    observation: Tensor  # (N, D)
+    reward: Tensor  # (N,) of the task
+    features: Tensor  # (N, F)
+    telemetry: Tensor  # (N, 12)
+    terminated: Tensor  # (N,) bool
+
+
+@dataclass(frozen=True)
+class Referee:
+    """The task of B races of A cars on a course.
+
+    Attributes:
+        course: track.
+        weights: of the task reward.
+        cars: A.
+        course_points: points of each edge that a driver sees.
+        substeps: of a control step.
+        pool: whether cars differ, so that drivers are told which they have.
+        opponents: whether drivers see opponents.
+        wrong_way_time: of going backwards that ends an episode [s].
+    """
+
+    course: Course
+    weights: TaskWeights
+    cars: int
+    substeps: int
+    course_points: int = COURSE_POINTS
+    pool: bool = False
+    opponents: bool = False
+    wrong_way_time: float = WRONG_WAY_TIME
+
+    def command(self, packed: Tensor, packed_run: Tensor, action: Tensor, compound: Tensor) -> tuple[Tensor, Tensor]:
+        """State and inputs of the next control step.
+
+        Args:
+            packed: (29, N).
+            packed_run: (25, N).
+            action: (N, 2): steer in [-1, 1], throttle (positive) or brake (negative).
+            compound: (11, N): factors of grip and wear, then the compound's one-hot.
+        """
+        run = Run(*packed_run.unbind(0))
+        steer, pedal = action[:, 0], action[:, 1]
+        inputs = CarInputs(
+            (steer - packed[ROW["steer_command"]]) / self.substeps,
+            torch.clamp(pedal, min=0.0),
+            torch.clamp(-pedal, min=0.0),
+            1.0 - SLIPSTREAM_DRAG * run.slipstream,
+            1.0 - SLIPSTREAM_LIFT * run.slipstream,
+            compound[0],
+            compound[1],
+            *packed_run[FRAME].unbind(0),
+        )
+        timers = torch.zeros_like(packed[:2])
+        return torch.cat([packed[: ROW["off_time"]], timers]), torch.stack(list(inputs))
+
+    def judge(
+        self,
+        old: Tensor,
+        new: Tensor,
+        packed_run: Tensor,
+        action: Tensor,
+        compound: Tensor,
+        car: Car,
+        wheels: WheelSet,
+        group: Tensor | None = None,
+        impact: Tensor | None = None,
+    ) -> Verdict:
+        """What became of a control step.
+
+        Args:
+            old: (29, N) state before it.
+            new: (29, N) state after it.
+            packed_run: (25, N) before it.
+            action: (N, 2).
+            compound: (11, N).
+            car: parameters.
+            wheels: of that car.
+            group: (A, B), for several cars.
+            impact: (A // 2, A, B), likewise.
+        """
+        broken = ~torch.isfinite(new.sum(0))
+        new = torch.where(broken, old, new)
+        s, before = CarState(*new.unbind(0)), Run(*packed_run.unbind(0))
+        place, arc, frame = self.course.project(s.x, s.y, before.s)
+        progress = wrap(place - before.s, self.course.length)
+        turned = torch.cos(s.yaw), torch.sin(s.yaw)
+        along = arc.ny * turned[0] - arc.nx * turned[1]  # the tangent is the normal turned to the right
+        across = arc.nx * turned[0] + arc.ny * turned[1]
+        speed = torch.sqrt(s.vx * s.vx + s.vy * s.vy)
+        one = torch.ones_like(s.x)
+        outcome = Outcome(progress, *(torch.zeros_like(s.x) for _ in range(4)))
+        others, bodies, tow = None, None, torch.zeros_like(s.x)
+        if group is not None and impact is not None:
+            bodies = bodies_of(new, car, self.cars)
+            others = look_around(self._split(place), self._split(arc.offset), group, self.course.length)
+            earlier = look_around(self._split(before.s), self._split(before.offset), group, self.course.length)
+            ahead, behind = metres_gained(earlier, others)
+            touched, rear_end = contacts(impact, earlier, self.cars)
+            outcome = Outcome(progress, *(value.reshape(-1) for value in (ahead, behind, touched, rear_end)))
+            tow = self._tow(others, car)
+        facing_back = (along < 0.0) & (before.along >= 0.0)
+        run = Run(
+            place,
+            arc.offset,
+            along,
+            across,
+            before.distance + progress,
+            before.steps + 1.0,
+            torch.where(progress < -CONTROL_STEP * STOPPED_SPEED, before.wrong_time + CONTROL_STEP, 0.0),
+            torch.where(speed < STOPPED_SPEED, before.stopped_time + CONTROL_STEP, 0.0),
+            action[:, 0],
+            action[:, 1],
+            before.steer,
+            before.pedal,
+            (s.off_time > 0.5 * CONTROL_STEP).to(new.dtype),
+            (s.wall_time > 0.0).to(new.dtype),
+            outcome.contact * one,
+            tow,
+            before.spins + facing_back.to(new.dtype),
+            *frame.unbind(0),
+        )
+        tyres = tyre_view(car, wheels, new, compound[0])
+        reward = task_reward(self.weights, s, run, tyres, outcome)
+        features = style_features(old, new, tyres, outcome, bodies, group)
+        reward = reward - self.weights.tyre_heat * (heat_loss(new[HEATS]) - heat_loss(old[HEATS])).mean(0)
+        lost = beyond(arc.offset, run.left, run.right) > run.margin + _BEHIND_WALL
+        stranded = (run.wrong_time > self.wrong_way_time) | (run.stopped_time > STOPPED_TIME) | lost
+        reward = reward - self.weights.stranded * stranded.to(reward.dtype)
+        terminated = stranded | broken
+        packed_run = torch.stack(list(run))
+        observation = self.observe(new, packed_run, compound, car, wheels, group)
+        return Verdict(
+            new, packed_run, observation, reward, features, self._telemetry(new, run, progress, group), terminated
+        )
+
+    def observe(
+        self,
+        packed: Tensor,
+        packed_run: Tensor,
+        compound: Tensor,
+        car: Car,
+        wheels: WheelSet,
+        group: Tensor | None = None,
+    ) -> Tensor:
+        """Observations (N, D)."""
+        run = Run(*packed_run.unbind(0))
+        tyres = tyre_view(car, wheels, packed, compound[0])
+        parts = [torch.stack(own_car(car, wheels, packed, run, tyres, self.course.length), dim=-1), compound[2:].T]
+        if self.pool:
+            parts.append(car_columns(car))
+        parts.append(course_ahead(self.course, packed, run, self.course_points))
+        if group is not None:
+            bodies = bodies_of(packed, car, self.cars)
+            others = look_around(self._split(run.s), self._split(run.offset), group, self.course.length)
+            parts += [opponents_seen(bodies, others), run.slipstream[:, None]]
+        elif self.opponents:
+            parts.append(run.slipstream.new_zeros(len(run.slipstream), OPPONENT_COLUMNS))
+        return torch.cat(parts, dim=1)
+
+    def begin(self, packed: Tensor, s: Tensor, distance: Tensor, car: Car, group: Tensor | None) -> Tensor:
+        """Task state (25, N) of cars that have just been placed at s (N,)."""
+        state = CarState(*packed.unbind(0))
+        place, arc, frame = self.course.project(state.x, state.y, s)
+        cos, sin = torch.cos(state.yaw), torch.sin(state.yaw)
+        nothing = torch.zeros_like(place)
+        tow = nothing
+        if group is not None:
+            tow = self._tow(look_around(self._split(place), self._split(arc.offset), group, self.course.length), car)
+        return torch.stack(
+            [
+                place,
+                arc.offset,
+                arc.ny * cos - arc.nx * sin,
+                arc.nx * cos + arc.ny * sin,
+                distance,
+                *[nothing] * 10,
+                tow,
+                nothing,
+                *frame.unbind(0),
+            ]
+        )
+
+    def _split(self, values: Tensor) -> Tensor:
+        return values.reshape(self.cars, -1)
+
+    def _tow(self, others: Others, car: Car) -> Tensor:
+        length = self._split(car.length) if isinstance(car.length, Tensor) else car.length
+        return slipstream(others, length).reshape(-1)
+
+    def _telemetry(self, packed: Tensor, run: Run, progress: Tensor, group: Tensor | None) -> Tensor:
+        s = CarState(*packed.unbind(0))
+        rank = torch.ones_like(s.x)
+        if group is not None:
+            distance = self._split(run.distance)
+            for k in range(1, self.cars):
+                in_front = (distance.roll(-k, 0) > distance) & (group.roll(-k, 0) == group)
+                rank = rank + in_front.to(rank.dtype).reshape(-1)
+        return torch.stack(
+            [
+                run.distance,
+                torch.sqrt(s.vx * s.vx + s.vy * s.vy),
+                run.offset,
+                progress,
+                packed[WEARS].mean(0),
+                s.fuel,
+                run.off,
+                run.wall,
+                run.contact,
+                rank,
+                torch.atan2(s.vy, s.vx.abs().clamp(min=1e-3)),
+                torch.atan2(run.across, run.along),
+            ],
+            dim=-1,
+        )

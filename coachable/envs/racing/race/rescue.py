@@ -1,0 +1,50 @@
+"""Stranded cars are put back on the track, as games do in a race."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from coachable.envs.racing.circuit.track import Course
+from coachable.envs.racing.physics.parameters import Car
+from coachable.envs.racing.physics.state import HEATS, ROW, WEARS
+from coachable.envs.racing.race.run import Run, look_around, others_of
+from coachable.envs.racing.race.scenarios import rolling_cars
+
+RESCUE_SPEED = 15.0  # [m/s]
+_CLEAR_BEHIND, _CLEAR_AHEAD = 60.0, 15.0  # [m], nobody may be there
+
+
+def way_clear(course: Course, run: Run, stranded: Tensor, group: Tensor) -> Tensor:
+    """Whether nobody is near a car along the track, (N,) bool. Of stranded cars in one place, the first goes first.
+
+    Args:
+        course: track.
+        run: task state of N = A B cars.
+        stranded: (N,) bool.
+        group: (A, B).
+    """
+    cars = group.shape[0]
+    if cars == 1:
+        return torch.ones_like(stranded)
+    others = look_around(run.s.reshape(cars, -1), run.offset.reshape(cars, -1), group, course.length)
+    near = others.met & (others.gap > -_CLEAR_BEHIND) & (others.gap < _CLEAR_AHEAD)
+    index = torch.arange(cars, device=group.device)[:, None].expand_as(group)
+    waiting = others_of(stranded.reshape(cars, -1)) & (others_of(index) > index)
+    return ~(near & ~waiting).any(0).reshape(-1)
+
+
+def back_on_track(course: Course, car: Car, packed: Tensor, run: Run) -> Tensor:
+    """State (29, N) of cars that roll along the centre line where they were, with the tyres and the fuel they had.
+
+    Args:
+        course: track.
+        car: parameters.
+        packed: (29, N).
+        run: task state of the N cars.
+    """
+    nothing = torch.zeros_like(run.s)
+    state = rolling_cars(course, car, run.s, nothing, nothing, nothing + RESCUE_SPEED)
+    for kept in (HEATS, WEARS, ROW["fuel"]):
+        state[kept] = packed[kept]
+    return state

@@ -1,0 +1,121 @@
+"""`Rivals`: who the agent races against: scripted drivers and its own past (racing.md, section 5.3)."""
+
+from __future__ import annotations
+
+import copy
+from collections import deque
+from typing import TYPE_CHECKING, Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from coachable.envs.racing.race.counter_rng import uniforms
+from coachable.envs.racing.race.driver import LineFollower
+from coachable.keys import STYLE
+
+if TYPE_CHECKING:
+    from coachable.envs.racing.env import RacingEnv
+    from coachable.styles import StyleSpace
+
+_STREAM = 7919  # keeps the draws apart from those of the starts
+
+
+class Rivals:
+    """Drives each car either by script, at a share of the grip that is its own, or as the policy drove some time ago.
+
+    Who is who is drawn at the start of each race, and so is the style of the copies. Without a policy to follow, all
+    are scripted.
+
+    Args:
+        driver: the scripted driver.
+        space: styles of the copies.
+        scripted: share of scripted cars.
+        slowest: smallest share of the driver's grip; the largest is 1.
+        keep: number of copies, the newest ones.
+        interval: control steps between copies.
+
+    Raises:
+        ValueError: if a share is not in [0, 1], or `keep` or `interval` below 1.
+    """
+
+    def __init__(
+        self,
+        driver: LineFollower,
+        space: StyleSpace,
+        *,
+        scripted: float = 0.5,
+        slowest: float = 0.82,
+        keep: int = 4,
+        interval: int = 2000,
+    ) -> None:
+        if not 0.0 <= scripted <= 1.0 or not 0.0 < slowest <= 1.0:
+            raise ValueError(f"scripted is {scripted} and slowest {slowest}: expected shares of the cars and of grip")
+        if keep < 1 or interval < 1:
+            raise ValueError(f"keep is {keep} and interval {interval}: expected at least one copy and one step")
+        self.driver, self.space, self.scripted, self.slowest, self.interval = driver, space, scripted, slowest, interval
+        self.copies: deque[nn.Module] = deque(maxlen=keep)
+        self.policy: nn.Module | None = None
+        self._steps = 0
+
+    def follow(self, policy: nn.Module) -> None:
+        """Takes copies of this policy from now on; it reads `observation` and `style` and writes `action`."""
+        self.policy = policy
+
+    @torch.no_grad()
+    def __call__(self, env: RacingEnv, observation: Tensor) -> Tensor:
+        """Actions (M, 2) for the last M cars of an env."""
+        m = len(observation)
+        # Of each car: whether it is scripted, its share of the grip, which copy it is.
+        who, grip, which = uniforms(env.seeds + _STREAM, env.episode, 3, env.cars).reshape(3, -1)
+        action = self.driver(env, observation, self.slowest + (1.0 - self.slowest) * grip)
+        self._copy_if_due()
+        if not self.copies:
+            return action
+        which = torch.where(who < self.scripted, -1.0, torch.floor(which * len(self.copies)))[-m:]
+        style = self._styles(env)[-m:]
+        for number, policy in enumerate(self.copies):
+            cars = (which == number).nonzero()[:, 0]
+            if len(cars):
+                seen = TensorDict({"observation": observation[cars], STYLE: style[cars]}, [len(cars)])
+                action[cars] = policy(seen)["action"].to(action)
+        return action
+
+    def state(self) -> dict[str, Any]:
+        """The copies, and when the next one is due."""
+        return {"steps": self._steps, "copies": [copy.deepcopy(policy.state_dict()) for policy in self.copies]}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Restores `state`.
+
+        Raises:
+            ValueError: if there are copies, but no policy to follow.
+        """
+        if state["copies"] and self.policy is None:
+            raise ValueError("the state has copies of a policy: call follow(policy) before")
+        self._steps = state["steps"]
+        self.copies.clear()
+        for weights in state["copies"]:
+            past = _frozen(self.policy)
+            past.load_state_dict(weights)
+            self.copies.append(past)
+
+    def _copy_if_due(self) -> None:
+        if self.policy is None:
+            return
+        self._steps += 1
+        if self._steps % self.interval == 0:
+            self.copies.append(_frozen(self.policy))
+
+    def _styles(self, env: RacingEnv) -> Tensor:
+        """A style for each car (N, d), the same throughout a race."""
+        low, high = self.space.low, self.space.high
+        u = uniforms(env.seeds + 2 * _STREAM, env.episode, len(low), env.cars).reshape(len(low), -1)
+        return (low[:, None] + (high - low)[:, None] * u).T
+
+
+def _frozen(policy: nn.Module | None) -> nn.Module:
+    """A copy that does not learn."""
+    if policy is None:
+        raise ValueError("there is no policy to copy: call follow(policy) before")
+    return copy.deepcopy(policy).requires_grad_(False)

@@ -1,0 +1,113 @@
+"""What the task remembers of each car beside the physics, and quantities derived from the state."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from coachable.envs.racing.physics.body import rotate, wheel_velocity
+from coachable.envs.racing.physics.dynamics import WheelSet, steering, wheel_grip, wheel_loads
+from coachable.envs.racing.physics.parameters import Car
+from coachable.envs.racing.physics.state import HEATS, SPINS, WEARS, CarState
+from coachable.envs.racing.physics.tyres import SLIP_SPEED
+
+SLIPSTREAM_LENGTH = 25.0  # [m]
+SLIPSTREAM_WIDTH = 1.5  # [m]
+SLIPSTREAM_DRAG, SLIPSTREAM_LIFT = 0.30, 0.15
+_FAR = 1e4  # [m], gap to a car of another group
+
+
+class Run(NamedTuple):
+    """Task state of N cars, one tensor (N,) each; packed as the rows of one tensor (25, N)."""
+
+    s: Tensor  # distance along the centre line [m]
+    offset: Tensor  # from it, to the left [m]
+    along: Tensor  # cosine of the heading relative to the track
+    across: Tensor  # sine of it
+    distance: Tensor  # covered in this episode [m]
+    steps: Tensor
+    wrong_time: Tensor  # going backwards [s]
+    stopped_time: Tensor  # [s]
+    steer: Tensor  # last action
+    pedal: Tensor
+    steer_before: Tensor  # the one before
+    pedal_before: Tensor
+    off: Tensor  # flags, 0 or 1
+    wall: Tensor
+    contact: Tensor
+    slipstream: Tensor  # in [0, 1]
+    spins: Tensor  # times that the car turned against the track in this episode
+    # Frame of the nearest node: see `track.COLUMNS`.
+    node_x: Tensor
+    node_y: Tensor
+    node_tx: Tensor
+    node_ty: Tensor
+    curvature: Tensor
+    left: Tensor
+    right: Tensor
+    margin: Tensor
+
+
+RUN_ROWS = len(Run._fields)
+FRAME = slice(Run._fields.index("node_x"), RUN_ROWS)
+
+
+class TyreView(NamedTuple):
+    """Of each wheel, (4, N)."""
+
+    load: Tensor  # [N]
+    ratio: Tensor  # slip ratio
+    angle: Tensor  # slip angle in [0, π/2], unsigned [rad]
+    side: Tensor  # signed lateral slip, tangent of the angle at speed
+    grip: Tensor  # friction coefficient
+
+
+def tyre_view(car: Car, wheels: WheelSet, packed: Tensor, compound_grip: Tensor) -> TyreView:
+    """Slip and grip of the tyres in a state (29, N)."""
+    s = CarState(*packed.unbind(0))
+    load = wheel_loads(car, wheels, s)
+    cos, sin = steering(wheels, s.steer)
+    v_long, v_lat = rotate(*wheel_velocity(s.vx, s.vy, s.yaw_rate, wheels.x, wheels.y), cos, -sin)
+    den = torch.sqrt(v_long * v_long + SLIP_SPEED * SLIP_SPEED)
+    return TyreView(
+        load=load,
+        ratio=(packed[SPINS] * car.wheel_radius - v_long) / den,
+        angle=torch.atan2(v_lat.abs(), v_long.abs()),
+        side=v_lat / den,
+        grip=wheel_grip(car, load, packed[HEATS], packed[WEARS], compound_grip),
+    )
+
+
+def wrap(distance: Tensor, length: float) -> Tensor:
+    """Signed distance on a loop, in [-length / 2, length / 2)."""
+    return torch.remainder(distance + 0.5 * length, length) - 0.5 * length
+
+
+class Others(NamedTuple):
+    """The other cars of each car, (A - 1, A, B), in the order of their places in the race."""
+
+    gap: Tensor  # distance along the track from this car to the other, positive ahead [m]
+    aside: Tensor  # offset of the other less this one's [m]
+    met: Tensor  # bool, of the same group
+
+
+def others_of(values: Tensor) -> Tensor:
+    """Values (A, B) of the other cars, (A - 1, A, B): entry k - 1 is that of the k-th next car."""
+    return torch.stack([values.roll(-k, 0) for k in range(1, values.shape[0])])
+
+
+def look_around(s: Tensor, offset: Tensor, group: Tensor, length: float) -> Others:
+    """Where the others are, from s, offset and group (A, B)."""
+    gap = wrap(others_of(s) - s, length)
+    met = others_of(group) == group
+    return Others(torch.where(met, gap, _FAR), others_of(offset) - offset, met)
+
+
+def slipstream(others: Others, car_length: Tensor | float) -> Tensor:
+    """Strength of the strongest slipstream, (A, B), in [0, 1] (racing.md, 3.1)."""
+    clear = others.gap - car_length  # from nose to tail
+    beside = torch.clamp(1.0 - others.aside.abs() / SLIPSTREAM_WIDTH, min=0.0)
+    strength = torch.exp(-clear.clamp(min=0.0) / SLIPSTREAM_LENGTH) * beside
+    return torch.where(others.gap > 0.5 * car_length, strength, 0.0).amax(0)

@@ -1,0 +1,267 @@
+"""How episodes start: who races whom, where, how fast, on which tyres and with how much fuel."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from coachable.envs.racing.circuit.track import Course
+from coachable.envs.racing.physics.parameters import COMPOUNDS, RACE_COMPOUNDS, Car
+from coachable.envs.racing.physics.state import HEATS, ROW, SPINS, STATE_ROWS, WEARS
+from coachable.envs.racing.race.counter_rng import normal, uniforms
+
+STARTS = ("solo", "field", "rolling", "slipstream", "passing", "recovery", "launch")
+GRID_SLOTS = 20
+ROLLING_GAP = 14.0  # [m] between cars of a rolling start
+_LAUNCH_SPEED = 60.0  # [m/s]
+_PASSING_SPREAD = 0.2  # of the speed, between the slowest and the fastest car of a passing start
+_WEAR_MAX, _WEAR_SPREAD = 0.75, 0.05
+_FUEL = (10.0, 100.0)  # [l]
+_HEAT = (30.0, 130.0)  # [°C], as hot as a stint makes them
+_MEDIUM = COMPOUNDS.index("race_medium")
+_DRAWS = 16  # random numbers per car and episode
+_SHARES = {"solo": 0.30, "one_to_one": 0.15, "field": 0.25, "rolling": 0.10, "slipstream": 0.10, "recovery": 0.10}
+_SHARES_ALONE = {"solo": 0.8, "recovery": 0.2}
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One way to start an episode.
+
+    Attributes:
+        name: also of its replay table.
+        share: of the episodes.
+        start: "solo" (anywhere, alone), "field" (cars one behind the other), "rolling" (two columns before the line),
+            "slipstream" (one behind the other, close, on the longest straight), "passing" (there too, but spread across
+            the track and some up to a fifth faster than others), "recovery" (off course, spun, slow) or "launch" (any
+            heading and up to 60 m/s, every second time an ordinary start).
+        group: cars that see and touch each other; cars of different groups share the road without meeting.
+    """
+
+    name: str
+    share: float
+    start: str
+    group: int = 1
+
+    def __post_init__(self) -> None:
+        if self.start not in STARTS:
+            raise ValueError(f"scenario {self.name!r} starts {self.start!r}: expected one of {', '.join(STARTS)}")
+
+
+def drift_scenarios() -> tuple[Scenario, ...]:
+    """Launches at random positions, speeds and orientations (paper); half of the starts are ordinary (our choice)."""
+    return (Scenario("launch", 1.0, "launch"),)
+
+
+def race_scenarios(cars: int, shares: Mapping[str, float] | None = None) -> tuple[Scenario, ...]:
+    """The mixture of multi-tables (racing.md, 5.3).
+
+    Args:
+        cars: of a race.
+        shares: of each kind of start, by its name; by default the design's, and with one car those without opponents.
+
+    Raises:
+        ValueError: if there is no such kind.
+    """
+    if shares is None:
+        shares = _SHARES if cars > 1 else _SHARES_ALONE
+    kinds = {
+        "solo": ("solo", 1),
+        "one_to_one": ("field", 2),
+        "field": ("field", cars),
+        "rolling": ("rolling", cars),
+        "slipstream": ("slipstream", cars),
+        "passing": ("passing", cars),
+        "recovery": ("recovery", 1),
+    }
+    if unknown := set(shares) - set(kinds):
+        raise ValueError(f"shares of {', '.join(sorted(unknown))} given: expected some of {', '.join(kinds)}")
+    return tuple(Scenario(name, shares[name], *kind) for name, kind in kinds.items() if name in shares)
+
+
+def rolling_start(cars: int) -> tuple[Scenario, ...]:
+    """Races only: every car in one group."""
+    return (Scenario("rolling", 1.0, "rolling", cars),)
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Tyres and fuel at the start.
+
+    Attributes:
+        wear: whether tyres start worn: X ~ U(0, 0.75), each tyre N(X, 0.05) clipped (paper).
+        fuel: litres, or None for U(10, 100) (paper).
+        heat: °C of the tyres, or None for U(30, 130).
+        compounds: indices into `COMPOUNDS`, drawn uniformly.
+    """
+
+    wear: bool = False
+    fuel: float | None = 30.0
+    heat: float | None = 80.0
+    compounds: tuple[int, ...] = (_MEDIUM,)
+
+    @classmethod
+    def resources(cls) -> Conditions:
+        """Of the tyre and fuel task."""
+        return cls(wear=True, fuel=None, heat=None, compounds=RACE_COMPOUNDS)
+
+    @classmethod
+    def any_compound(cls) -> Conditions:
+        """Of the aggressiveness task: nine compounds, uniformly."""
+        return cls(compounds=tuple(range(len(COMPOUNDS))))
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Start of every race, (A, B) or (…, A, B)."""
+
+    state: Tensor  # (29, A, B)
+    s: Tensor  # [m]
+    distance: Tensor  # behind the first car of the group, 0 or negative [m]
+    group: Tensor  # int64
+    compound: Tensor  # int64, of `COMPOUNDS`
+    scenario: Tensor  # (B,) int64
+
+
+class Starter:
+    """Draws starts on one course.
+
+    Args:
+        course: track.
+        scenarios: mixture.
+        conditions: tyres and fuel.
+        speeds: (n,) sensible speed at each node [m/s].
+        cars: A.
+    """
+
+    def __init__(
+        self, course: Course, scenarios: Sequence[Scenario], conditions: Conditions, speeds: Tensor, cars: int
+    ) -> None:
+        if cars > GRID_SLOTS:
+            raise ValueError(f"{cars} cars for {GRID_SLOTS} grid slots: expected at most {GRID_SLOTS} cars")
+        total = sum(scenario.share for scenario in scenarios)
+        if not scenarios or abs(total - 1.0) > 1e-6:
+            raise ValueError(f"shares of the scenarios add up to {total:g}: expected 1")
+        self.course, self.scenarios, self.conditions, self.cars = course, tuple(scenarios), conditions, cars
+        device = course.table.device
+        self.speeds = speeds.to(device, torch.float32)
+        shares = torch.tensor([scenario.share for scenario in scenarios], device=device)
+        self._bounds = shares.cumsum(0)[:-1]
+        self._start = torch.tensor([STARTS.index(scenario.start) for scenario in scenarios], device=device)
+        self._group = torch.tensor([scenario.group for scenario in scenarios], device=device)
+        self._compounds = torch.tensor(conditions.compounds, device=device)
+        self._straight = _longest_straight(course)
+
+    def draw(self, seed: Tensor, episode: Tensor, car: Car) -> Starts:
+        """Starts of all races from their seeds (B,) and episode numbers (B,)."""
+        u = uniforms(seed, episode, _DRAWS, self.cars)
+        first = u[:, 0]  # (rows, B), what cars of a race share
+        scenario = torch.bucketize(first[0], self._bounds, right=True)
+        kind, size = self._start[scenario], self._group[scenario]
+        # Cars in a random order, so that no row always starts in front.
+        order = u[1].argsort(0).argsort(0)
+        group = order // size
+        alone = size == 1
+
+        def chosen(*names: str) -> Tensor:
+            return torch.stack([kind == STARTS.index(name) for name in names]).any(0)
+
+        length, half = self.course.length, self._half_width()
+        rank = (order % size).to(u.dtype)  # place within the group, from the front
+        close = chosen("slipstream", "passing")
+        gap = torch.where(
+            chosen("rolling"),
+            ROLLING_GAP,
+            torch.where(close, 7.0 + 6.0 * first[2], 8.0 + 22.0 * first[2]),
+        )
+        straight, extent = self._straight
+        lead = torch.where(close, straight + extent * (0.2 + 0.4 * first[3]), length * first[3])
+        lead = torch.where(chosen("rolling"), length - 10.0, lead)
+        # Groups that do not meet spread over the track.
+        s = torch.where(alone, length * u[4], lead + group * 97.0 - rank * gap)
+        s = torch.remainder(s, length)
+        spread = 2.0 * u[5] - 1.0
+        column = torch.where(order % 2 == 0, 0.4, -0.4)
+        offset = torch.where(
+            chosen("rolling"), column, torch.where(chosen("slipstream"), 0.3 * first[6] - 0.15, 0.6 * spread)
+        )
+        offset = offset * half
+        pace = torch.where(alone, 0.3 + 0.6 * u[7], 0.6 + 0.3 * first[7])
+        sensible = self._sensible(s)
+        slowest = sensible.min(0).values
+        speed = pace * torch.where(alone, sensible, slowest)
+        speed = torch.where(chosen("passing"), speed * (1.0 + _PASSING_SPREAD * (u[9] - 0.5)), speed)
+        yaw_error = 0.05 * (2.0 * u[8] - 1.0)
+
+        beside = half + float(self.course.table[:, 7].min()) - 3.0
+        lost = chosen("recovery").expand_as(s)
+        offset, speed = torch.where(lost, spread * beside, offset), torch.where(lost, 20.0 * u[7], speed)
+        any_way = math.pi * (2.0 * u[8] - 1.0)
+        launched = chosen("launch") & (u[9] < 0.5)
+        offset = torch.where(chosen("launch"), 0.9 * half * spread, offset)
+        speed = torch.where(launched, _LAUNCH_SPEED * u[7], speed)
+        yaw_error = torch.where(lost | launched, any_way, yaw_error)
+
+        compound = self._compounds[(first[10] * len(self._compounds)).long().clamp(max=len(self._compounds) - 1)]
+        state = self._state(car, s, offset, yaw_error, speed, u)
+        distance = torch.where(alone, 0.0, -rank * gap)
+        return Starts(state, s, distance, group, compound.expand_as(order).contiguous(), scenario)
+
+    def _state(self, car: Car, s: Tensor, offset: Tensor, yaw_error: Tensor, speed: Tensor, u: Tensor) -> Tensor:
+        """Packed state (29, A, B): rolling wheels, a fitting gear, tyres and fuel as the conditions ask."""
+        state = rolling_cars(self.course, car, s, offset, yaw_error, speed)
+        conditions = self.conditions
+        low, high = _HEAT
+        state[HEATS] = low + (high - low) * u[11] if conditions.heat is None else conditions.heat
+        low, high = _FUEL
+        state[ROW["fuel"]] = low + (high - low) * u[12] if conditions.fuel is None else conditions.fuel
+        if conditions.wear:
+            common = _WEAR_MAX * u[13]
+            pair = torch.stack([normal(u[14], u[15]), normal(u[14], (u[15] + 0.25) % 1.0)])
+            other = torch.stack([normal(u[2], u[3]), normal(u[2], (u[3] + 0.25) % 1.0)])
+            state[WEARS] = (common + _WEAR_SPREAD * torch.cat([pair, other])).clamp(0.0, 1.0)
+        return state
+
+    def _half_width(self) -> float:
+        return float(self.course.table[:, 5:7].min())
+
+    def _sensible(self, s: Tensor) -> Tensor:
+        return self.speeds[self.course.node(s)]
+
+
+def rolling_cars(course: Course, car: Car, s: Tensor, offset: Tensor, yaw_error: Tensor, speed: Tensor) -> Tensor:
+    """Packed state (29, ...) of cars that roll freely, in a fitting gear, without heat, wear and fuel.
+
+    Args:
+        course: track.
+        car: parameters.
+        s: distance along the track [m]; likewise the following, all of one shape.
+        offset: from the centre line [m].
+        yaw_error: heading relative to the track [rad].
+        speed: [m/s].
+    """
+    state = torch.zeros(STATE_ROWS, *s.shape, dtype=course.table.dtype, device=s.device)
+    x, y, direction = course.place(s, offset)
+    radius = car.wheel_radius.reshape(s.shape) if isinstance(car.wheel_radius, Tensor) else car.wheel_radius
+    for name, value in (("x", x), ("y", y), ("yaw", direction + yaw_error), ("vx", speed)):
+        state[ROW[name]] = value
+    state[SPINS] = speed / radius
+    state[ROW["gear"]] = (1.0 + speed / 14.0).floor().clamp(max=5.0)
+    return state
+
+
+def _longest_straight(course: Course) -> tuple[float, float]:
+    """Start and length of the longest stretch with hardly any curvature [m]."""
+    straight = (course.table[:, 4].abs() < 1e-3).tolist()
+    best, start, run = (0, 0), 0, 0
+    for index, flag in enumerate(straight * 2):
+        run = run + 1 if flag else 0
+        if run == 1:
+            start = index
+        if best[1] < run <= len(straight):
+            best = (start, run)
+    return best[0] % len(straight) * course.spacing, best[1] * course.spacing

@@ -1,0 +1,137 @@
+"""Task reward and style features of one control step (racing.md, section 6)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from coachable.envs.racing.physics.contact import Bodies, body_gaps, partner
+from coachable.envs.racing.physics.state import WEARS, CarState
+from coachable.envs.racing.race.features import DRIFT_SPEED_MIN, NEAR_DISTANCE, pack_style_features
+from coachable.envs.racing.race.run import Others, Run, TyreView
+
+BEHIND, AHEAD = 20.0, 40.0  # [m], window in which passing counts
+_KMH = 3.6
+
+
+@dataclass(frozen=True)
+class TaskWeights:
+    """Weights of the task reward: those of GT Sophy at Lago Maggiore (Wurman et al. 2022, supplement).
+
+    Attributes:
+        progress: per metre along the track, 0 while off course.
+        off_course: per second with three wheels off the track, times the squared speed in km/h.
+        wall: per second against a wall, times the squared speed in km/h.
+        tyre_slip: of Σ min(|slip ratio|, 1) |slip angle|.
+        passing: per metre gained on cars near.
+        contact: of any contact.
+        rear_end: of contact with a car ahead, times the squared relative speed.
+        stranded: once, when a car that stands, goes backwards or is outside the walls ends its episode (our choice:
+            without it drivers learn to park beside the track for good, as that costs nothing).
+        steering_change: of the squared change of the steering command (our choice, after Lee et al. 2025). Wheels turn
+            at a limited rate, so that commands from lock to lock and back steer as well as steady ones: drivers that
+            pay nothing get stuck in that habit, which scrubs the tyres.
+        tyre_heat: per mean share of grip that tyres lose by being too hot, charged as they heat up and paid back as
+            they cool down (our choice: 0 but in the tyre and fuel family). Undiscounted it would change nothing; but
+            heat takes a minute to go, and what a slide costs by then is beyond the discount.
+    """
+
+    progress: float = 1.0
+    off_course: float = 0.01
+    wall: float = 0.01
+    tyre_slip: float = 0.25
+    passing: float = 0.5
+    contact: float = 4.0
+    rear_end: float = 0.1
+    stranded: float = 100.0
+    steering_change: float = 2.0
+    tyre_heat: float = 0.0
+
+
+class Outcome(NamedTuple):
+    """What happened to each car in a control step, (N,) each."""
+
+    progress: Tensor  # [m]
+    overtake: Tensor  # metres gained on cars ahead
+    defend: Tensor  # metres gained or lost to cars behind
+    contact: Tensor  # 0 or 1
+    rear_end: Tensor  # Σ squared relative speed of contacts with cars ahead [m²/s²]
+
+
+def metres_gained(before: Others, after: Others) -> tuple[Tensor, Tensor]:
+    """Metres gained on cars ahead and on cars behind, (A, B) each.
+
+    A car counts while it is at most 40 m ahead or 20 m behind, before or after the step. It is ahead or behind by where
+    it was before.
+    """
+    gained = before.gap - after.gap
+
+    def near(gap: Tensor) -> Tensor:
+        return (gap >= -BEHIND) & (gap <= AHEAD)
+
+    counts = after.met & (near(before.gap) | near(after.gap))
+    gained = torch.where(counts, gained, 0.0)
+    ahead = before.gap >= 0.0
+    return torch.where(ahead, gained, 0.0).sum(0), torch.where(ahead, 0.0, gained).sum(0)
+
+
+def impacts_of(impact: Tensor, cars: int) -> Tensor:
+    """Each car's contacts with the others, (A - 1, A, B), from those of the pairs (A // 2, A, B)."""
+    rows: list[Tensor] = []
+    for k in range(1, cars):
+        rows.append(impact[k - 1] if k <= cars // 2 else impact[cars - k - 1].roll(-k, 0))
+    return torch.stack(rows)
+
+
+def contacts(impact: Tensor, before: Others, cars: int) -> tuple[Tensor, Tensor]:
+    """Whether a car was touched, and Σ squared relative speed where the other car was ahead, (A, B) each."""
+    each = impacts_of(impact, cars)
+    touched = (each > 0.0).any(0).to(impact.dtype)
+    return touched, torch.where(before.gap > 0.0, each, 0.0).sum(0)
+
+
+def task_reward(weights: TaskWeights, state: CarState, run: Run, tyres: TyreView, outcome: Outcome) -> Tensor:
+    """Σ weight · term, (N,)."""
+    squared = (_KMH * _KMH) * (state.vx * state.vx + state.vy * state.vy)
+    slip = (torch.clamp(tyres.ratio.abs(), max=1.0) * tyres.angle).unbind(0)
+    reward = weights.progress * torch.where(run.off > 0.5, 0.0, outcome.progress)
+    reward = reward - weights.off_course * state.off_time * squared
+    reward = reward - weights.wall * state.wall_time * squared
+    reward = reward - weights.tyre_slip * (slip[0] + slip[1] + slip[2] + slip[3])
+    reward = reward - weights.steering_change * (run.steer - run.steer_before) ** 2
+    reward = reward + weights.passing * (outcome.overtake + outcome.defend)
+    return reward - weights.contact * outcome.contact - weights.rear_end * outcome.rear_end
+
+
+def style_features(
+    old: Tensor, new: Tensor, tyres: TyreView, outcome: Outcome, bodies: Bodies | None, group: Tensor | None
+) -> Tensor:
+    """Raw quantities of all style terms, (N, F): see `styles`.
+
+    Args:
+        old: (29, N) state before the step.
+        new: (29, N) state after it.
+        tyres: after it.
+        outcome: of the step.
+        bodies: (A, B) after it, if there are several cars.
+        group: (A, B), likewise.
+    """
+    state = CarState(*new.unbind(0))
+    moving = (state.vx * state.vx + state.vy * state.vy > DRIFT_SPEED_MIN * DRIFT_SPEED_MIN).to(new.dtype)
+    ratio = torch.clamp(tyres.ratio.abs(), max=1.0)
+    drift = [0.5 * (values[axle] + values[axle + 1]) * moving for values in (tyres.angle, ratio) for axle in (0, 2)]
+    worn = (new[WEARS] - old[WEARS]).unbind(0)
+    tire = -0.25 * (worn[0] + worn[1] + worn[2] + worn[3])
+    burnt = state.fuel - CarState(*old.unbind(0)).fuel  # negative
+    gaps: list[Tensor] = []
+    if bodies is not None and group is not None:
+        for k in range(1, group.shape[0]):
+            other = partner(bodies, k)
+            long, lat = body_gaps(bodies, other)
+            apart = (other.x - bodies.x) ** 2 + (other.y - bodies.y) ** 2
+            near = (apart <= NEAR_DISTANCE * NEAR_DISTANCE) & (group == group.roll(-k, 0))
+            gaps += [long.reshape(-1), lat.reshape(-1), near.to(new.dtype).reshape(-1)]
+    return pack_style_features(drift, [outcome.overtake, outcome.defend, tire, burnt], gaps)

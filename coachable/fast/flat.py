@@ -1,0 +1,73 @@
+"""Gradients and rounded copies of a network's parameters, each kind in one contiguous buffer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.autograd.graph import increment_version
+
+from coachable.fast.memory import Arena
+
+_ALIGN = 32  # elements: one cache line of 64 bytes at bfloat16, so that products see aligned matrices
+
+
+class FlatBuffers:
+    """What the hand-written passes keep besides the parameters, which stay where they are.
+
+    Args:
+        tensors: Float tensors on one device, trained parameters or not.
+        low_dtype: Dtype of the rounded copies; `None` to use the tensors themselves.
+        trained: Whether there are gradients.
+
+    Attributes:
+        originals: The tensors as they were given.
+        tensors: The same memory as that of the originals, without autograd.
+        low: The rounded copies.
+        grad: All gradients as one vector.
+        grads: The gradients, parts of `grad`.
+    """
+
+    def __init__(self, tensors: Sequence[Tensor], low_dtype: torch.dtype | None, trained: bool) -> None:
+        self.rounds = low_dtype is not None
+        self._low_dtype, self._trained = low_dtype, trained
+        self.bind(tensors)
+
+    def bind(self, tensors: Sequence[Tensor]) -> None:
+        """Take other tensors, or the same ones after their memory was replaced. The gradients become zero.
+
+        Args:
+            tensors: As in the constructor. One that is not contiguous is made so in place, because kernels read rows.
+        """
+        for tensor in tensors:
+            if not tensor.is_contiguous():
+                tensor.data = tensor.data.contiguous()
+        self.originals = list(tensors)
+        self.tensors = [tensor.detach() for tensor in tensors]
+        self.low = self.tensors if self._low_dtype is None else self._views(self._low_dtype)[1]
+        self.grad, self.grads = self._views(self.tensors[0].dtype) if self._trained else (torch.zeros(0), [])
+        self._versions: list[int] = []
+
+    def refresh(self) -> None:
+        """Renew the rounded copies, if the tensors changed (through `.data` they change unseen)."""
+        versions = [tensor._version for tensor in self.tensors]
+        if self.rounds and versions != self._versions:
+            torch._foreach_copy_(self.low, self.tensors)
+            self._versions = versions
+
+    def renewed(self) -> None:
+        """Take note that a kernel changed the tensors, of which torch knows nothing, and renewed their copies."""
+        increment_version(self.tensors)
+        self._versions = [tensor._version for tensor in self.tensors]
+
+    def _views(self, dtype: torch.dtype) -> tuple[Tensor, list[Tensor]]:
+        """A buffer of zeros, and its parts in the shapes of the tensors."""
+        starts, total = [], 0
+        for tensor in self.tensors:
+            starts.append(total)
+            total += -(-tensor.numel() // _ALIGN) * _ALIGN
+        on_cpu = self.tensors[0].device.type == "cpu"
+        buffer = Arena().zeros(total, dtype=dtype) if on_cpu else self.tensors[0].new_zeros(total, dtype=dtype)
+        parts = zip(starts, self.tensors, strict=True)
+        return buffer, [buffer[start : start + t.numel()].view(t.shape) for start, t in parts]

@@ -1,0 +1,109 @@
+"""Adam in one pass over memory, which also renews the rounded copies and moves the target network."""
+
+from __future__ import annotations
+
+import ctypes
+import itertools
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.graph import increment_version
+
+from coachable.fast.flat import FlatBuffers
+from coachable.fast.memory import Arena
+from coachable.fast.native import KERNEL_THREADS, load_kernels
+
+__all__ = ["FlatAdam", "place_moments"]
+
+
+class FlatAdam(torch.optim.Adam):
+    """Adam for a network of the hand-written passes.
+
+    The same numbers as `torch.optim.Adam`, whose state it keeps, and its state dict.
+
+    Args:
+        params: The trained parameters.
+        flat: Their buffers: gradients, and rounded copies, which every step renews.
+        target: The target network's buffers, or `None`.
+        tau: Polyak rate by which the target moves after every step.
+        lr: Learning rate.
+        eps: Adam's epsilon.
+
+    Attributes:
+        grad_norm: Norm of the gradient of the last step.
+    """
+
+    def __init__(
+        self,
+        params: list[nn.Parameter],
+        flat: FlatBuffers,
+        target: FlatBuffers | None,
+        tau: float,
+        *,
+        lr: float,
+        eps: float,
+    ) -> None:
+        super().__init__(params, lr=lr, eps=eps, fused=True)
+        self._flat, self._target, self._tau = flat, target, tau
+        self.grad_norm = torch.zeros(())
+        place_moments(self)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore a state of this class or of `torch.optim.Adam`."""
+        super().load_state_dict(state_dict)
+        place_moments(self)
+
+    @torch.no_grad()
+    def step(self, closure: None = None) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Step on the gradients in the buffers, renew the rounded copies, move the target."""
+        (group,) = self.param_groups
+        (beta1, beta2), rate, eps = group["betas"], group["lr"], group["eps"]
+        flat, target, tensors = self._flat, self._target, self._flat.tensors
+        states = [self.state[parameter] for parameter in flat.originals]
+        steps, first, second = ([state[name] for state in states] for name in ("step", "exp_avg", "exp_avg_sq"))
+        single = tensors[0].dtype == torch.float32
+        if single and torch.get_num_threads() <= KERNEL_THREADS and (kernels := load_kernels()):
+            taken = steps[0].item() + 1.0
+            rate, root = rate / (1.0 - beta1**taken), (1.0 - beta2**taken) ** -0.5
+            table = _table(flat, target, first, second, steps)
+            squares = kernels[torch.float32].adam(table, len(tensors), rate, beta1, beta2, root, eps, self._tau)
+            self.grad_norm = torch.scalar_tensor(squares**0.5)
+            flat.renewed()
+            if target is not None:
+                target.renewed()
+            return
+        torch._foreach_add_(steps, 1.0)
+        self.grad_norm = torch.linalg.vector_norm(flat.grad)
+        options = {"lr": rate, "beta1": beta1, "beta2": beta2, "eps": eps, "weight_decay": 0.0}
+        torch._fused_adam_(tensors, flat.grads, first, second, [], steps, **options, amsgrad=False, maximize=False)
+        increment_version(tensors)  # torch's function does not
+        flat.refresh()
+        if target is not None:
+            torch._foreach_lerp_(target.tensors, tensors, self._tau)
+            target.refresh()
+
+
+def _table(
+    flat: FlatBuffers, target: FlatBuffers | None, first: list[Tensor], second: list[Tensor], steps: list[Tensor]
+) -> Any:
+    """Sizes and addresses for one call of the kernel, see `Parameter` in kernels.c."""
+    columns = [flat.tensors, first, second, flat.grads, flat.low if flat.rounds else []]
+    columns += [[], []] if target is None else [target.tensors, target.low if target.rounds else []]
+    columns += [steps]
+    nothing = [0] * len(steps)
+    addresses = [[tensor.data_ptr() for tensor in column] or nothing for column in columns]
+    rows = zip([tensor.numel() for tensor in flat.tensors], *addresses, strict=True)
+    return (ctypes.c_int64 * (len(steps) * (1 + len(columns))))(*itertools.chain.from_iterable(rows))
+
+
+def place_moments(optimizer: torch.optim.Adam) -> None:
+    """Place Adam's moments on huge pages, zeros if there are none yet."""
+    arena = Arena()
+    for group in optimizer.param_groups:
+        for p in group["params"]:
+            state = optimizer.state[p]
+            state.setdefault("step", torch.zeros(()))
+            for name in ("exp_avg", "exp_avg_sq"):
+                moment = arena.zeros(*p.shape, dtype=p.dtype)
+                state[name] = moment.copy_(state[name]) if name in state else moment

@@ -1,0 +1,237 @@
+"""Phrases: a table of what each means, and the share of thirty-six requests that is understood."""
+
+import pytest
+
+from coachable.coach.phrases import segments
+from coachable.coach.phrases.grammar import MAX_PHRASE, StyleGrammar
+from coachable.coach.phrases.vocabulary import tokenise
+from coachable.coach.session.coaching import coaching_of
+from coachable.domains.humanoid import humanoid_style_space
+from coachable.styles import Choice, Setpoint, Weight
+from tests.coach.phrases.requests import REQUESTS
+
+NOW = {"pose": "arms_in_front", "step_length": 0.475, "course": 0.0}
+
+
+@pytest.fixture(scope="module")
+def grammar():
+    coaching = coaching_of("humanoid")
+    controls = [control.parameter for control in coaching.controls]
+    return StyleGrammar([*humanoid_style_space().parameters, *controls], coaching.vocabulary, coaching.examples)
+
+
+# Steps of the range 0.35 m: a bit 0.035, plain 0.07, much 0.14.
+UNDERSTOOD = [
+    ("T-pose", {"pose": "t_pose"}),
+    ("t_pose", {"pose": "t_pose"}),
+    ("raise your arms", {"pose": "arms_up"}),
+    ("hands over your head", {"pose": "arms_up"}),
+    ("shorter steps", {"step_length": 0.405}),
+    ("a bit longer", {"step_length": 0.51}),
+    ("much shorter steps", {"step_length": 0.335}),
+    ("shorter steps, just a bit", {"step_length": 0.44}),
+    ("steps, shorter", {"step_length": 0.405}),
+    ("your steps are too long", {"step_length": 0.405}),
+    ("not so long", {"step_length": 0.44}),
+    ("baby steps", {"step_length": 0.30}),
+    ("as long as possible", {"step_length": 0.65}),
+    ("short steps", {"step_length": 0.3525}),
+    ("0.4 m", {"step_length": 0.4}),
+    ("0,4m", {"step_length": 0.4}),
+    (".4", {"step_length": 0.4}),
+    ("40 cm", {"step_length": 0.4}),
+    ("half a metre", {"step_length": 0.5}),
+    ("steps of forty five centimetres", {"step_length": 0.45}),
+    ("reduce the step length to 0.4", {"step_length": 0.4}),
+    ("reduce the step length by 0.1", {"step_length": 0.375}),
+    ("5 cm longer", {"step_length": 0.525}),
+    ("+5 cm", {"step_length": 0.525}),
+    ("10 % longer steps", {"step_length": 0.5225}),
+    ("half as long", {"step_length": 0.2375}),
+    ("shorter steps, arms up", {"step_length": 0.405, "pose": "arms_up"}),
+    ("longest steps arms up", {"step_length": 0.65, "pose": "arms_up"}),
+    ("short steps but raise your arms", {"step_length": 0.3525, "pose": "arms_up"}),
+    ("keep the arms, shorter steps", {"step_length": 0.405}),
+    ("arms up instead of in front", {"pose": "arms_up"}),
+    ("turn left", {"course": 45.0}),
+    ("turn right by 90 degrees", {"course": -90.0}),
+]
+
+UNCHANGED = ["not a T-pose", "don't raise your arms", "no longer steps", "keep the steps", "normal steps", "in front"]
+
+NOT_UNDERSTOOD = [
+    ("sing", "unknown: sing"),
+    ("jump higher", "unknown: jump"),
+    ("don't wave", "unknown: wave"),
+    ("walk faster", "nothing here has a speed"),
+    ("0.4 kg", "unknown: kg"),
+    ("0.4 s", "nothing here has a time"),
+    ("step length 20 degrees", "step length is no angle, it is in m"),
+    ("steps", "how much"),
+    ("not arms in front", "say what instead: arms up or t pose"),
+    ("change your arms", "pose can be arms in front or arms up or t pose"),
+    ("not 0.4 m", "say what instead"),
+    ("", "an empty phrase"),
+    ("?!", "'?!'"),
+    ("step length " + "9" * 400, "how much"),
+]
+
+
+@pytest.mark.parametrize(("phrase", "changes"), UNDERSTOOD)
+def test_phrases_that_are_understood(grammar, phrase, changes):
+    understood = grammar.read(phrase, NOW)
+    assert understood.changes == {n: v if isinstance(v, str) else pytest.approx(v) for n, v in changes.items()}
+    assert not understood.failed
+    assert all(name.replace("_", " ") in str(understood) for name in changes)
+
+
+@pytest.mark.parametrize("phrase", UNCHANGED)
+def test_requests_that_are_met_already(grammar, phrase):
+    understood = grammar.read(phrase, NOW)
+    assert not understood.changes and not understood.failed
+    assert "stays" in str(understood)
+
+
+@pytest.mark.parametrize(("phrase", "reason"), NOT_UNDERSTOOD)
+def test_phrases_that_are_not_understood_say_so(grammar, phrase, reason):
+    understood = grammar.read(phrase, NOW)
+    assert not understood.changes
+    assert f"not understood: {understood.failed[0]}" in str(understood)
+    assert ("try: shorter steps, arms up, 0.4 m" in str(understood)) == bool(understood.examples)
+    assert reason in understood.failed[0]
+
+
+def test_what_is_not_understood_beside_what_is(grammar):
+    understood = grammar.read("arms up, whistle, and 0.5 m", NOW)
+    assert understood.changes == {"pose": "arms_up", "step_length": 0.5}
+    assert understood.failed == ("'whistle' (unknown: whistle)",)
+
+
+def test_a_bit_more_goes_on_in_the_same_direction(grammar):
+    first = grammar.read("shorter steps", NOW)
+    style = NOW | first.changes
+    assert grammar.read("a bit more", style, first).changes == {"step_length": pytest.approx(0.37)}
+    assert grammar.read("again", style, first).changes == {"step_length": pytest.approx(0.335)}
+    assert grammar.read("a bit less", style, first).changes == {"step_length": pytest.approx(0.44)}
+    turned = grammar.read("turn right", NOW)
+    assert grammar.read("a bit more", NOW | turned.changes, turned).changes == {"course": -60.0}
+
+
+def test_directions_go_round(grammar):
+    turned = grammar.read("turn left", NOW | {"course": 170.0})
+    assert turned.changes == {"course": -145.0}
+    assert "outside" not in str(turned)
+    assert grammar.read("a bit more", NOW | {"course": -145.0}, turned).changes == {"course": -130.0}
+
+
+def test_changes_stop_at_the_end_of_the_range_and_numbers_are_flagged(grammar):
+    lowest = NOW | {"step_length": 0.3}
+    assert "already at its lowest" in str(grammar.read("shorter", lowest))
+    assert grammar.read("much shorter", NOW | {"step_length": 0.35}).changes == {"step_length": pytest.approx(0.3)}
+    beyond = grammar.read("step length 0.9", NOW)
+    assert beyond.changes == {"step_length": 0.9}
+    assert "outside the trained range 0.3 to 0.65" in str(beyond)
+
+
+def test_back_to_normal_means_everything(grammar):
+    understood = grammar.read("back to normal", {"pose": "t_pose", "step_length": 0.6, "course": 90.0})
+    assert understood.changes == {"pose": "arms_in_front", "step_length": 0.475, "course": 0.0}
+
+
+def test_weights_are_encouraged_and_discouraged():
+    grammar = StyleGrammar(
+        [
+            Weight("melee", -0.5, 2.0, help="prefer the spear"),
+            Weight("fire", 0.0, 1.0, help="prefer burning arrows"),
+            Weight("frost", 0.0, 1.0, help="prefer freezing arrows"),
+            Setpoint("speed", 0.0, 50.0, unit="m/s"),
+            Choice("side", ("left", "right")),
+        ]
+    )
+    now = {"melee": 0.0, "fire": 0.0, "frost": 0.0, "speed": 10.0, "side": "left"}
+    for phrase, changes in [
+        ("melee", {"melee": 2.0}),
+        ("use the spear", {"melee": 2.0}),
+        ("avoid melee", {"melee": -0.5}),
+        ("more melee", {"melee": 0.5}),
+        ("a bit of fire", {"fire": 0.25}),
+        ("more melee less speed", {"melee": 0.5, "speed": 0.0}),
+        ("much more melee and no fire", {"melee": 1.0}),
+        ("freezing arrows", {"frost": 1.0}),
+        ("faster", {"speed": 20.0}),
+        ("90 km/h", {"speed": 25.0}),
+        ("side right", {"side": "right"}),
+    ]:
+        assert grammar.read(phrase, now).changes == pytest.approx(changes), phrase
+    assert grammar.read("not left", now).changes == {"side": "right"}
+    assert "of what: melee or fire or frost or speed?" in grammar.read("more", now).failed[0]
+
+
+class CountingLexicon(dict):
+    """Counts what is looked up in it."""
+
+    looked_up = 0
+
+    def __contains__(self, words):
+        self.looked_up += 1
+        return super().__contains__(words)
+
+
+@pytest.mark.parametrize("piece", ["shorter steps ", "a ", "arms ", "x ", "not ", ", ", "0.4 m ", "steps much more "])
+def test_the_work_grows_with_the_length_of_the_phrase(grammar, piece):
+    lexicon = CountingLexicon(grammar.lexicon)
+    longest = max(map(len, lexicon))
+    for repeats in (10, MAX_PHRASE // len(piece)):
+        tokens = tokenise(piece * repeats)
+        lexicon.looked_up = 0
+        segments.split(tokens, lexicon)
+        assert lexicon.looked_up <= longest * len(tokens)
+
+
+def test_a_phrase_that_is_too_long_is_refused_in_a_sentence(grammar):
+    longest = "arms up," + "a" * (MAX_PHRASE - 8)
+    assert grammar.read(longest, NOW).changes == {"pose": "arms_up"}
+    refused = grammar.read(longest + "a", NOW)
+    assert refused.changes == {}
+    assert refused.failed == ("the phrase has 2,001 characters, at most 2,000 are read",)
+
+
+def test_an_unknown_word_is_answered_with_what_works_without_examples():
+    grammar = StyleGrammar([Weight("melee", 0.0, 1.0), Choice("side", ("left", "right_hand"))])
+    answer = str(grammar.read("sing", {"melee": 0.0, "side": "left"}))
+    assert answer == "not understood: 'sing' (unknown: sing); try: more melee, right hand"
+
+
+def test_the_vocabulary_is_checked():
+    with pytest.raises(ValueError, match="words for 'poses': expected one of"):
+        StyleGrammar(humanoid_style_space(), {"poses": ("arms",)})
+    with pytest.raises(ValueError, match=r"'pose=down': options are"):
+        StyleGrammar(humanoid_style_space(), {"pose=down": ("arms down",)})
+    with pytest.raises(ValueError, match="words for 'stride': expected one of"):
+        StyleGrammar(humanoid_style_space(), {"-step_length -stride": ("arms down",)})
+
+
+def test_tokens():
+    assert tokenise("Don\u2019t go 0.4m/s, twenty five cm!") == ["do", "not", "go", "0.4", "m/s", ",", "25", "cm", "!"]
+
+
+def meets(value, wanted) -> bool:
+    if wanted in ("shorter", "longer"):
+        return value is not None and (value < 0.475) == (wanted == "shorter") and value != 0.475
+    return value == (wanted if wanted is None else pytest.approx(wanted))
+
+
+def test_most_of_36_requests_are_understood_and_none_wrongly(grammar):
+    assert len(REQUESTS) == 36
+    right = {"pose": 0, "gait": 0, "both": 0}
+    for phrase, pose, gait in REQUESTS:
+        start = NOW | {"pose": "t_pose" if pose == "arms_up" else "arms_up"}
+        changes = grammar.read(phrase, start).changes
+        posed, walked = changes.get("pose") == pose, meets(changes.get("step_length"), gait)
+        right["pose"] += posed and pose is not None
+        right["gait"] += walked and gait is not None
+        right["both"] += posed and walked and pose is not None and gait is not None
+        assert posed or "pose" not in changes, phrase
+        assert walked or "step_length" not in changes, phrase
+        assert "course" not in changes, phrase
+    assert right == {"pose": 23, "gait": 21, "both": 13}  # of 28, 24 and 16

@@ -1,0 +1,69 @@
+"""What is measured of a walker, from features written by hand."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from coachable.domains.humanoid import humanoid_style_space
+from coachable.domains.humanoid.metrics import HumanoidMeasures
+from coachable.domains.humanoid.styles import POSES, pose_bounds_deg
+from coachable.envs.humanoid.features import COMPLETED, LENGTH, STYLE_FEATURES_SIZE
+from coachable.envs.humanoid.observation import OBSERVATION_GROUPS
+from coachable.keys import STYLE, STYLE_FEATURES
+
+
+def transition(pose="t_pose", asked=0.5, angles=None, struck=True, length=0.5, speed=1.2):
+    space = humanoid_style_space()
+    features = torch.zeros(1, STYLE_FEATURES_SIZE)
+    centre = torch.from_numpy(pose_bounds_deg()[POSES.index(pose)].mean(1)).float()
+    features[0, :6] = torch.deg2rad(centre if angles is None else angles)
+    features[0, COMPLETED], features[0, LENGTH] = float(struck), length
+    observation = torch.zeros(1, sum(width for _, width, _ in OBSERVATION_GROUPS))
+    first = 0
+    for name, width, _ in OBSERVATION_GROUPS:
+        if name == "com_velocity":
+            observation[0, first] = speed
+        first += width
+    following = {STYLE_FEATURES: features, "observation": observation}
+    return TensorDict({STYLE: space.make(pose=pose, step_length=asked)[None], "next": following}, [1])
+
+
+@pytest.mark.parametrize("pose", POSES)
+@pytest.mark.parametrize("joint", range(6))
+def test_arms_are_in_pose_within_ten_degrees_of_its_bounds(pose, joint):
+    bounds = torch.from_numpy(pose_bounds_deg()[POSES.index(pose)]).float()
+    for beyond, held in ((9.9, 1.0), (10.1, 0.0)):
+        for side, sign in ((0, -1), (1, 1)):
+            angles = bounds.mean(1)
+            angles[joint] = bounds[joint, side] + sign * beyond
+            row = HumanoidMeasures().step(transition(pose, angles=angles))
+            assert row["pose_held"].item() == held, (side, beyond)
+
+
+def test_a_strike_is_measured_and_nothing_between_strikes():
+    measures = HumanoidMeasures()
+    row = measures.step(transition(asked=0.4, length=0.45))
+    assert row["step_length"].item() == pytest.approx(0.45)
+    assert row["step_length_error"].item() == pytest.approx(0.05)
+    assert row["forward_speed"].item() == pytest.approx(1.2)
+    between = measures.step(transition(struck=False))
+    assert math.isnan(between["step_length"]) and math.isnan(between["step_length_error"])
+    assert not measures.complies(between).any()
+
+
+@pytest.mark.parametrize("length, complies", [(0.445, True), (0.555, True), (0.43, False), (0.57, False)])
+def test_a_step_within_six_centimetres_complies(length, complies):
+    measures = HumanoidMeasures()
+    assert measures.complies(measures.step(transition(asked=0.5, length=length))).item() is complies
+    wrong = torch.full((6,), 170.0)
+    assert not measures.complies(measures.step(transition(asked=0.5, length=0.5, angles=wrong))).item()
+
+
+def test_means_are_over_the_steps_that_count():
+    record = {"forward_speed": torch.tensor([[1.0, 1.0], [3.0, 1.0], [9.0, 1.0]])}
+    record["step_length"] = torch.tensor([[torch.nan, torch.nan], [0.4, torch.nan], [0.9, torch.nan]])
+    means = HumanoidMeasures().summarise(record, torch.tensor([[True, True], [True, True], [False, True]]))
+    assert means["forward_speed"].tolist() == [2.0, 1.0]
+    assert means["step_length"][0] == pytest.approx(0.4) and means["step_length"][1].isnan()

@@ -1,0 +1,113 @@
+"""The three declarations: they make environments, measure and draw."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from coachable.domain import load_domain
+from coachable.domains.racing.events import racing_events
+from coachable.domains.racing.families import family_env, family_style, race_env
+from coachable.domains.racing.metrics import RacingMeasures
+from coachable.domains.racing.render import RacingRenderer
+from coachable.envs.racing import RacingEnv
+from coachable.envs.racing.race.referee import TELEMETRY
+from coachable.transforms import coachable_env
+
+
+@pytest.mark.parametrize("family", ["drift", "resources", "aggressiveness"])
+def test_a_domain_makes_measures_and_draws(family):
+    domain = load_domain(f"racing_{family}")
+    space = domain.make_space()
+    assert all(set(cell) == set(space.names) for cell in domain.cells())
+    env = coachable_env(domain.make_env(num_envs=4, seed=0), space, domain.make_reward(space), seed=0)
+    data = env.rollout(3, break_when_any_done=False)
+    assert sum(width for _, width in domain.observation_groups) == data["observation"].shape[-1]
+    records = [domain.measures.step(data[:, t]) for t in range(3)]
+    record = {name: torch.stack([r[name] for r in records]) for name in records[0]}
+    steered = data["action"][..., 0].T
+    torch.testing.assert_close(record["steering_change"][1:], steered.diff(dim=0).abs())
+    alive = torch.ones(3, 4, dtype=torch.bool)
+    summary = domain.measures.summarise(record, alive)
+    assert set(domain.columns) - {"survived"} <= set(summary)
+    assert domain.measures.complies(record).shape == (3, 4)
+    renderer = domain.make_renderer(160, 120)
+    image = renderer.draw(env, row=1)
+    renderer.close()
+    assert image.shape == (120, 160, 3) and image.dtype == np.uint8 and image.std() > 10
+
+
+def test_five_cars_from_the_pool_start_a_race():
+    env = race_env(10, seed=0)
+    assert (env.reset()["observation"].abs() < 50).all()
+    assert env.garage.model.shape == (2,)
+    assert len(set(env.compound[2:].argmax(0).reshape(5, 2)[:, 0].tolist())) == 1
+
+
+def test_who_learnt_among_others_is_measured_alone_and_coached_among_others():
+    domain = load_domain("racing_resources", {"env": {"track": "ring", "cars": 3}})
+    alone, before = domain.make_env(num_envs=4, seed=0), load_domain("racing_resources", {"env": {"track": "ring"}})
+    seen = alone.reset()["observation"]
+    assert alone.cars == 1 and seen.shape[-1] == sum(width for _, width in domain.observation_groups)
+    assert torch.equal(seen[:, :-33], before.make_env(num_envs=4, seed=0).reset()["observation"])
+    assert not seen[:, -33:].any()
+    coached = domain.make_env(num_envs=1, seed=0, **domain.coached)
+    assert (coached.cars, coached.controlled) == (3, 1) and coached.reset()["observation"][:, -33:].any()
+    # So does who learnt alone with room for others.
+    ready = load_domain("racing_resources", {"env": {"track": "ring", "opponents": True}})
+    assert not ready.coached and torch.equal(ready.make_env(num_envs=4, seed=0).reset()["observation"], seen)
+
+
+def test_an_agent_of_tyres_and_fuel_races_agents_or_scripted_drivers():
+    agents, one = (family_env(n, family="resources", cars=3, track="ring", seed=0) for n in (6, 4))
+    assert (agents.races, agents.controlled, one.races, one.controlled) == (2, 3, 4, 1)
+    assert one.rollout(3)["next", "observation"].isfinite().all()
+
+
+def test_an_unknown_family_is_refused():
+    with pytest.raises(ValueError, match="unknown family 'speed'"):
+        RacingMeasures("speed")
+
+
+def test_pictures_follow_the_car():
+    env = RacingEnv(2, track="ring", seed=0)
+    env.reset()
+    renderer = RacingRenderer(160, 120)
+    assert not np.array_equal(renderer.draw(env, 0), renderer.draw(env, 1))
+
+
+def test_a_domain_is_as_its_training_made_it():
+    settings = {"_target_": "x", "family": "resources", "num_envs": 256, "track": "ring", "car": "gt3"}
+    # As a configuration has them; a file must not choose what is imported and called.
+    settings |= {"scenarios": [{"_target_": "x"}], "conditions": {"_target_": "x"}, "weights": {"_target_": "x"}}
+    domain = load_domain("racing_resources", {"env": {**settings, "episode_steps": 20, "course_points": 5}})
+    env = domain.make_env(num_envs=2, seed=0)
+    assert (env.track.name, env.num_envs, domain.episode_steps) == ("ring", 2, 20)
+    assert sum(width for _, width in domain.observation_groups) == env.observation_size
+
+
+@pytest.mark.parametrize(
+    "family, names", [("drift", ["slide"]), ("aggressiveness", ["contact", "overtake", "slipstream"])]
+)
+def test_events_are_what_their_names_say(family, names):
+    events = racing_events(family)
+    assert list(events.names) == ["recovery", *names]
+    space, make_reward = family_style(family)
+    env = coachable_env(family_env(8, family=family, seed=0), space, make_reward(space), seed=0)
+    data = env.rollout(15, break_when_any_done=False).reshape(-1)
+    found = events(data)
+    assert found.shape == (120, 1 + len(names))
+    off = data["next", "telemetry"][:, TELEMETRY.index("off")] > 0
+    assert torch.equal(found[:, 0], off)
+    if family == "drift":
+        assert torch.equal(found[:, 1], data["next", "style_features"][:, 1] > math.radians(20.0))
+        assert found[:, 1].any()
+    else:
+        assert torch.equal(found[:, 1], data["next", "telemetry"][:, TELEMETRY.index("contact")] > 0)
+
+
+@pytest.mark.parametrize("make", [family_style, racing_events, lambda name: family_env(2, family=name)])
+def test_families_are_checked_everywhere(make):
+    with pytest.raises(ValueError, match="unknown family 'speed': expected drift, resources or aggressiveness"):
+        make("speed")

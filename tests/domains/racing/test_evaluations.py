@@ -1,0 +1,190 @@
+"""Evaluations of racing: numbers checked by hand, and whole runs of a scripted driver."""
+
+import csv
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from coachable.domain import load_domain
+from coachable.domains.racing import traffic
+from coachable.domains.racing.drifts import evaluate_drift
+from coachable.domains.racing.families import family_style
+from coachable.domains.racing.metrics import whole_turns
+from coachable.domains.racing.races import _count, _overtakes, _pair_results, evaluate_aggressiveness
+from coachable.domains.racing.stints import _stint, evaluate_resources, range_at
+from coachable.domains.racing.traffic import race_in_traffic, traffic_report, traffic_response
+from coachable.envs.racing.circuit.circuits import load_track
+from coachable.envs.racing.physics.parameters import load_car
+from coachable.envs.racing.race.driver import LineFollower
+from coachable.evaluation.settings import EvaluationSettings
+from coachable.evaluation.statistics import wilson_interval
+from coachable.training.weights import LoadedPolicy
+
+
+def read(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def scripted(family, car, **settings):
+    """A domain on the ring and an "agent" that looks at the simulator instead of the observation."""
+    domain = load_domain(f"racing_{family}", {"env": {"track": "ring", "car": car, **settings}})
+    driver, envs = LineFollower(load_track("ring"), load_car(car), grip=0.8), []
+
+    def make_env(**options):
+        envs.append(domain.make_env(**options))
+        return envs[-1]
+
+    class Policy(torch.nn.Module):
+        def forward(self, data):
+            return data.set("action", driver(envs[-1], data["observation"]))
+
+    agent = LoadedPolicy(Policy(), family_style(family)[0], {"env": {"track": "ring", "car": car}}, {})
+    return replace(domain, make_env=make_env), agent
+
+
+def test_laps_of_a_stint_are_cut_at_the_line():
+    # 30 m/s on a lap of 75 m: 2.5 s each; the flag is raised once, in the second lap.
+    distance = 3.0 * np.arange(1, 101)[:, None]
+    off = np.zeros((100, 1))
+    off[30] = 1.0
+    fuel = 100.0 - 0.1 * np.arange(1, 101)[:, None]
+    measured = {"distance": distance, "off": off, "fuel": fuel, "wear": np.zeros((100, 1))}
+    stint = _stint(measured, np.ones((100, 1), dtype=bool), 0, 75.0, "fuel")
+    np.testing.assert_allclose(stint.laps, 2.5)
+    assert stint.clean.tolist() == [True, False, True, True]
+    np.testing.assert_allclose(stint.left, [97.5, 95.0, 92.5, 90.0])
+    assert stint.per_km == pytest.approx(0.1 / 0.003)
+    assert stint.compared == pytest.approx(2.5)
+
+
+def test_an_empty_tank_ends_the_stint():
+    measured = {"distance": np.full((50, 1), 40.0), "off": np.zeros((50, 1)), "wear": np.zeros((50, 1))}
+    measured["distance"][:20, 0] = 2.0 * np.arange(1, 21)
+    measured["fuel"] = np.maximum(19.0 - np.arange(50.0), 0.0)[:, None]
+    stint = _stint(measured, np.ones((50, 1), dtype=bool), 0, 1000.0, "fuel")
+    assert len(stint.laps) == 0 and math.isnan(stint.compared)
+    assert stint.per_km == pytest.approx(18.0 / 0.036)
+
+
+def test_the_frontier_between_its_points():
+    bound = [{"lap_time": 80.0, "range_km": 50.0}, {"lap_time": 84.0, "range_km": 90.0}]
+    assert range_at(bound, 81.0) == pytest.approx(60.0)
+    assert math.isnan(range_at(bound, 79.0)) and math.isnan(range_at(bound, 85.0))
+
+
+def test_turns_add_up_in_one_direction_only():
+    steps = torch.arange(200) / 10.0
+    spin = torch.stack([steps, steps.sin(), -2.0 * steps], 1)  # 19.9 rad, back and forth, 39.8 rad the other way
+    wrapped = torch.remainder(spin + math.pi, 2 * math.pi) - math.pi
+    alive = torch.ones(200, 3, dtype=torch.bool)
+    assert whole_turns(wrapped, alive).tolist() == [3.0, 0.0, 6.0]
+    alive[100:] = False
+    assert whole_turns(wrapped, alive).tolist() == [1.0, 0.0, 3.0]
+
+
+def test_contacts_within_a_second_count_once():
+    touched = np.zeros(100, dtype=bool)
+    touched[[3, 4, 12, 40, 51]] = True  # 0.8 s and 1.1 s after the last one
+    assert _count(touched) == 3
+    assert _count(np.zeros(5, dtype=bool)) == 0
+
+
+def test_whoever_is_ahead_by_a_length_after_being_behind_has_overtaken():
+    own = np.array([0.0, 10.0, 20.0, 30.0, 40.0, 50.0])
+    rival = own + np.array([8.0, -4.0, 4.0, -6.0, 7.0, -8.0])
+    beside = own + np.array([9.0, 4.0, -4.9, 3.0, 6.0, 0.0])  # never passed
+    distance = np.stack([rival, own, beside], axis=1)
+    assert _overtakes(distance, 1) == 2
+    assert _overtakes(distance[:, :2], 0) == 1
+    assert _overtakes(distance[:2], 1) == 0
+
+
+def test_a_race_ends_when_the_first_car_does():
+    distance = np.array([[90.0, 80.0, 70.0], [101.0, 95.0, 99.0], [110.0, 140.0, 150.0]])
+    race = {"distance": distance, "contact": np.eye(3), "beside": np.eye(3), "off": np.zeros((3, 3))}
+    result = _pair_results(race, np.array([2, 0, 1]), np.array([True, False, True]), 100.0)
+    assert result["top_two"].tolist() == [1.0, 1.0]
+    assert result["won"].tolist() == [1.0, 0.0]
+    assert result["places_gained"].tolist() == [2.0, 0.0]
+    assert result["contacts"].tolist() == [1.0, 0.0]  # the last one came after the end
+    assert result["beside"].tolist() == [0.5, 0.0]
+
+
+def test_places_of_the_first_minute_count_apart():
+    steps = np.arange(700.0)
+    distance = np.stack([40 * steps, 41 * steps - 25, 20 * steps + 13_100], axis=1)  # the third is passed at 655, 625
+    race = {name: np.zeros((700, 3)) for name in ("contact", "beside", "off")}
+    result = _pair_results({"distance": distance, **race}, np.array([1, 2, 0]), np.array([True, True, False]), 1e9)
+    assert result["places_gained"].tolist() == [0.0, 2.0]
+    assert result["places_later"].tolist() == [1.0, 1.0]
+
+
+def test_wilson_interval():
+    low, high = wilson_interval(8, 10)
+    assert (low, high) == (pytest.approx(0.4902, abs=1e-4), pytest.approx(0.9433, abs=1e-4))
+    assert wilson_interval(0, 5)[0] == pytest.approx(0.0)
+    with pytest.raises(ValueError, match="3 successes in 2 trials"):
+        wilson_interval(3, 2)
+
+
+@pytest.mark.slow
+def test_stints_of_the_scripted_driver(tmp_path):
+    domain, agent = scripted("resources", "gt3")
+    report = evaluate_resources(domain, agent, tmp_path, EvaluationSettings(episodes=1, steps=800, progress=False))
+    rows = read(tmp_path / "stints.csv")
+    assert [row["resource"] for row in rows] == ["fuel"] * 5 + ["tyre"] * 5
+    assert all(float(row["range_gain"]) == pytest.approx(0.0, abs=0.1) for row in rows)  # it knows no style
+    assert all(15 < float(row["lap_time"]) < 30 and float(row["clean_laps"]) >= 0.5 for row in rows)
+    trial = json.loads((tmp_path / "summary.json").read_text())["trial"]
+    assert trial["laps"] >= 10 and 0.0 < trial["over_estimate"] < 0.3
+    assert "above it; clean laps" in report
+    assert {path.name for path in tmp_path.glob("*.png")} == {"stints.png", "tradeoff.png"}
+
+
+def test_a_driver_who_never_drifts(tmp_path):
+    domain, agent = scripted("drift", "street")
+    evaluate_drift(domain, agent, tmp_path, EvaluationSettings(episodes=2, steps=60, progress=False))
+    rows = read(tmp_path / "drift.csv")
+    assert [float(row["weight"]) for row in rows] == 3 * [-0.4, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
+    assert sum(float(row["slip_angle_rear"]) < 8.0 for row in rows) >= 14  # it loses the car now and then
+    assert all(float(row["turns"]) == 0.0 for row in rows)
+    assert (tmp_path / "drift.png").stat().st_size > 10_000
+
+
+def test_races_of_the_scripted_driver(tmp_path):
+    domain, agent = scripted("aggressiveness", "gt3")
+    settings = EvaluationSettings(episodes=1, steps=40, seed=1, progress=False)
+    report = evaluate_aggressiveness(domain, agent, tmp_path, settings)
+    rows = read(tmp_path / "races.csv")
+    assert len(rows) == 10 and {row["races"] for row in rows} == {"8"}
+    # It knows no style, and the races of all margins start alike.
+    assert all(row | {"lateral": "0"} in (rows[0], rows[5]) for row in rows)
+    # In four seconds nobody overtakes: the leaders stay in front, the pursuers behind.
+    by_setting = {row["setting"]: row for row in rows}
+    assert float(by_setting["leader"]["win_rate"]) > 0.9
+    assert float(by_setting["pursuer"]["win_rate"]) < 0.1
+    # A rolling start puts 14 m between cars; one driver on one line hardly ever brings them beside each other.
+    assert all(0.0 <= float(row["beside"]) < 0.05 for row in rows)
+    assert "races per row, 4 laps" in report and (tmp_path / "radar.png").exists()
+
+
+def test_traffic_of_the_scripted_driver(monkeypatch):
+    monkeypatch.setattr(traffic, "RACES", 32)
+    domain, agent = scripted("resources", "x2019", cars=3)
+    rows = race_in_traffic(domain, agent, EvaluationSettings(episodes=1, steps=20, progress=False))
+    assert [(row["sweep"], row["weight"]) for row in rows[4:6]] == [("overtake", 2.0), ("defend", 0.0)]
+    # It knows no style, and the races of all weights start alike.
+    for sweep in (rows[:5], rows[5:]):
+        assert all(row | {"weight": 0.0} == sweep[0] for row in sweep)
+    # Whoever starts last has nobody behind, whoever starts first nobody ahead.
+    assert rows[0]["defend"] == 0.0 and rows[5]["overtake"] == 0.0 and rows[0]["overtake"] != 0.0
+    follows = [row | {row["sweep"]: row["weight"] ** 2, "places_gained": -row["weight"]} for row in rows]
+    response = traffic_response(follows)
+    each = {"metres": pytest.approx(1.0), "places": pytest.approx(-1.0)}
+    assert response == {"overtake": each, "defend": each}
+    assert "of defend 1.00 in metres, -1.00 in places.\n" in traffic_report(rows, response)

@@ -1,0 +1,73 @@
+"""The dynamic programme: limits, monotone trade-offs, calibration."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from coachable.domains.racing.frontier import TANK, WORN, LapProgramme
+from coachable.envs.racing.circuit.circuits import load_track
+from coachable.envs.racing.circuit.profile import Envelope, lap_time, speed_profile
+from coachable.envs.racing.physics.parameters import Resources, load_car
+from coachable.envs.racing.race.driver import line_geometry
+
+
+@pytest.fixture(scope="module", params=["gt3", "x2019"])
+def lakeside(request):
+    """Name of a car, its programme on the centre line, and the lap that pays for nothing."""
+    track = load_track("lakeside")
+    line = np.zeros(len(track.table))
+    programme = LapProgramme(track, load_car(request.param), Resources(1.0, 1.0), line=line)
+    [free] = programme.laps("fuel", [0.0])
+    return request.param, programme, free
+
+
+def test_centre_line_laps_are_those_of_the_specification(lakeside):
+    """racing.md, 4: quasi-steady state on the centre line 113.9 s and 88.8 s."""
+    name, _, free = lakeside
+    expected = {"gt3": 113.9, "x2019": 88.8}[name]
+    track = load_track("lakeside")
+    curvature, spacing = line_geometry(track, None)
+    assert lap_time(speed_profile(Envelope(load_car(name)), curvature, spacing), spacing) == pytest.approx(
+        expected, rel=0.01
+    )
+    assert free.time == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize("lakeside, resource", [("gt3", "tyre"), ("x2019", "fuel")], indirect=["lakeside"])
+def test_a_higher_price_saves_more_and_costs_more(lakeside, resource):
+    _, programme, free = lakeside
+    scale = {"tyre": free.wear, "fuel": free.fuel}[resource]
+    laps = programme.laps(resource, [0.0, 2.0 / scale, 8.0 / scale, 30.0 / scale])
+    times = [lap.time for lap in laps]
+    used = [{"tyre": lap.wear, "fuel": lap.fuel}[resource] for lap in laps]
+    assert times[0] == pytest.approx(free.time, abs=1e-9)
+    assert all(a < b for a, b in pairwise(times))
+    assert all(a > b for a, b in pairwise(used))
+
+
+def test_a_ring_is_driven_at_the_speed_that_friction_allows():
+    """Radius 200 m: the lap of a steady speed, to the width of the speed grid."""
+    track, car = load_track("ring"), load_car("gt3")
+    envelope = Envelope(car)
+    speed = speed_profile(envelope, np.full(len(track.table), 1 / 200.0), track.spacing).mean()
+    programme = LapProgramme(track, car, Resources(1.0, 1.0), line=np.zeros(len(track.table)))
+    [lap] = programme.laps("tyre", [0.0])
+    assert lap.time == pytest.approx(track.length / speed, rel=0.01)
+
+
+@pytest.mark.parametrize("car", ["gt3", "x2019"])
+def test_a_stint_lasts_about_ten_laps(car):
+    """An uncoached lap: the fastest of the programme on its own line."""
+    programme = LapProgramme(load_track("lakeside"), load_car(car), Resources.calibrated(car), fuel=TANK / 2)
+    [lap] = programme.laps("fuel", [0.0])
+    assert TANK / lap.fuel == pytest.approx(10.0, abs=1.0)
+    assert WORN / lap.wear == pytest.approx(10.0, abs=1.0)
+
+
+def test_bad_input_is_refused():
+    programme = LapProgramme(load_track("ring"), load_car("gt3"), Resources())
+    with pytest.raises(ValueError, match="unknown resource 'brakes': expected tyre or fuel"):
+        programme.laps("brakes", [0.0])
+    with pytest.raises(ValueError, match="no calibrated wear and fuel rates of 'street': expected one of gt3, x2019"):
+        Resources.calibrated("street")

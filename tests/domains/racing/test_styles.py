@@ -1,0 +1,112 @@
+"""The three families of style: laws of the paper, rewards by hand."""
+
+import pytest
+import torch
+
+from coachable.domains.racing.styles import (
+    aggressiveness_style_reward,
+    aggressiveness_style_space,
+    drift_style_reward,
+    drift_style_space,
+    resource_style_reward,
+    resource_style_space,
+)
+from coachable.envs.racing.race.features import anyone_beside
+from coachable.styles import Shared, StyleSpace
+
+N = 40000
+
+
+def draws(space):
+    return space.sample((N,), generator=torch.Generator().manual_seed(0)).double()
+
+
+def within(values, expected):
+    """Mean within five standard errors."""
+    assert abs(values.mean() - expected) < 5 * values.std() / N**0.5
+
+
+def test_drift_weights_follow_the_paper():
+    """0.5 δ(0) + 0.25 U(-0.4, 0) + 0.25 U(0, 5): mean 0.575, second moment 2.096667."""
+    weights = draws(drift_style_space())
+    for column in weights.T:
+        within(column, 0.575)
+        within(column**2, 2.096667)
+        within((column == 0).double(), 0.5)
+        within((column < 0).double(), 0.25)
+        assert column.min() >= -0.4 and column.max() <= 5.0
+    correlation = torch.corrcoef(weights.T) - torch.eye(4)
+    assert correlation.abs().max() < 5 / N**0.5
+
+
+def test_resource_weights_follow_the_paper():
+    overtake, defend, tire, fuel = draws(resource_style_space()).T
+    for column in (overtake, defend):
+        within(column, 1.0)
+        assert column.min() >= 0 and column.max() <= 2
+    for column, mean, second, low, high in (
+        (tire, 2686.5, 21600540, -60, 12000),
+        (fuel, 22.95, 1655.1, -3, 105),
+    ):
+        within(column, mean)
+        within(column**2, second)
+        within((column == 0).double(), 0.10)
+        within((column < 0).double(), 0.45)
+        assert low <= column.min() and column.max() <= high
+
+
+def test_margins_follow_the_paper_and_are_shared():
+    space = aggressiveness_style_space(cars=5)
+    long, lat = draws(space).T
+    assert long.min() >= 0 and long.max() <= 2 and lat.min() >= 0 and lat.max() <= 1
+    by_car = space.sample((10,), generator=torch.Generator().manual_seed(0)).reshape(5, 2, 2)
+    assert (by_car == by_car[0]).all()
+    assert not torch.equal(by_car[0, 0], by_car[0, 1])
+
+
+def test_the_shared_sampler_survives_serialisation():
+    space = aggressiveness_style_space(cars=5)
+    again = StyleSpace.from_dict(space.to_dict())
+    assert again == space
+    assert isinstance(again.sampler, Shared)
+
+
+def test_drift_reward_by_hand():
+    space = drift_style_space()
+    features = torch.tensor([[0.1, 0.5, 0.2, 0.3, 9.0, 9.0, 9.0, 9.0]])
+    reward = drift_style_reward(space)(features, torch.tensor([[1.0, 2.0, -0.4, 5.0]]))
+    assert reward.item() == pytest.approx(0.1 + 1.0 - 0.08 + 1.5)
+
+
+def test_resource_reward_by_hand():
+    features = torch.tensor([[9.0, 9.0, 9.0, 9.0, 3.0, -1.0, -8e-5, -0.01]])
+    space, theta = resource_style_space(), torch.tensor([[2.0, 0.5, 12000.0, 105.0]])
+    assert resource_style_reward(space)(features, theta).item() == pytest.approx(6.0 - 0.5 - 0.96 - 1.05)
+    more = resource_style_reward(space, gained=4.0)
+    assert more(features, theta).item() == pytest.approx(4 * 5.5 - 0.96 - 1.05)
+    apart = resource_style_reward(space, gained=2.0, defended=8.0)
+    assert apart(features, theta).item() == pytest.approx(2 * 6.0 - 8 * 0.5 - 0.96 - 1.05)
+    assert more.is_linear, "n-step transitions can be relabelled"
+
+
+def test_margin_reward_by_hand():
+    """Gaps (3, 2) and (0.5, 0.25) m, margins (2, 1): -2.25 (algorithms.md, section 10). A far car costs nothing."""
+    space = aggressiveness_style_space()
+    features = torch.tensor([[0.0] * 8 + [3.0, 2.0, 1.0, 0.5, 0.25, 1.0, 0.0, 0.0, 0.0]])
+    theta = torch.tensor([[2.0, 1.0]])
+    assert aggressiveness_style_reward(space)(features, theta).item() == pytest.approx(-2.25)
+    assert aggressiveness_style_reward(space, weight=4.0)(features, theta).item() == pytest.approx(-9.0)
+    ahead = torch.tensor([[0.0] * 8 + [1.0, 0.0, 1.0]])
+    assert aggressiveness_style_reward(space)(ahead, theta).item() == pytest.approx(-2.0)
+    assert aggressiveness_style_reward(space, apart=0.0)(ahead, theta).item() == pytest.approx(-1.0)
+    assert aggressiveness_style_reward(space, apart=0.1)(ahead, theta).item() == pytest.approx(-1.1)
+    with pytest.raises(ValueError, match="apart is 2: expected a share"):
+        aggressiveness_style_reward(space, apart=2)
+
+
+def test_beside_is_alongside_within_so_many_metres():
+    """Two opponents each: one 0.6 m beside; one ahead; one beside but not near."""
+    far = [3.0, 2.0, 0.0]
+    features = torch.tensor([[0.0] * 8 + far + gaps for gaps in ([0.0, 0.6, 1.0], [0.5, 0.0, 1.0], [0.0, 0.6, 0.0])])
+    assert anyone_beside(features, within=1.0).tolist() == [True, False, False]
+    assert not anyone_beside(features, within=0.5).any()

@@ -1,0 +1,87 @@
+"""What can be judged of a style, by hand: nothing is called met that was not measured."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from coachable.domains.combat.metrics import CombatMeasures
+from coachable.domains.humanoid.metrics import HumanoidMeasures
+from coachable.domains.racing.metrics import RacingMeasures
+from coachable.envs.racing.race.features import GAPS
+from coachable.envs.racing.race.observation import own_columns
+from coachable.envs.racing.race.referee import TELEMETRY
+
+
+def race(gaps, theta):
+    """One step of one car; `gaps` holds longitudinal and lateral distance [m] and near of each other car."""
+    features = torch.cat([torch.zeros(GAPS), torch.tensor(gaps, dtype=torch.float32).flatten()])
+    observation = torch.zeros(1, own_columns("controls").stop)
+    telemetry = torch.zeros(1, len(TELEMETRY))
+    after = {"observation": observation, "telemetry": telemetry, "style_features": features[None]}
+    return TensorDict({"style": torch.tensor([theta]), "next": TensorDict(after, [1])}, [1])
+
+
+@pytest.mark.parametrize(
+    ("gaps", "judged", "kept", "longitudinal", "lateral"),
+    [
+        ([(30.0, 0.0, 0.0), (50.0, 3.0, 0.0)], False, False, None, None),  # nobody within 10 m
+        ([(4.0, 0.0, 1.0), (6.0, 0.0, 1.0)], True, True, 4.0, None),  # two ahead, in line
+        ([(0.5, 0.0, 1.0), (30.0, 0.0, 0.0)], True, False, 0.5, None),  # too close behind one
+        ([(0.0, 0.3, 1.0), (0.0, 0.8, 1.0)], True, False, None, 0.3),  # between two, too close to one
+        ([(0.0, 0.8, 1.0), (4.0, 0.0, 1.0)], True, True, 4.0, 0.8),
+    ],
+)
+def test_margins_are_judged_by_cars_nearby(gaps, judged, kept, longitudinal, lateral):
+    measures = RacingMeasures("aggressiveness")
+    found = measures.step(race(gaps, [1.0, 0.5]))
+    record = {name: value[None] for name, value in found.items()}
+    assert measures.judged(record).item() is judged
+    assert measures.complies(record).item() is kept
+    for name, value in {"longitudinal": longitudinal, "lateral": lateral}.items():
+        expected = float("nan") if value is None else value
+        assert found[name].item() == pytest.approx(expected, nan_ok=True)
+    assert measures.needs == "another car within 10 m"
+
+
+def test_alone_on_the_track_no_margin_is_judged():
+    measures = RacingMeasures("aggressiveness")
+    found = measures.step(race([], [1.0, 0.5]))
+    assert not measures.judged({name: value[None] for name, value in found.items()}).any()
+    assert found["longitudinal"].isnan().all() and found["lateral"].isnan().all()
+
+
+def test_savings_are_not_judged_by_single_steps():
+    measures = RacingMeasures("resources")
+    found = measures.step(race([], [0.0, 0.0, 100.0, 1.0]))
+    assert not measures.judged({name: value[None] for name, value in found.items()}).any()
+    assert "whole stints" in measures.needs
+
+
+def test_slip_ratios_are_measured_where_they_are_asked_for():
+    step = race([], [0.0, 0.0, 0.0, 0.0])
+    step["next", "style_features"][0, :4] = torch.tensor([0.1, 0.2, 0.3, 0.4])
+    found = RacingMeasures("drift").step(step)
+    assert (found["slip_ratio_front"].item(), found["slip_ratio_rear"].item()) == pytest.approx((0.3, 0.4))
+
+
+def test_fights_are_judged_by_damage_under_a_style():
+    nan = float("nan")
+    record = {
+        "damage": torch.tensor([[0.0], [5.0], [5.0], [5.0]]),
+        "requested": torch.tensor([[0.0], [nan], [0.0], [2.0]]),
+    }
+    measures = CombatMeasures()
+    assert measures.judged(record)[:, 0].tolist() == [False, False, True, True]
+    assert measures.complies(record)[:, 0].tolist() == [False, False, False, True]
+
+
+def test_walking_is_judged_by_footsteps():
+    nan = float("nan")
+    record = {
+        "pose_held": torch.tensor([[1.0], [1.0], [0.0], [1.0]]),
+        "step_length": torch.tensor([[nan], [0.5], [0.5], [0.3]]),
+        "step_length_error": torch.tensor([[nan], [0.01], [0.01], [0.21]]),
+    }
+    measures = HumanoidMeasures()
+    assert measures.judged(record)[:, 0].tolist() == [False, True, True, True]
+    assert measures.complies(record)[:, 0].tolist() == [False, True, False, False]

@@ -1,0 +1,104 @@
+"""The gamepad: 864 raw combinations are 315 legal ones (paper), each reached and read as it should be."""
+
+from itertools import product
+
+import pytest
+import torch
+
+from coachable.envs.combat.gamepad import (
+    GAMEPAD,
+    HEADS,
+    NUM_COMBINATIONS,
+    canonical,
+    canonical_rows,
+    combination_index,
+    describe,
+    press,
+    read_pad,
+)
+
+
+def all_raw() -> torch.Tensor:
+    """Every raw combination (864, 24) with both sticks pushed."""
+    choices = torch.tensor(list(product(*(range(len(values)) for values in HEADS.values()))))
+    return GAMEPAD.from_choices(choices, torch.full((len(choices), 4), 0.5))
+
+
+def test_864_raw_combinations_are_315_legal_ones():
+    index = combination_index(all_raw())
+    assert len(index) == 864
+    assert index.min() == 0
+    counts = index.bincount(minlength=NUM_COMBINATIONS)
+    assert len(counts) == NUM_COMBINATIONS == 315
+    assert (counts.min(), counts.max()) == (1, 20)
+
+
+def test_216_sets_of_pressed_buttons():
+    assert len(torch.unique(canonical(all_raw())[:, :16], dim=0)) == 216  # four button heads, thumbs left out
+
+
+def test_canonical_is_idempotent_and_still_a_valid_action():
+    raw = all_raw()
+    once = canonical(raw)
+    assert torch.equal(canonical(once), once)
+    assert GAMEPAD.spec((864,)).is_in(once)
+    assert torch.equal(combination_index(once), combination_index(raw))
+    assert torch.equal(combination_index(raw.reshape(4, 216, 24)), combination_index(raw).reshape(4, 216))
+
+
+def test_the_virtual_hand_holds_in_every_combination():
+    pad = read_pad(canonical_rows(all_raw().T))
+    left, right = pad.left_stick.abs().amax(0) > 0, pad.right_stick.abs().amax(0) > 0
+    arrows = pad.up + pad.down + pad.left + pad.right
+    assert not (left & (arrows > 0)).any()
+    assert not (right & (pad.cross + pad.circle + pad.square > 0)).any()
+    assert not (~left & (pad.l3 > 0)).any()
+    for pair in ((pad.l1, pad.l2), (pad.r1, pad.r2)):
+        assert (pair[0] + pair[1]).max() == 1
+
+
+def test_sticks_pass_through_while_their_thumb_is_on_them():
+    action = press("L3", left=(0.25, -1.0), right=(1.0, 0.0))
+    assert canonical(action)[20:].tolist() == [0.25, -1.0, 1.0, 0.0]
+    resting = action.clone()
+    resting[16:20] = torch.tensor([1.0, 0.0, 1.0, 0.0])  # both thumbs on the buttons
+    assert canonical(resting)[20:].tolist() == [0.0, 0.0, 0.0, 0.0]
+    assert describe(resting) == "nothing"  # L3 is out of reach, too
+
+
+def test_a_stick_cannot_be_pushed_beyond_its_rim():
+    action = press("L3", left=(0.5, 0.5), right=(0.5, 0.5))
+    action[20:] = torch.tensor([1.5, -1.7, 1.9, -1.2])
+    assert canonical(action)[20:].tolist() == [1.0, -1.0, 1.0, -1.0]
+    pad = read_pad(canonical_rows(action[:, None]))
+    assert (pad.left_stick[:, 0].tolist(), pad.right_stick[:, 0].tolist()) == ([1.0, -1.0], [1.0, -1.0])
+    assert describe(press("L3")) == "L3 | left stick (+0.00, +0.00)"
+    assert (
+        describe(press(left=(0.25, -1.0), right=(0.5, 0.75)))
+        == "left stick (+0.25, -1.00) | right stick (+0.50, +0.75)"
+    )
+
+
+def test_readable_actions():
+    assert describe(press("square", left=(0.0, 1.0))) == "□ | left stick (+0.00, +1.00)"
+    assert describe(press("up", "R1", "L2")) == "L2 R1 ↑"
+    assert describe(press("cross", right=None)) == "✕"
+
+
+@pytest.mark.parametrize(
+    ("buttons", "sticks", "message"),
+    [
+        (("triangle",), {}, "unknown button 'triangle'"),
+        (("L1", "L2"), {}, "L1 and L2 share a finger"),
+        (("cross",), {"right": (1.0, 0.0)}, "cannot press"),
+        (("up",), {"left": (1.0, 0.0)}, "cannot press"),
+    ],
+)
+def test_impossible_presses_are_refused(buttons, sticks, message):
+    with pytest.raises(ValueError, match=message):
+        press(*buttons, **sticks)
+
+
+def test_only_single_actions_are_described():
+    with pytest.raises(ValueError, match=r"expected one action of shape \(24,\)"):
+        describe(torch.zeros(2, 24))
