@@ -7,7 +7,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from coachable.envs.humanoid import HumanoidEnv, humanoid_style_reward, humanoid_style_space
-from coachable.envs.humanoid.observation import OBSERVATION_GROUPS
+from coachable.envs.humanoid.observation import OBSERVATION_GROUPS, suite_observation
 from coachable.transforms import coachable_env
 
 
@@ -195,5 +195,22 @@ def test_reward_is_task_plus_style_under_the_style_that_the_policy_saw():
     assert torch.equal(data["next", "reward"], expected)
 
 
-def test_observation_groups_add_up():
+def test_only_speeds_of_joints_are_scaled():
+    """The suite's 67 numbers, of which the last 27 are speeds in tenths, the pelvis and the gait."""
+    env = make_env(num_envs=2)
+    seen = roll(env, actions(env, 3))[-1].numpy()
+    simulation, kinematics = env.simulation, env.simulation.kinematics()
+    suite = suite_observation(simulation.positions, simulation.velocities, kinematics, env.course)
+    np.testing.assert_allclose(seen[:, :40], suite[:, :40], atol=1e-6)
+    np.testing.assert_allclose(seen[:, 40:67], 0.1 * simulation.velocities, atol=1e-6)
+    np.testing.assert_allclose(seen[:, 67:71], kinematics.pelvis_quaternion, atol=1e-6)
+    np.testing.assert_allclose(seen[:, 71:], env.gait.observe(), atol=1e-6)
     assert sum(width for _, width, _ in OBSERVATION_GROUPS) == 82
+
+
+def test_threads_share_the_physics_and_change_no_number():
+    """One thread is the caller's own, so that there is no pool to wake."""
+    one, two = (HumanoidEnv(num_envs=3, num_threads=n, seed=0) for n in (1, 2))
+    assert (one.simulation.num_threads, two.simulation.num_threads) == (0, 2)
+    assert torch.equal(roll(one, actions(one, 3)), roll(two, actions(two, 3)))
+    two.close()
