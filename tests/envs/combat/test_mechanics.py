@@ -10,7 +10,7 @@ from coachable.envs.combat import CombatEnv
 from coachable.envs.combat import constants as c
 from coachable.envs.combat.damage import ACID, BURNING, FROST, PLASMA, SHOCK, Totals, damage_parts
 from coachable.envs.combat.rewards import COMPONENT_SLICES
-from coachable.envs.combat.state import ACTIVE, IDLE, RECOVER, SAFE, STAGGER, STAGGERED, TELEGRAPH
+from coachable.envs.combat.state import ACTIVE, AIR, DODGE, IDLE, RECOVER, SAFE, SLIDE, STAGGER, STAGGERED, TELEGRAPH
 from coachable.envs.combat.tables import ALL_MACHINES, AMMO, ELEMENTS, MACHINES, WEAPONS, load_table, resistance
 from coachable.envs.combat.traits import DAMAGE, KIND, MACHINE_NAMES, SPREAD
 from coachable.transforms.gamepad import press
@@ -136,6 +136,22 @@ def test_overkill_is_clipped_before_it_is_attributed():
     assert part(components, "damage").item() == 95.0
     assert part(components, "weapon_damage").sum().item() == 95.0
     assert after["terminated"].item()
+
+
+def test_the_dead_do_nothing():
+    """Eight players: one each eats, sets a trap, dodges, slides, jumps, swings, swings hard, and shoots."""
+    pads = [press(button) for button in ("up", "down", "square", "circle", "cross", "R1", "R2")]
+    for hp in (400.0, 0.0):
+        env = still_fight("Ravager", 3.0, num_envs=8)
+        s = env.state
+        s.hp = torch.full_like(s.hp, hp)
+        hold(env, "Carja's Bane")
+        aim_at_body(env)
+        components, _ = act(env, torch.stack([*pads, SHOOT]))
+        started = torch.stack((c.BERRIES - s.berries, s.trap_type.amax(0) + 1, *s.timers[[DODGE, SLIDE, AIR]])) > 0
+        did = [*started.diagonal().tolist(), *(part(components, "damage")[0, 5:, 0] > 0).tolist()]
+        assert did == [hp > 0.0] * 8
+        assert (s.hp > 0).tolist() == [hp > 0.0] * 8
 
 
 def test_light_swings_hit_every_13_frames():
