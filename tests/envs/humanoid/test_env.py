@@ -115,15 +115,16 @@ def test_a_fall_terminates_and_time_truncates():
     current = env.reset()
     for _ in range(200):
         current = env.step(current.set("action", torch.zeros(1, 21)))["next"]
-        if current["done"].item():
+        if current["terminated"].item():
             break
-    assert current["terminated"].item()
+    assert current["terminated"].item() and current["done"].item()
     assert not current["truncated"].item()
     assert env.simulation.kinematics().head_height[0] < 1.1
     short = make_env(num_envs=1, episode_steps=3)
     current = short.reset()
     for _ in range(3):
         current = short.step(current.set("action", torch.zeros(1, 21)))["next"]
+        assert current["done"].item() == current["truncated"].item()
     assert current["truncated"].item()
     assert not current["terminated"].item()
 

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from coachable.envs.racing.observation import opponents_seen, own_car, own_colum
 from coachable.envs.racing.parameters import CARS, load_car
 from coachable.envs.racing.rescue import RESCUE_SPEED, back_on_track
 from coachable.envs.racing.run import SLIPSTREAM_LENGTH, SLIPSTREAM_WIDTH, Run, look_around, slipstream, tyre_view
-from coachable.envs.racing.scenarios import rolling_cars
+from coachable.envs.racing.scenarios import _longest_straight, rolling_cars
 from coachable.envs.racing.state import HEATS, ROW, SPINS, WEARS, CarState
 from coachable.envs.racing.track import Course
 
@@ -47,6 +48,24 @@ def test_finding_a_place_gives_it_back(ring):
     for found, arc, _ in (ring.find(x, y), ring.project(x, y, s + 20.0), ring.project(x, y, s - 20.0)):
         torch.testing.assert_close(found, s, atol=2e-3, rtol=0)
         torch.testing.assert_close(arc.offset, offset, atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("straight", "start", "length"),
+    [
+        ("--((---((-", 4, 3),
+        ("--((--((--", 8, 4),  # over the line
+        ("-((((((((-", 9, 2),
+        ("((--((((--", 2, 2),  # the first of two
+        ("((((((((((", 0, 0),
+        ("----------", 0, 10),
+    ],
+)
+def test_the_longest_straight(straight, start, length):
+    """Nodes 4 m apart, of which some lie in turns of 500 m."""
+    table = torch.zeros(10, 8)
+    table[:, 4] = torch.tensor([{"-": 0.0005, "(": -0.002}[sign] for sign in straight])
+    assert _longest_straight(SimpleNamespace(table=table, spacing=4.0)) == (4.0 * start, 4.0 * length)
 
 
 @pytest.mark.parametrize("name", CARS)
