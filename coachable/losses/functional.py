@@ -18,7 +18,7 @@ _BLOCK_ELEMENTS_DEVICE = 1 << 24
 def bootstrap_target(
     reward: Tensor, next_value: Tensor, terminated: Tensor, gamma: Tensor | float, steps: Tensor | None = None
 ) -> Tensor:
-    """TD target `R + gamma^k (1 - d) V'` (algorithms.md, sections 1-3).
+    """Return the TD target `R + gamma^k (1 - d) V'`.
 
     The value of a terminal successor is selected out, not multiplied by zero: what an environment emits after the end
     may be NaN, and NaN times zero is NaN.

@@ -17,8 +17,8 @@ from coachable.distributions.mixed_action import MixedAction
 class PolicyReader:
     """Evaluates the deterministic part of an actor and wraps its parameters in a `MixedAction`.
 
-    The distribution that the actor would build is passed over: building a `TanhNormal` costs more than sampling one,
-    and it samples and scores in separate steps, which is wrong where tanh saturates (algorithms.md, section 11).
+    The actor's own distribution is not built. Building a `TanhNormal` costs more than sampling one. It also samples and
+    scores in separate steps, which gives wrong densities where tanh saturates (see `sample_tanh_gaussian`).
 
     Args:
         actor: A `ProbabilisticActor` with a `MixedAction` or a `TanhNormal`.

@@ -1,4 +1,4 @@
-"""The replay buffer with event tables and multi-tables (paper, Stratified Sampling; algorithms.md sections 6 and 7)."""
+"""The replay buffer with event tables and multi-tables (paper, Appendix B, Stratified Sampling)."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""n-step transitions from a stream of one-step transitions (algorithms.md section 2)."""
+"""n-step transitions from a stream of one-step transitions."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -103,7 +103,7 @@ def run_frames(s: State, intent: Intent, rules: Rules, noise: Noise) -> Totals:
 def run_frame(
     s: State, intent: Intent, rules: Rules, totals: Totals, strength: Tensor, noise: Noise, frame: int
 ) -> None:
-    """One frame, in the order of the design: player, what it does to the machine, the machine, what it does back."""
+    """Advance one frame: the player, what it does to the machine, the machine, what it does to the player."""
     traits, site = rules.traits, rules.site
     run_timers(s, intent)
     move_player(s, intent, traits, site)

@@ -1,4 +1,4 @@
-"""`Rivals`: who the agent races against: scripted drivers and its own past (racing.md, section 5.3)."""
+"""`Rivals`: who the agent races against: scripted drivers and its own past."""
 
 from __future__ import annotations
 

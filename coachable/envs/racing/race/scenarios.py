@@ -58,11 +58,11 @@ def drift_scenarios() -> tuple[Scenario, ...]:
 
 
 def race_scenarios(cars: int, shares: Mapping[str, float] | None = None) -> tuple[Scenario, ...]:
-    """The mixture of multi-tables (racing.md, 5.3).
+    """Return the kinds of starts that a training mixes (paper, Appendix C: scenarios of Gran Turismo).
 
     Args:
         cars: of a race.
-        shares: of each kind of start, by its name; by default the design's, and with one car those without opponents.
+        shares: of each kind of start, by its name; by default `_SHARES`, and with one car those without opponents.
 
     Raises:
         ValueError: if there is no such kind.

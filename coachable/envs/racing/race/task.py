@@ -1,4 +1,4 @@
-"""Task reward and style features of one control step (racing.md, section 6)."""
+"""Task reward and style features of one control step (docs/domains/racing.md, Rewards)."""
 
 from __future__ import annotations
 
