@@ -76,7 +76,7 @@ class PointMass(Sampler):
         return constant(self.values, device).expand(*shape, self.dim).clone()
 
     def support(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """The point itself, twice."""
+        """Return the point as lower and as upper bound."""
         return self.values, self.values
 
 

@@ -45,7 +45,7 @@ class Totals:
 
     @classmethod
     def zeros(cls, like: Tensor, slots: int) -> Totals:
-        """Nothing yet; `like` is (E, N)."""
+        """Return an empty record; `like` is (E, N)."""
         shapes = (6, len(ELEMENTS), len(ELEMENTS), slots, slots)
         return cls(*(like.new_zeros((rows, *like.shape)) for rows in shapes), taken=like.new_zeros(like.shape[-1]))
 
@@ -60,7 +60,7 @@ class ElementNumbers:
 
     @classmethod
     def load(cls, device: torch.device) -> ElementNumbers:
-        """From the data file."""
+        """Read the numbers from the data file."""
         table = load_table("elements")
 
         def column(name: str) -> Tensor:
@@ -158,7 +158,7 @@ def _entry(along: Tensor, squared: Tensor) -> Tensor:
 
 
 def damage_parts(s: State, traits: Traits, damage: Tensor, totals: Totals) -> Tensor:
-    """Takes damage (12, E, N) off the parts; at most one unit of each is removed.
+    """Take damage (12, E, N) off the parts; at most one unit of each is removed.
 
     Returns:
         (E, N) canisters burst, 0 or 1.
@@ -203,7 +203,7 @@ _MELEE_COSINE = float(torch.tensor(c.MELEE_CONE).cos())
 
 
 def build_up(s: State, gain: Tensor, source: Tensor | float, totals: Totals) -> None:
-    """Adds build-up to the gauges; a running state takes none.
+    """Add build-up to the gauges; a running state takes none.
 
     Args:
         s: state.
@@ -253,7 +253,7 @@ def hit_factor(s: State, numbers: ElementNumbers) -> Tensor:
 
 
 def take_damage(s: State, raw: Tensor, active: Tensor, burst: Tensor, totals: Totals) -> Tensor:
-    """Takes damage off the machines, clipped to what is left, and keeps the books.
+    """Subtract damage from the machines, clipped to their health, and record who caused it.
 
     Args:
         s: state.

@@ -92,7 +92,7 @@ def observation_groups(observation: str) -> list[tuple[str, int]]:
 
 
 def observation_size(observation: str) -> int:
-    """Number of numbers."""
+    """Return the width of the observation."""
     return sum(width for _, width in observation_groups(observation))
 
 

@@ -20,7 +20,7 @@ from coachable.envs.combat.traps import closeness
 
 
 def run_step(s: State, pad_rows: Tensor, rules: Rules, noise: Noise, ammo_table: Tensor, sections: Tensor) -> Tensor:
-    """Advances the fights by one step. Changes `s`.
+    """Advance the fights by one step. Changes `s`.
 
     Args:
         s: state.

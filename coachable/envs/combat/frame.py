@@ -57,7 +57,7 @@ class Noise:
 
     @classmethod
     def draw(cls, enemies: int, n: int, generator: torch.Generator) -> Noise:
-        """Draws everything; how many numbers depends on the shapes only."""
+        """Draw everything; how many numbers depends on the shapes only."""
         frames, device = c.FRAMES_PER_STEP, generator.device
         normal = torch.randn((frames, 2 + 2 * enemies, n), generator=generator, device=device)
         uniform = torch.rand((2 * frames + ATTACK_SLOTS + 2, enemies, n), generator=generator, device=device)

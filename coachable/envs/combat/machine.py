@@ -221,7 +221,7 @@ def _spread(roll: Tensor) -> Tensor:
 def _fire_shots(
     s: State, blow: Tensor, firing: Tensor, distance: Tensor, noise: Tensor, pillars: Tensor | None, blocks: Tensor
 ) -> Tensor:
-    """Starts the shots that are due in this frame, spread evenly over the active phase.
+    """Start the shots that are due in this frame, spread evenly over the active phase.
 
     Returns:
         (4, E, N) bool, slots that were filled.
@@ -244,7 +244,7 @@ def _fire_shots(
 
 
 def segment_blocked(start: Tensor, end: Tensor, pillars: Tensor) -> Tensor:
-    """Whether a pillar (2, 4) stands between points (2, E, N): (E, N) bool."""
+    """Return whether a pillar (2, 4) stands between points (2, E, N): (E, N) bool."""
     along = end - start
     length = along.square().sum(0).clamp(min=1e-6)
     x, y = pillars.view(2, -1, 1, 1)

@@ -73,7 +73,7 @@ class Intent:
 
 
 def rows_where(timers: Tensor, row: int, mask: Tensor, value: Tensor | float) -> None:
-    """Writes one row of a tensor that nobody else holds, where `mask` (N,)."""
+    """Write one row of a tensor that nobody else holds, where `mask` (N,)."""
     timers[row] = torch.where(mask, value, timers[row])
 
 
@@ -102,7 +102,7 @@ def element_of(section: Tensor, ammo_table: Tensor) -> Tensor:
 
 
 def command(s: State, pad: Pad, traits: Traits, site: Tensor, ammo_table: Tensor, sections: Tensor) -> Intent:
-    """Acts on the pad at the start of a step: wheel, berries, tools, traps, evasions. Changes `s`.
+    """Act on the pad at the start of a step: wheel, berries, tools, traps, evasions. Changes `s`.
 
     Args:
         s: state.

@@ -1,4 +1,4 @@
-"""What a step is worth: raw components, task reward, style features and events, all free of the style."""
+"""Raw components of a step, and the task reward, style features and events made of them; none depends on the style."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ class TrapNumbers:
 
     @classmethod
     def of(cls, traits: Traits) -> TrapNumbers:
-        """Looks the numbers up."""
+        """Look the numbers up."""
         table, device = load_table("traps"), traits.hp.device
         element = torch.zeros((len(ELEMENTS), len(TRAPS)), device=device)
         for i, trap in enumerate(TRAPS):

@@ -177,7 +177,7 @@ class HumanoidEnv(EnvBase):
     # -- state -----------------------------------------------------------------------------------------------------
 
     def simulator_state(self) -> dict[str, Any]:
-        """Everything that the next step depends on, as tensors and plain values, for exact resumption."""
+        """Return everything that the next step depends on, as tensors and plain values, for exact resumption."""
         arrays = {
             "state": self.simulation.state,
             "course": self.course,

@@ -1,4 +1,4 @@
-"""What the humanoid emits for styles to judge: arm angles, and what the gait did in this control step."""
+"""Style features of the humanoid: arm angles, and what the gait did in this control step."""
 
 from __future__ import annotations
 

@@ -148,7 +148,7 @@ class GaitTracker:
         self.knee_max = np.where(column, knees, self.knee_max)
 
     def observe(self) -> np.ndarray:
-        """What the policy must know about the step under way.
+        """Return what the policy observes of the step under way.
 
         Returns:
             (N, 11): one-hot of the expected foot 2, smallest and largest angle of each knee since the step began 4

@@ -129,7 +129,7 @@ def wheel_grip(car: Car, load: Tensor, heat: Tensor, wear: Tensor, compound: Ten
 def substep(
     packed: Tensor, packed_inputs: Tensor, car: Car, wheels: WheelSet, resources: Resources, h: float
 ) -> Tensor:
-    """Advances the cars by h.
+    """Advance the cars by h.
 
     Args:
         packed: (29, N) rows of `CarState`.

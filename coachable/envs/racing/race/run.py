@@ -55,7 +55,7 @@ FRAME = slice(Run._fields.index("node_x"), RUN_ROWS)
 
 
 class TyreView(NamedTuple):
-    """Of each wheel, (4, N)."""
+    """Slip and grip of each wheel, (4, N)."""
 
     load: Tensor  # [N]
     ratio: Tensor  # slip ratio

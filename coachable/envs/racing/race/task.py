@@ -87,7 +87,7 @@ def impacts_of(impact: Tensor, cars: int) -> Tensor:
 
 
 def contacts(impact: Tensor, before: Others, cars: int) -> tuple[Tensor, Tensor]:
-    """Whether a car was touched, and Σ squared relative speed where the other car was ahead, (A, B) each."""
+    """Return whether a car was touched, and Σ squared relative speed where the other car was ahead, (A, B) each."""
     each = impacts_of(impact, cars)
     touched = (each > 0.0).any(0).to(impact.dtype)
     return touched, torch.where(before.gap > 0.0, each, 0.0).sum(0)
