@@ -285,7 +285,7 @@ class StyleSpace:
         return cls.from_dict(json.loads(text))
 
     def difference(self, other: "StyleSpace") -> list[str]:
-        """List the differences between this space ("here") and `other` ("there") as sentences; empty if there are none."""
+        """List the differences between this space ("here") and `other` ("there") as sentences; empty if equal."""
         return differences(self, other)
 
     def encodes_like(self, other: "StyleSpace") -> bool:
