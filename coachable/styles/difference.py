@@ -17,7 +17,7 @@ _WORDS = {
 
 
 def differences(here: "StyleSpace", there: "StyleSpace") -> list[str]:
-    """List the differences between two spaces as sentences; the list is empty if they are equal."""
+    """Sentences on how `there` differs from `here`; empty if the spaces are equal."""
     found = []
     if here.name != there.name:
         found.append(f"The space is called {here.name!r} here, {there.name!r} there.")

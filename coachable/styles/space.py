@@ -91,7 +91,7 @@ class StyleSpace:
         self._check_sampler()
 
     def __getitem__(self, name: str) -> Parameter:
-        """Return the parameter of that name."""
+        """Parameter of that name."""
         if name not in self.slices:
             raise KeyError(f"no style parameter named {name}: expected {', '.join(self.names)}")
         return self.parameters[self.names.index(name)]
@@ -123,15 +123,15 @@ class StyleSpace:
         generator: Generator | None = None,
         device: torch.device | str | None = None,
     ) -> Tensor:
-        """Draw training styles, `(*shape, dim)` float32; see `Sampler.sample`."""
+        """Draws training styles, `(*shape, dim)` float32; see `Sampler.sample`."""
         return self.sampler.sample(shape, generator, device)
 
     def with_sampler(self, sampler: Sampler) -> "StyleSpace":
-        """Return a space of the same parameters with another training distribution."""
+        """The same parameters with another training distribution."""
         return StyleSpace(self.parameters, sampler, self.name)
 
     def encode(self, theta: Tensor) -> Tensor:
-        """Scale theta for the networks: `theta / max(|low|, |high|)` (paper's f), affine for "range" set-points.
+        """Scales theta for the networks: `theta / max(|low|, |high|)` (paper's f), affine for "range" set-points.
 
         Args:
             theta: `(..., dim)`, raw.
@@ -151,7 +151,7 @@ class StyleSpace:
         return shift, scale
 
     def make(self, strict: bool = False, **values: float | str) -> Tensor:
-        """Build one style from named values.
+        """Builds one style from named values.
 
         Args:
             strict: Raise instead of clamping with a warning when a number lies outside its range.
@@ -182,7 +182,7 @@ class StyleSpace:
         return self.clamp(theta, strict=strict)
 
     def clamp(self, theta: Tensor, strict: bool = False) -> Tensor:
-        """Bring theta into the trained range, with a `StyleRangeWarning` that names what was changed.
+        """Brings theta into the trained range, with a `StyleRangeWarning` that names what was changed.
 
         A `Choice` block that is no one-hot becomes the one-hot of its largest entry.
 
@@ -212,7 +212,7 @@ class StyleSpace:
         return clamped
 
     def validate(self, theta: Tensor) -> None:
-        """Raise a ValueError that lists what is wrong with theta: shape, NaN, range or one-hot."""
+        """Raises a ValueError that lists what is wrong with theta: shape, NaN, range or one-hot."""
         clauses = violations(self, theta)
         if clauses:
             raise ValueError(f"style {'; '.join(clauses)}.")
@@ -222,7 +222,7 @@ class StyleSpace:
         return {name: theta[..., column] for name, column in self.columns.items()}
 
     def lazy_view(self, theta: Tensor) -> StyleView:
-        """Return the blocks of `view`, each sliced only when it is read."""
+        """Like `view`, but each block is sliced only when read."""
         return StyleView(self, theta)
 
     def columns_of(self, names: tuple[str, ...]) -> slice | list[int] | None:
@@ -235,7 +235,7 @@ class StyleSpace:
         return self._columns_of[names]
 
     def describe(self, theta: Tensor) -> dict[str, float | str]:
-        """Return the numbers and option names of one style `(dim,)`; `make(**describe(theta))` returns the style."""
+        """Numbers and option names of one style `(dim,)`; `make(**describe(theta))` gives it back."""
         if tuple(theta.shape) != (self.dim,):
             raise ValueError(f"style has shape {tuple(theta.shape)}: expected ({self.dim},), one style.")
         values = theta.detach().to("cpu", torch.float32)
@@ -247,7 +247,7 @@ class StyleSpace:
         }
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a description that JSON can hold, including the sampler."""
+        """JSON-ready description, sampler included."""
         return {
             "version": SCHEMA_VERSION,
             "name": self.name,
@@ -257,7 +257,7 @@ class StyleSpace:
 
     @classmethod
     def from_dict(cls, description: Mapping[str, Any]) -> "StyleSpace":
-        """Rebuild a space from `to_dict`.
+        """Rebuilds a space from `to_dict`.
 
         Raises:
             ValueError: If the schema version, a kind of parameter or a sampler is unknown.
@@ -276,20 +276,20 @@ class StyleSpace:
         return cls(parameters, Sampler.from_dict(description["sampler"]), description.get("name", ""))
 
     def to_json(self) -> str:
-        """Return the description of `to_dict` as a JSON string."""
+        """The description of `to_dict` as a JSON string."""
         return json.dumps(self.to_dict(), allow_nan=False)
 
     @classmethod
     def from_json(cls, text: str) -> "StyleSpace":
-        """Rebuild a space from `to_json`."""
+        """Rebuilds a space from `to_json`."""
         return cls.from_dict(json.loads(text))
 
     def difference(self, other: "StyleSpace") -> list[str]:
-        """List the differences between this space ("here") and `other` ("there") as sentences; empty if equal."""
+        """Readable sentences on how `other` ("there") differs from this space ("here"); empty if equal."""
         return differences(self, other)
 
     def encodes_like(self, other: "StyleSpace") -> bool:
-        """Return whether both spaces have the same entries and encoding, so that networks of `other` read this one."""
+        """Whether a network trained on `other` reads this space's styles unchanged: same entries, same encoding."""
         ours, theirs = (
             [(p.name, p.kind, getattr(p, "options", None), p.encoding, p.low, p.high) for p in space.parameters]
             for space in (self, other)
@@ -311,7 +311,7 @@ class StyleSpace:
                 raise ValueError(f"the sampler does not fit the parameters: it draws a {error}") from None
 
     def _corners(self) -> list[Tensor]:
-        """Return the lowest and highest draw of every number, with choices at their default."""
+        """Lowest and highest draw of every number, choices at their default."""
         support = self.sampler.support()
         if support is None:
             return []

@@ -16,7 +16,7 @@ class StyleRangeWarning(UserWarning):
 
 
 def violations(space: "StyleSpace", theta: Tensor) -> list[str]:
-    """List the range and one-hot violations of theta, one clause per parameter; empty if theta is a valid style.
+    """Range and one-hot violations of theta, one clause per parameter; empty if theta is a valid style.
 
     Args:
         space: What theta means.

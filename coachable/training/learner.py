@@ -47,7 +47,7 @@ class Learner:
     Works with `SACLoss` and its relatives (QR-SAC, RAC, Cat-RAC): any `LossModule` with `actor_network_params`,
     `qvalue_network_params`, their targets, and `loss_actor` and `loss_qvalue` among its outputs.
 
-    Update orders (paper, Appendix B):
+    Update orders (algorithms.md, sections 1 and 2):
 
     - `"simultaneous"` (the paper's humanoid): both losses from the parameters before the update, then both
       optimisers step, then the target networks move.

@@ -1,4 +1,4 @@
-"""The environments that the three families of style are trained in (paper, Appendix C, Gran Turismo)."""
+"""The environments that the three families of style are trained in (racing.md, sections 1 and 5.3)."""
 
 from __future__ import annotations
 

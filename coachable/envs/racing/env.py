@@ -285,7 +285,7 @@ class RacingEnv(EnvBase):
         return state | ({"rivals": self.driver.state()} if isinstance(self.driver, Rivals) else {})
 
     def load_simulator_state(self, state: dict[str, Any]) -> None:
-        """Restore what `simulator_state` returned.
+        """Restores what `simulator_state` returned.
 
         Raises:
             ValueError: if it comes from other numbers of races or cars.
@@ -302,7 +302,7 @@ class RacingEnv(EnvBase):
             self.driver.load_state(state["rivals"])
 
     def follow(self, policy: nn.Module) -> None:
-        """Set the policy that self-play opponents copy."""
+        """Lets rivals that are copies of the agent know its policy."""
         if isinstance(self.driver, Rivals):
             self.driver.follow(policy)
 

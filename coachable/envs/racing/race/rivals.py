@@ -1,4 +1,4 @@
-"""`Rivals`: the opponents of an agent, which are scripted drivers and earlier copies of its policy."""
+"""`Rivals`: who the agent races against: scripted drivers and its own past (racing.md, section 5.3)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _STREAM = 7919  # keeps the draws apart from those of the starts
 
 
 class Rivals:
-    """Drives each car either by script, at its own share of the grip, or with an earlier copy of the policy.
+    """Drives each car either by script, at a share of the grip that is its own, or as the policy drove some time ago.
 
     Who is who is drawn at the start of each race, and so is the style of the copies. Without a policy to follow, all
     are scripted.
@@ -59,7 +59,7 @@ class Rivals:
         self._steps = 0
 
     def follow(self, policy: nn.Module) -> None:
-        """Copy this policy from now on; it reads `observation` and `style` and writes `action`."""
+        """Takes copies of this policy from now on; it reads `observation` and `style` and writes `action`."""
         self.policy = policy
 
     @torch.no_grad()
@@ -86,7 +86,7 @@ class Rivals:
         return {"steps": self._steps, "copies": [copy.deepcopy(policy.state_dict()) for policy in self.copies]}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Restore `state`.
+        """Restores `state`.
 
         Raises:
             ValueError: if there are copies, but no policy to follow.
@@ -115,7 +115,7 @@ class Rivals:
 
 
 def _frozen(policy: nn.Module | None) -> nn.Module:
-    """Return a copy that does not learn."""
+    """A copy that does not learn."""
     if policy is None:
         raise ValueError("there is no policy to copy: call follow(policy) before")
     return copy.deepcopy(policy).requires_grad_(False)
