@@ -279,7 +279,7 @@ class CombatEnv(EnvBase):
 
 
 def _numbers(what: str, names: Sequence[str], known: Sequence[str]) -> Tensor:
-    """Indices of names, (len(names),) int64."""
+    """Return the indices of names, (len(names),) int64."""
     unknown = sorted({name for name in names if name not in known})
     if unknown or isinstance(names, str) or not names:
         raise ValueError(f"{what} are {names!r}: expected a list of at least one of {list(known)}")

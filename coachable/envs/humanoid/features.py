@@ -13,7 +13,7 @@ STYLE_FEATURES_SIZE = TIMED_OUT + 1
 
 
 def pack_style_features(arms: np.ndarray, report: StepReport) -> np.ndarray:
-    """Raw quantities of both style terms under any theta.
+    """Pack the raw quantities of both style terms, which do not depend on theta.
 
     Args:
         arms: (N, 6) arm joint angles [rad].
