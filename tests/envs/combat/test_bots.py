@@ -1,4 +1,4 @@
-"""Scripted players: they fight as their name says, and the order of the weapons is the design's."""
+"""Scripted players: they fight as their names say, and the weapons have the intended order of strength."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""Physics of one car: performance, symmetry, dissipation, convergence (racing.md, 3.3)."""
+"""Physics of one car: performance, symmetry, dissipation, convergence."""
 
 import pytest
 import torch
