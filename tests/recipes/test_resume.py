@@ -12,7 +12,7 @@ from tests.random_kills import RECIPES, differences
 
 TINY = ["preset=smoke", "env.num_envs=2", "threads.simulator=1", "threads.learner=1", "train.eval_interval=16"]
 TINY += ["init_random_frames=8", "train.warmup_frames=8", "train.batch_size=12", "eval.max_steps=3"]
-TINY += ["train.total_frames=64", "train.utd_ratio=0.25", "eval.num_envs=1"]
+TINY += ["train.total_frames=48", "train.utd_ratio=0.25", "eval.num_envs=1"]
 
 
 @pytest.mark.parametrize("recipe", sorted(file.stem for file in (RECIPES / "configs").glob("*_*.yaml")))
@@ -22,13 +22,13 @@ def test_a_resumed_training_equals_the_uninterrupted_one(recipe, tmp_path, monke
     middle = CheckpointStore(tmp_path / "rest" / "checkpoints")
 
     def save_in_the_middle():
-        if train.frames == 40:
+        if train.frames == 28:
             middle.save({**train.describe(), **train.state_dict()}, {"frames": train.frames}, train.replay)
 
     monkeypatch.setattr(train, "_checkpoint_if_due", save_in_the_middle)
     train.run()
     rest = build(compose_config(recipe, [f"resume={tmp_path / 'rest'}"]))
-    assert rest.frames == 40 and 0 < rest.learner.updates < train.learner.updates
+    assert rest.frames == 28 and 0 < rest.learner.updates < train.learner.updates
     rest.run()
     found = differences(tmp_path / "rest", tmp_path / "whole")
     assert [name for name in found if not name.startswith("metrics/")] == []
