@@ -45,6 +45,7 @@ def test_a_resumed_training_takes_as_many_threads(tmp_path):
 
 def test_the_number_of_threads_is_the_one_that_was_asked_for(tmp_path, monkeypatch):
     """TorchRL raises it when a `SerialEnv` is closed, which happens to a forgotten one at any time."""
+    gc.collect()  # of earlier tests
     monkeypatch.setattr("torchrl._THREAD_POOL_INIT", 4)
     train = import_module("cheetah_speed").build(compose_config("cheetah_speed", [*TINY, f"run_dir={tmp_path}"]))
     gc.collect()

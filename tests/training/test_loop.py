@@ -256,7 +256,7 @@ def test_evaluation_counts_each_episode_once(make_echo_env):
 def test_a_signal_ends_the_training_with_a_checkpoint(make_train, tmp_path, number):
     train = make_train(total_frames=10**9)
     before = signal.getsignal(number)
-    timer = threading.Timer(0.5, os.kill, (os.getpid(), number))
+    timer = threading.Timer(0.2, os.kill, (os.getpid(), number))
     timer.start()
     train.run()
     assert signal.getsignal(number) is before

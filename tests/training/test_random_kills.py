@@ -16,7 +16,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:De
 def _make(make_train, make_echo_env, run_dir, resume):
     """Checkpoints after every round, so that kills fall into their writes, and evaluations every few rounds."""
     seed_everything(0)
-    train = make_train(run_dir, total_frames=72, eval_interval=24, checkpoint_interval=0.0, log_interval=0.05)
+    train = make_train(run_dir, total_frames=56, eval_interval=24, checkpoint_interval=0.0, log_interval=0.05)
     env = make_echo_env(5)
 
     def evaluate():

@@ -228,7 +228,7 @@ def check_invariants(env: CombatEnv, before: State, transition: TensorDict) -> N
 
 
 def run_random(num_envs: int, steps: int, **options) -> None:
-    env = make_env(num_envs=num_envs, components=True, episode_steps=20, **options)
+    env = make_env(num_envs=num_envs, components=True, episode_steps=40, **options)
     current = env.reset()
     with torch.random.fork_rng():
         torch.manual_seed(0)
