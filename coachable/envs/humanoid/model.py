@@ -8,6 +8,7 @@ our features need and every force switched off, so that one cheap step of it rea
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from importlib.resources import files
 
 import mujoco
@@ -78,8 +79,9 @@ def load_spec() -> mujoco.MjSpec:
     return mujoco.MjSpec.from_string(text, include=common)
 
 
+@cache
 def build_model() -> HumanoidModel:
-    """Compile the dynamics and kinematics models."""
+    """Compile the dynamics and kinematics models, once for all simulations of a process: only states change."""
     dynamics_spec = load_spec()
     for sensor in list(dynamics_spec.sensors):
         dynamics_spec.delete(sensor)
