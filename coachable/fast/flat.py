@@ -8,8 +8,6 @@ import torch
 from torch import Tensor
 from torch.autograd.graph import increment_version
 
-from coachable.fast.memory import Arena
-
 _ALIGN = 32  # elements: one cache line of 64 bytes at bfloat16, so that products see aligned matrices
 
 
@@ -67,7 +65,6 @@ class FlatBuffers:
         for tensor in self.tensors:
             starts.append(total)
             total += -(-tensor.numel() // _ALIGN) * _ALIGN
-        on_cpu = self.tensors[0].device.type == "cpu"
-        buffer = Arena().zeros(total, dtype=dtype) if on_cpu else self.tensors[0].new_zeros(total, dtype=dtype)
+        buffer = self.tensors[0].new_zeros(total, dtype=dtype)
         parts = zip(starts, self.tensors, strict=True)
         return buffer, [buffer[start : start + t.numel()].view(t.shape) for start, t in parts]

@@ -1,4 +1,4 @@
-"""Builds and loads `kernels.c` with the machine's C compiler, where there is one."""
+"""Build and load `kernels.c` with the machine's C compiler, where there is one."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def _bind(library: ctypes.CDLL) -> dict[torch.dtype, Kernels]:
     kernels = {}
     adam = library.adam
     adam.argtypes = [p, i, *[ctypes.c_float] * 6]
-    adam.restype = ctypes.c_double
+    adam.restype = None
     for dtype, name in ((torch.bfloat16, "bf16"), (torch.float32, "fp32")):
         forward, backward = library[f"layer_forward_{name}"], library[f"layer_backward_{name}"]
         forward.argtypes = [p, p, p, p, p, i, i, i, i, ctypes.c_float, i, i, p, p, p, p]
