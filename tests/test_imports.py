@@ -24,19 +24,23 @@ LAYERS = {
     "ranges": 0,
     "third_party": 0,
     "styles": 0,
-    "losses": 1,
-    "networks": 1,
-    "replay": 1,
-    "transforms": 1,
+    "distributions": 0,
     "domain": 1,
     "envs": 1,
-    "gym": 1,
-    "training": 2,
-    "evaluation": 2,
-    "pretrained": 2,
-    "coach": 3,
-    "doctor": 3,
-    "cli": 4,
+    "fast": 1,
+    "networks": 1,
+    "losses": 2,
+    "replay": 2,
+    "transforms": 2,
+    "gym": 3,
+    "training": 3,
+    "export": 4,
+    "evaluation": 4,
+    "pretrained": 4,
+    "coach": 5,
+    "doctor": 5,
+    "domains": 6,
+    "cli": 7,
 }
 
 # Numerics that need nothing but torch (and the standard library).
@@ -74,7 +78,7 @@ def part(module: str) -> str:
 def domain(module: str) -> str | None:
     """Name of the domain that a module belongs to."""
     pieces = module.split(".")
-    return pieces[2] if pieces[:2] == ["coachable", "envs"] and len(pieces) > 2 else None
+    return pieces[2] if pieces[1:2] in (["envs"], ["domains"]) and len(pieces) > 2 else None
 
 
 INTERNAL = {
