@@ -1,7 +1,5 @@
-import ast
 import copy
 import logging
-from pathlib import Path
 
 import pytest
 import torch
@@ -9,7 +7,6 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives import SACLoss
 
-import coachable
 from coachable.fast import accelerate, native
 from coachable.fast.accelerate import Acceleration, obstacle
 from coachable.networks import make_gaussian_actor
@@ -218,14 +215,3 @@ def test_hand_written_passes_are_not_compiled():
     learner = make_learner(make_loss(), True, compile=True)
     learner.update(make_batch(16))
     assert learner._losses.both == learner.loss_module.forward
-
-
-def test_nothing_else_in_the_library_imports_the_fast_room():
-    package = Path(coachable.__file__).parent
-    for path in package.rglob("*.py"):
-        if path.is_relative_to(package / "fast"):
-            continue
-        for node in ast.walk(ast.parse(path.read_text())):
-            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            names += [f"{node.module}.{alias.name}" for alias in node.names] if isinstance(node, ast.ImportFrom) else []
-            assert not any(name.startswith("coachable.fast") for name in names), path
