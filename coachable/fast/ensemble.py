@@ -14,7 +14,7 @@ from coachable.fast.fused import Layer, Member, Plan, residual_network
 from coachable.networks.residual import ResidualBlock, ResidualMLP
 
 Triple = tuple[Tensor, Tensor, Tensor | None]
-"""A parameter, its rounded copy, and where its gradient goes."""
+"""Parameter, its rounded copy, and the place of its gradient."""
 
 
 def residual_networks(module: nn.Module) -> dict[str, ResidualMLP]:
@@ -94,7 +94,7 @@ def planned_copy(module: nn.Module, plans: Mapping[str, Plan]) -> nn.Module:
 
 
 class CriticEnsemble:
-    """Stands in for the vmapped critic of a TorchRL loss (`loss._vmap_qnetworkN0`).
+    """Replacement of the vmapped critic of a TorchRL loss, `loss._vmap_qnetworkN0`.
 
     Called with a tensordict and a stack of parameters, it evaluates the K critics and returns a tensordict
     `[K, *batch]` that holds the critic's output keys.

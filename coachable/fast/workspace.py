@@ -1,8 +1,8 @@
 """The hand-written passes of residual networks on prepared memory, with the kernels of `kernels.c`.
 
-Between two products of matrices that fill the cache, every Python call is a cold one; so all views, addresses and
-buffers that do not change from update to update are made once. A workspace is good for as long as the parameters stay
-where they are; when they have moved, a new plan is made (the learner looks at the beginning of each update).
+Products of matrices fill the cache, so that every Python call between them is slow. All views, addresses and buffers
+that do not change from update to update are therefore made once. A workspace is valid while the parameters stay where
+they are in memory. When they move, the backend of the learner makes new plans before the next update.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Workspace:
         ]
 
     def _buffers(self, layers: Sequence[Layer]) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
-        """Product, output, mean and reciprocal deviation of each layer; little memory if nothing is kept."""
+        """Return product, output, mean and reciprocal deviation of each layer; layers share them if `keep` is false."""
 
         def buffer(layer: Layer) -> Tensor:
             return torch.empty(self.rows, layer.out_features, dtype=self._dtype)
@@ -72,7 +72,7 @@ class Workspace:
 
     @property
     def own_products(self) -> bool:
-        """Whether the products are those of the kernels now."""
+        """Whether the kernels compute the products at the present number of threads."""
         return self._members[0].products() is not None
 
     def forward(self, inputs: Sequence[Tensor], out: Sequence[Tensor]) -> None:
@@ -85,7 +85,7 @@ class Workspace:
     def backward(
         self, k: int, grad: Tensor, trained: bool, add: bool, rows: Tensor | None, columns: slice | None
     ) -> Tensor:
-        """Backward pass of member `k`, see `TorchPasses.backward`."""
+        """Run the backward pass of member `k`, see `TorchPasses.backward`."""
         return self._members[k].backward(grad, trained, add, rows, columns)
 
 
