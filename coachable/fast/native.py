@@ -76,9 +76,7 @@ def load_kernels() -> dict[torch.dtype, Kernels]:
         return _bind(_library(compiler))
     except (OSError, subprocess.SubprocessError) as error:
         detail = getattr(error, "stderr", "") or error
-        _LOG.warning(
-            "building %s with %s failed; updates run without: %s", _SOURCE.name, compiler, detail
-        )
+        _LOG.warning("building %s with %s failed; updates run without: %s", _SOURCE.name, compiler, detail)
         return {}
 
 
