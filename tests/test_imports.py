@@ -27,7 +27,6 @@ LAYERS = {
     "distributions": 0,
     "domain": 1,
     "envs": 1,
-    "fast": 1,
     "networks": 1,
     "losses": 2,
     "replay": 2,
@@ -41,6 +40,7 @@ LAYERS = {
     "doctor": 5,
     "domains": 6,
     "cli": 7,
+    "fast": 8,  # optional: nothing but recipes imports it
 }
 
 # Numerics that need nothing but torch (and the standard library).
