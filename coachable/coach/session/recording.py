@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from coachable.coach.session.coaching import Control
+from coachable.domain import Control
 from coachable.styles import Choice, Parameter, StyleSpace
 
 SCHEMA_VERSION = 1
