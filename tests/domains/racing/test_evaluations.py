@@ -41,7 +41,7 @@ def scripted(family, car, **settings):
 
     class Policy(torch.nn.Module):
         def forward(self, data):
-            return data.set("action", driver(envs[-1], data["observation"]))
+            return data.set("action", driver(envs[-1].field, data["observation"]))
 
     agent = LoadedPolicy(Policy(), family_style(family)[0], {"env": {"track": "ring", "car": car}}, {})
     return replace(domain, make_env=make_env), agent
