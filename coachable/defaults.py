@@ -127,12 +127,16 @@ class EnvPictures:
         width, height = self.size
         if hasattr(simulation, "physics"):
             return np.asarray(simulation.physics.render(height=height, width=width))
-        picture = simulation.render() if getattr(simulation, "render_mode", None) == "rgb_array" else None
-        if picture is None:
+        name = type(getattr(simulation, "unwrapped", simulation)).__name__
+        if getattr(simulation, "render_mode", None) != "rgb_array":
             raise RenderingError(
-                f"{type(simulation).__name__} draws no pictures: make it with render_mode='rgb_array' where it is a "
+                f"{name} draws no pictures: make it with render_mode='rgb_array' where it is a "
                 "Gymnasium environment, or give the Domain a make_renderer"
             )
+        try:
+            picture = simulation.render()
+        except Exception as error:  # whatever the environment needs for it
+            raise RenderingError(f"{name} draws no pictures: {error}") from error
         return np.asarray(Image.fromarray(np.asarray(picture, dtype=np.uint8)).resize(self.size))
 
     def close(self) -> None:
@@ -206,10 +210,14 @@ def style_grid(space: StyleSpace) -> list[dict[str, Any]]:
     numeric = [p for p in space.parameters if not isinstance(p, Choice)]
     count = _GRID[0] if len(numeric) == 1 else _GRID[1]
     values = {
-        p.name: p.options if isinstance(p, Choice) else np.linspace(*p.evaluation_range, count).tolist()
-        for p in space.parameters
+        p.name: p.options if isinstance(p, Choice) else _spread(*p.evaluation_range, count) for p in space.parameters
     }
     if np.prod([len(options) for options in values.values()]) <= _LARGEST_GRID:
         return [dict(zip(values, cell, strict=True)) for cell in product(*values.values())]
     default = space.describe(space.default)
     return [default, *({**default, name: v} for name, options in values.items() for v in options if v != default[name])]
+
+
+def _spread(low: float, high: float, count: int) -> list[float]:
+    """Evenly spaced values with few digits."""
+    return [min(max(float(f"{value:.6g}"), low), high) for value in np.linspace(low, high, count)]

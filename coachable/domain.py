@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, Transform
 
 from coachable.defaults import EnvPictures, RewardMeasures, steps_per_episode, style_grid, time_per_step
 from coachable.styles import Setpoint, StyleReward, StyleSpace
@@ -190,8 +190,9 @@ class Domain:
         self,
         space: StyleSpace,
         num_envs: int,
-        *,
         seed: int | None = None,
+        *,
+        transforms: Sequence[Transform] = (),
         num_threads: int | None = None,
         reward: StyleReward | None = None,
         **options: Any,
@@ -202,6 +203,7 @@ class Domain:
             space: the agent's styles.
             num_envs: N.
             seed: of the initial states and of the styles that are drawn.
+            transforms: further ones, such as `EpisodeSums`.
             num_threads: physics threads, where `make_env` takes them.
             reward: style reward; default: the domain's own.
             **options: further arguments of `make_env`.
@@ -210,7 +212,8 @@ class Domain:
         if "num_threads" in accepted or any(p.kind is p.VAR_KEYWORD for p in accepted.values()):
             options["num_threads"] = num_threads
         simulation = self.make_env(num_envs=num_envs, **options)
-        return coachable_env(simulation, space, self.make_reward(space) if reward is None else reward, seed=seed)
+        reward = self.make_reward(space) if reward is None else reward
+        return coachable_env(simulation, space, reward, *transforms, seed=seed)
 
     def cells(self) -> list[dict[str, Any]]:
         """The styles of the evaluation grid, by parameter name."""

@@ -21,7 +21,7 @@ def fitting(words: Words, parameters: Sequence[Parameter]) -> Words:
     options = {p.name: p.options if isinstance(p, Choice) else None for p in parameters}
 
     def known(name: str, value: Any) -> bool:
-        return name in options and (options[name] is None or value in ("", *options[name]))
+        return name in options and (options[name] is None or value in ("", *(options[name] or ())))
 
     def means(meaning: str) -> bool:
         named, _, value = read_meaning(meaning)
