@@ -164,7 +164,7 @@ class Domain:
         coached: options of `make_env` for an agent that a person watches, where it then meets others than when it is
             measured.
         evaluation: what `coachable evaluate` does instead of running the grid and switched styles: `(domain, policy,
-            folder, settings) -> report`, with the loaded policy and `coachable.evaluation.settings`.
+            folder, settings) -> report`, with the loaded policy and `coachable.evaluation.evaluation_settings`.
     """
 
     name: str

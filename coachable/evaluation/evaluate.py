@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from coachable.domain import Domain
+from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import draw_style_grid
-from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.style_grid import (
     StyleGrid,
     evaluate_grid,

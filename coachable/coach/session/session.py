@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 
 from coachable.coach.phrases.fitting import fitting
 from coachable.coach.phrases.grammar import StyleGrammar, Understanding
-from coachable.coach.session.episodes import LiveEpisodes
+from coachable.coach.session.live_episodes import LiveEpisodes
 from coachable.coach.session.readout import MeasuredWindow, StyleReport
 from coachable.coach.session.recording import Recording, check_seed
 from coachable.coach.session.timeline import Timeline

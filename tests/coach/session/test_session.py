@@ -9,7 +9,7 @@ import torch
 from tensordict.nn import TensorDictModule
 
 from coachable.coach.phrases.fitting import fitting
-from coachable.coach.session.episodes import TIME_IS_UP
+from coachable.coach.session.live_episodes import TIME_IS_UP
 from coachable.coach.session.recording import Recording, ReplayMismatch
 from coachable.coach.session.session import CoachSession
 from coachable.domain import load_domain
