@@ -33,7 +33,8 @@ from cosmic_ray.plugins import get_operator, operator_names
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("styles", "networks", "losses", "transforms", "replay", "training")
-PACKAGES += ("envs/racing", "envs/combat", "envs/humanoid")
+PACKAGES += ("distributions", "fast", "envs/racing", "envs/combat", "envs/humanoid")
+PACKAGES += ("domains/racing", "domains/combat", "domains/humanoid")
 
 # Pictures, the page's words, and tables of numbers, whose tests could only repeat them.
 LEFT_OUT = ("render", "domain", "domains", "constants", "tables", "garage", "circuits")

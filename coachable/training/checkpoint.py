@@ -282,7 +282,7 @@ def check_writable(directory: Path | str, required_bytes: int = 0) -> None:
         ) from error
     finally:
         with contextlib.suppress(OSError):
-            probe.unlink(missing_ok=True)
+            probe.unlink()
     free = shutil.disk_usage(directory).free
     if free < required_bytes:
         raise CheckpointError(

@@ -1,5 +1,6 @@
 import pytest
 import torch
+from torchrl.modules import TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from coachable.fast.accelerate import Acceleration
@@ -104,6 +105,14 @@ def test_what_it_does_not_cover_is_left_to_the_loss():
     assert not LeanSAC.supports(loss)
     assert not LeanSAC.supports(make_loss(reduction="sum"))
     assert not LeanSAC.supports(make_loss(skip_done_states=True))
+    for part, name, other in (
+        (1, "distribution_class", TanhNormal),
+        (1, "distribution_kwargs", {"low": -2.0}),
+        (0, "out_keys", ["scale", "loc"]),
+    ):
+        loss = make_loss()
+        setattr(loss.actor_network.module[part], name, other)
+        assert not LeanSAC.supports(loss), name
     tensors, _ = lean(make_loss())
     batch = make_batch(8)
     assert tensors.serves(batch)

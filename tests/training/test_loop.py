@@ -175,6 +175,14 @@ def test_updates_per_step(make_train, utd_ratio, updates):
     assert abs(train.learner.updates - updates) <= 1  # 160 frames, the first 40 are warm-up; 0.3 is not exact in binary
 
 
+def test_without_settings_every_step_is_followed_by_an_update(make_train):
+    train = make_train(total_frames=6, num_envs=1)
+    train.settings = TrainSettings(total_frames=6, batch_size=1)
+    train.run()
+    assert train.learner.updates == 6  # from the first one on
+    assert train.learner.optimizers["actor"].param_groups[0]["lr"] == 1e-3  # and nothing is annealed
+
+
 def test_without_a_ratio_the_learner_fills_the_throttled_time(make_train):
     train = make_train(total_frames=60, utd_ratio=None, throttle=40.0, warmup_frames=20)
     start = time.monotonic()

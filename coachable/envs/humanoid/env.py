@@ -207,8 +207,7 @@ class HumanoidEnv(EnvBase):
 
     def _start_episodes(self, rows: np.ndarray) -> None:
         """Upright, feet on the ground, random arms, heading near the course."""
-        positions = np.tile(self.simulation.model.dynamics.qpos0, (len(rows), 1))
-        positions[:, 7:] = 0.0
+        positions = np.tile(self.simulation.model.dynamics.qpos0, (len(rows), 1))  # all joints at 0
         postures = self._random.integers(0, len(self._postures), len(rows))
         positions[:, self.simulation.model.arm_positions] = self._postures[postures]
         positions[:, 2] = self._standing_height
@@ -229,7 +228,6 @@ class HumanoidEnv(EnvBase):
         random = np.random.default_rng(0)
         model = self.simulation.model
         state = self.simulation.state[:1].copy()
-        state[0, 1 + 7 : 1 + NUM_POSITIONS] = 0.0
         self._standing_height = float(state[0, 3] - self.simulation.kinematics_of(state).foot_clearance.min())
         lower, upper = model.arm_ranges.T
         found = []

@@ -22,8 +22,7 @@ from coachable.coach.page.page import CoachPage, verdict  # noqa: E402
 from coachable.coach.page.server import make_server  # noqa: E402
 from coachable.coach.session.readout import StyleReport  # noqa: E402
 from coachable.coach.session.session import CoachSession  # noqa: E402
-from coachable.domains.humanoid import scene  # noqa: E402
-from coachable.domains.humanoid.scene import HumanoidScene  # noqa: E402
+from coachable.domains.humanoid import scene as humanoid_scene  # noqa: E402
 from coachable.styles import StyleRangeWarning  # noqa: E402
 from tests.coach.echo_domain import echo_session  # noqa: E402
 
@@ -533,8 +532,8 @@ def test_in_a_narrow_window_the_picture_lies_above_the_panel(server, monkeypatch
     """viser's panel covers the lower 60 % of such a window."""
     session, shown = echo_session(), []
     view = views.make_view(server, session)
-    drawing = SimpleNamespace(set_background_image=lambda picture, **_: shown.append(picture))
-    client = SimpleNamespace(scene=drawing, camera=SimpleNamespace(aspect=0.5, image_width=400))
+    scene = SimpleNamespace(set_background_image=lambda picture, **_: shown.append(picture))
+    client = SimpleNamespace(scene=scene, camera=SimpleNamespace(aspect=0.5, image_width=400))
     monkeypatch.setattr(server, "get_clients", lambda: {0: client})
     view.update()
     drawn = (shown[0] != views._BORDER).any(-1).any(-1)
@@ -544,8 +543,8 @@ def test_in_a_narrow_window_the_picture_lies_above_the_panel(server, monkeypatch
 
 
 def test_in_a_narrow_window_the_camera_shows_the_agent_above_the_panel():
-    camera = SimpleNamespace(image_width=400, position=scene._START)
-    scene._raise_agent(camera)
+    camera = SimpleNamespace(image_width=400, position=humanoid_scene._START)
+    humanoid_scene._raise_agent(camera)
     position, target = np.array(camera.position), np.array(camera.look_at)
     ahead = (target - position) / np.linalg.norm(target - position)
     right = np.cross(ahead, [0.0, 0.0, 1.0])
@@ -555,10 +554,10 @@ def test_in_a_narrow_window_the_camera_shows_the_agent_above_the_panel():
         share = (seen @ up) / (seen @ ahead) / np.tan(np.deg2rad(75.0) / 2)  # -1 below, 1 above
         assert 0.2 < share < 1.0, "above the panel's 60 %"
     for other in (
-        SimpleNamespace(image_width=1280, position=scene._START),
+        SimpleNamespace(image_width=1280, position=humanoid_scene._START),
         SimpleNamespace(image_width=400, position=(1.0, 1.0, 1.0)),  # the user has moved it
     ):
-        scene._raise_agent(other)
+        humanoid_scene._raise_agent(other)
         assert not hasattr(other, "look_at")
 
 
@@ -567,7 +566,7 @@ def test_the_humanoid_stays_in_the_middle_of_the_scene(server):
     server.scene.reset()
     session = CoachSession.open("humanoid", seed=1)
     view = views.make_view(server, session)
-    assert isinstance(view, HumanoidScene)
+    assert isinstance(view, humanoid_scene.HumanoidScene)
     session.run(0.5)
     view.update()
     position = session.base_env.simulation.positions[0, :2]

@@ -84,3 +84,14 @@ def test_the_score_is_the_share_of_the_damage_in_the_steps_that_count():
     sums = measures.summarise(record, alive)
     assert sums["requested"].tolist() == [5.0, 0.0] and sums["damage"].tolist() == [10.0, 0.0]
     assert sums["style_score"][0] == 0.5 and sums["style_score"][1].isnan()
+
+
+def test_fights_are_judged_by_damage_under_a_style():
+    nan = float("nan")
+    record = {
+        "damage": torch.tensor([[0.0], [5.0], [5.0], [5.0]]),
+        "requested": torch.tensor([[0.0], [nan], [0.0], [2.0]]),
+    }
+    measures = CombatMeasures()
+    assert measures.judged(record)[:, 0].tolist() == [False, False, True, True]
+    assert measures.complies(record)[:, 0].tolist() == [False, False, False, True]

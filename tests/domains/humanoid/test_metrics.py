@@ -67,3 +67,15 @@ def test_means_are_over_the_steps_that_count():
     means = HumanoidMeasures().summarise(record, torch.tensor([[True, True], [True, True], [False, True]]))
     assert means["forward_speed"].tolist() == [2.0, 1.0]
     assert means["step_length"][0] == pytest.approx(0.4) and means["step_length"][1].isnan()
+
+
+def test_walking_is_judged_by_footsteps():
+    nan = float("nan")
+    record = {
+        "pose_held": torch.tensor([[1.0], [1.0], [0.0], [1.0]]),
+        "step_length": torch.tensor([[nan], [0.5], [0.5], [0.3]]),
+        "step_length_error": torch.tensor([[nan], [0.01], [0.01], [0.21]]),
+    }
+    measures = HumanoidMeasures()
+    assert measures.judged(record)[:, 0].tolist() == [False, True, True, True]
+    assert measures.complies(record)[:, 0].tolist() == [False, True, False, False]

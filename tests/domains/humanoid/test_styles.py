@@ -65,6 +65,15 @@ def test_poses_mirror_left_and_right():
         np.testing.assert_allclose(right * [1, -1, 1], left, atol=1e-6)
 
 
+def test_elbows_are_bent_by_70_to_90_degrees_and_shoulders_have_15_either_side():
+    for right, left in zip(pose_bounds_deg()[:, :3], pose_bounds_deg()[:, 3:], strict=True):
+        assert right[2].tolist() == left[2].tolist() == [-90.0, -70.0]
+        np.testing.assert_allclose(right[:2, 1] - right[:2, 0], 30.0)
+        np.testing.assert_allclose(left[:2], -right[:2, ::-1])
+    t_pose = [[-71.0, -41.0], [-42.0, -12.0]]
+    np.testing.assert_allclose(pose_bounds_deg()[POSES.index("t_pose"), :2], t_pose)
+
+
 def test_pose_bounds_lie_in_the_joint_ranges():
     ranges = np.rad2deg(HumanoidSimulation(1).model.arm_ranges)
     centres = pose_bounds_deg().mean(axis=2)
@@ -116,6 +125,7 @@ def test_gait_terms_at_the_papers_margin_of_five_centimetres():
 
 def test_uneven_strides_and_bent_or_overstretched_knees_cost():
     assert terms(a_step(0.5, fraction=2 / 3))["gait"] == pytest.approx(20)
+    assert terms(a_step(0.5, fraction=3 / 4))["gait"] == pytest.approx(10, rel=1e-4)
     assert terms(a_step(0.5, fraction=5 / 6))["gait"] == pytest.approx(0, abs=1e-5)
     assert terms(a_step(0.5, knee_min=math.radians(-160)))["gait"] == pytest.approx(10, rel=1e-4)
     assert terms(a_step(0.5, knee_max=math.radians(10)))["gait"] == pytest.approx(40 / 3, rel=1e-4)

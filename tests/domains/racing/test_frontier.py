@@ -1,14 +1,17 @@
 """The dynamic programme: limits, monotone trade-offs, calibration."""
 
+import math
 from itertools import pairwise
 
 import numpy as np
 import pytest
+import torch
 
-from coachable.domains.racing.frontier import TANK, WORN, LapProgramme
+from coachable.domains.racing.frontier import SPEEDS, TANK, THROTTLE, WORN, LapProgramme
 from coachable.envs.racing.circuit.circuits import load_track
 from coachable.envs.racing.circuit.profile import Envelope, lap_time, speed_profile
 from coachable.envs.racing.physics.parameters import Resources, load_car
+from coachable.envs.racing.physics.powertrain import drive_wheels
 from coachable.envs.racing.race.driver import line_geometry
 
 
@@ -63,6 +66,23 @@ def test_a_stint_lasts_about_ten_laps(car):
     [lap] = programme.laps("fuel", [0.0])
     assert TANK / lap.fuel == pytest.approx(10.0, abs=1.0)
     assert WORN / lap.wear == pytest.approx(10.0, abs=1.0)
+
+
+def test_coasting_and_full_throttle_are_the_simulators():
+    """In third gear at 56 % and 90 % of the highest engine speed, the latter at the engine's full power."""
+    track, car, h = load_track("ring"), load_car("gt3"), 0.01
+    programme = LapProgramme(track, car, Resources(1.0, 3.0), line=np.zeros(len(track.table)))
+    pedal = torch.tensor([0.0, 1.0], dtype=torch.float64)
+    gear, tank = torch.full_like(pedal, 3.0), torch.full_like(pedal, 30.0)
+    omega = torch.tensor([0.56, 0.9], dtype=torch.float64) * car.rpm_max * 2 * math.pi / 60
+    wheels = omega / (car.gears[2] * car.final_drive)
+    drive = drive_wheels(car, Resources(1.0, 3.0), pedal, wheels, gear, 0.0 * pedal, tank, h)
+    assert drive.gear.tolist() == [3.0, 3.0]  # no shift
+    braking = (drive.resistance * wheels)[0].item() / programme.envelope.mass / SPEEDS  # power over momentum
+    np.testing.assert_allclose(programme._pull[:, 0], -braking)
+    np.testing.assert_allclose(programme._pull[:, -1], programme.envelope.engine(SPEEDS))
+    burnt = (tank - drive.fuel) / h
+    np.testing.assert_allclose(programme._fuel_rate[[0, len(THROTTLE) - 1]], burnt, rtol=1e-6)
 
 
 def test_bad_input_is_refused():

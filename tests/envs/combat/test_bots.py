@@ -5,10 +5,10 @@ import torch
 from tensordict import TensorDict
 
 from coachable.envs.combat import CombatEnv
-from coachable.envs.combat.bots import BOTS, fight_all
+from coachable.envs.combat.bots import BOTS, Bot, fight_all
 from coachable.envs.combat.gamepad import GAMEPAD
 from coachable.envs.combat.player import from_stick, to_stick
-from coachable.envs.combat.state import State
+from coachable.envs.combat.state import ACTIVE, IDLE, TELEGRAPH, State
 from coachable.envs.combat.tables import AMMO, MACHINES, WEAPONS
 
 TOP = ("Slitherfang", "Apex Thunderjaw", "Slaughterspine", "Specter Prime")
@@ -37,6 +37,33 @@ def test_bots_act_validly_and_fight_as_they_are_called(name):
     bow, spear = damage[1 + WEAPONS.index("Carja's Bane")], damage[7]
     assert damage[0] > 500
     torch.testing.assert_close(bow if name != "Spear" else spear, damage[0])
+
+
+def test_bots_dodge_what_is_about_to_hit_with_their_probabilities():
+    # Phase, its timer [frames], attack slot, gap [m], machine alive, frames until a shot lands; probability.
+    bite, shots, soon, late = 0, 2, 3.0, 20.0  # a bite reaches 4.5 m, and dodges begin 3 m further
+    cases = [
+        (IDLE, 0.0, bite, 2.0, True, 0.0, 0.0),
+        (TELEGRAPH, soon, bite, 2.0, True, 0.0, 0.6),
+        (TELEGRAPH, late, bite, 2.0, True, 0.0, 0.0),
+        (ACTIVE, late, bite, 7.0, True, 0.0, 0.6),
+        (ACTIVE, late, bite, 8.0, True, 0.0, 0.0),
+        (ACTIVE, late, bite, 2.0, False, 0.0, 0.0),
+        (ACTIVE, late, shots, 2.0, True, 0.0, 0.0),
+        (IDLE, 0.0, bite, 30.0, True, soon, 0.42),
+        (IDLE, 0.0, bite, 30.0, True, late, 0.0),
+        (TELEGRAPH, soon, bite, 2.0, True, soon, 0.6),  # one decision for both
+    ]
+    phase, timer, attack, gap, lives, landing, share = torch.tensor(cases).repeat(30, 1).T
+    env = CombatEnv(len(phase), seed=0, machines=["Ravager"], sites=["Arena"])
+    env.reset()
+    s = env.state
+    s.phase, s.phase_timer, s.attack = phase[None], timer[None], attack[None].long()
+    s.position, s.enemy_hp = torch.zeros_like(s.position), s.enemy_hp * lives
+    s.enemy_position = torch.stack((gap + MACHINES["Ravager"].radius + 0.5, torch.zeros_like(gap))).unsqueeze(1)
+    s.land_timer[3] = landing
+    luck = torch.rand(len(phase), generator=torch.Generator().manual_seed(0))
+    assert torch.equal(Bot._dodges(env, torch.Generator().manual_seed(0)), luck < share)
 
 
 def test_acting_leaves_the_fight_alone():

@@ -11,7 +11,7 @@ from coachable.envs.combat import constants as c
 from coachable.envs.combat.damage import ACID, BURNING, FROST, PLASMA, SHOCK, Totals, damage_parts
 from coachable.envs.combat.gamepad import press
 from coachable.envs.combat.rewards import COMPONENT_SLICES
-from coachable.envs.combat.state import ACTIVE, IDLE, SAFE, STAGGER, STAGGERED
+from coachable.envs.combat.state import ACTIVE, AIR, DODGE, IDLE, RECOVER, SAFE, SLIDE, STAGGER, STAGGERED, TELEGRAPH
 from coachable.envs.combat.tables import ALL_MACHINES, AMMO, ELEMENTS, MACHINES, WEAPONS, load_table, resistance
 from coachable.envs.combat.traits import DAMAGE, KIND, MACHINE_NAMES, SPREAD
 
@@ -136,6 +136,22 @@ def test_overkill_is_clipped_before_it_is_attributed():
     assert part(components, "damage").item() == 95.0
     assert part(components, "weapon_damage").sum().item() == 95.0
     assert after["terminated"].item()
+
+
+def test_the_dead_do_nothing():
+    """Eight players: one each eats, sets a trap, dodges, slides, jumps, swings, swings hard, and shoots."""
+    pads = [press(button) for button in ("up", "down", "square", "circle", "cross", "R1", "R2")]
+    for hp in (400.0, 0.0):
+        env = still_fight("Ravager", 3.0, num_envs=8)
+        s = env.state
+        s.hp = torch.full_like(s.hp, hp)
+        hold(env, "Carja's Bane")
+        aim_at_body(env)
+        components, _ = act(env, torch.stack([*pads, SHOOT]))
+        started = torch.stack((c.BERRIES - s.berries, s.trap_type.amax(0) + 1, *s.timers[[DODGE, SLIDE, AIR]])) > 0
+        did = [*started.diagonal().tolist(), *(part(components, "damage")[0, 5:, 0] > 0).tolist()]
+        assert did == [hp > 0.0] * 8
+        assert (s.hp > 0).tolist() == [hp > 0.0] * 8
 
 
 def test_light_swings_hit_every_13_frames():
@@ -323,6 +339,35 @@ def test_a_bite_hits_once_hurts_as_the_table_says_and_a_dodge_avoids_it(machine)
             assert 0.85 * hit <= lost <= 1.15 * hit
             assert (s.timers[STAGGER].item() > 0) == (lost > 60)
             assert s.timers[SAFE].item() > 0
+
+
+def test_an_attack_hits_once_and_one_that_was_dodged_is_spent():
+    """It goes on for 40 frames within reach of two players: one is safe in its first 5, the other after the hit."""
+    env = still_fight("Ravager", 2.5, num_envs=2)
+    s = env.state
+    s.phase, s.attack = torch.full_like(s.phase, ACTIVE), torch.zeros_like(s.attack)
+    s.phase_timer, s.hits_left = torch.full_like(s.phase_timer, 40.0), torch.ones_like(s.hits_left)
+    s.lock = torch.tensor([-1.0, 0.0]).view(2, 1, 1).expand(2, 1, 2)
+    s.timers[SAFE] = torch.tensor([5.0, 0.0])
+    act(env, *[NOTHING] * 5)
+    assert (s.phase == ACTIVE).all() and (s.timers[SAFE] == 0.0).all()
+    assert (s.hits_left == 0.0).all()
+    dodged, lost = (c.PLAYER_HP - s.hp).tolist()
+    hit = MACHINES["Ravager"].hit * env.traits.attacks[DAMAGE, 0, 0, 0].item()
+    assert dodged == 0.0 and 0.85 * hit <= lost <= 1.15 * hit
+
+
+def test_the_shots_of_an_attack_are_spread_evenly_over_its_active_phase():
+    env = still_fight("Ravager", 12.0)
+    s = env.state
+    s.phase, s.attack = torch.full_like(s.phase, TELEGRAPH), torch.full_like(s.attack, 2)
+    s.phase_timer = torch.ones_like(s.phase_timer)
+    act(env, NOTHING, NOTHING)
+    # Three in 12 frames: in the 1st, 5th and 9th, of which 11, 7 and 3 have passed. 12 m take 12.9 frames of 0.93 m.
+    assert s.land_timer[:, 0, 0].tolist() == [13 - 11, 13 - 7, 13 - 3, 0]
+    assert s.hits_left.item() == 0.0
+    act(env, NOTHING, NOTHING)
+    assert s.land_timer.max().item() == 0.0 and s.phase.item() == RECOVER
 
 
 def test_a_jump_avoids_a_stomp():

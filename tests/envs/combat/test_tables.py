@@ -91,6 +91,19 @@ def test_traits_hold_every_unit_of_every_part():
     assert unit_hp(MACHINES["Ravager"], "shield") == pytest.approx(0.06 * 1.6 * 1300**0.85)
 
 
+def test_shields_and_weapons_are_in_front_and_canisters_behind():
+    """Azimuths [rad] over the whole of their ranges; elevations between -0.2 and 0.9 rad."""
+    traits = look_up_traits(machine_table(torch.device("cpu")), torch.arange(len(MACHINE_NAMES)).unsqueeze(0))
+    x, y, z = traits.offset[:, :, 0]  # (12, 22) each
+    elevation = torch.atan2(z, torch.hypot(x, y))
+    for kind, (low, high) in zip(traits.part_type[:, :, 0], ((-1.2, 1.2), (-1.6, 1.6), (1.6, 4.7)), strict=True):
+        used = kind > 0
+        azimuth = torch.remainder(torch.atan2(y, x)[used] - low, 2 * torch.pi) + low
+        for angle, a, b in ((azimuth, low, high), (elevation[used], -0.2, 0.9)):
+            assert a <= angle.min() < a + 0.1 * (b - a)
+            assert b - 0.1 * (b - a) < angle.max() <= b
+
+
 def test_weapons_are_the_papers():
     assert dict(zip(WEAPONS, AMMO, strict=True)) == {
         "Icestorm": ("Frost Bolts", "Plasma Bolts", "Shock Bolts"),

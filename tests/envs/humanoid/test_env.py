@@ -8,7 +8,7 @@ from torchrl.envs.utils import check_env_specs
 
 from coachable.domains.humanoid import humanoid_style_reward, humanoid_style_space
 from coachable.envs.humanoid import HumanoidEnv
-from coachable.envs.humanoid.observation import OBSERVATION_GROUPS
+from coachable.envs.humanoid.observation import OBSERVATION_GROUPS, suite_observation
 from coachable.transforms import coachable_env
 
 
@@ -116,15 +116,16 @@ def test_a_fall_terminates_and_time_truncates():
     current = env.reset()
     for _ in range(200):
         current = env.step(current.set("action", torch.zeros(1, 21)))["next"]
-        if current["done"].item():
+        if current["terminated"].item():
             break
-    assert current["terminated"].item()
+    assert current["terminated"].item() and current["done"].item()
     assert not current["truncated"].item()
     assert env.simulation.kinematics().head_height[0] < 1.1
     short = make_env(num_envs=1, episode_steps=3)
     current = short.reset()
     for _ in range(3):
         current = short.step(current.set("action", torch.zeros(1, 21)))["next"]
+        assert current["done"].item() == current["truncated"].item()
     assert current["truncated"].item()
     assert not current["terminated"].item()
 
@@ -196,5 +197,22 @@ def test_reward_is_task_plus_style_under_the_style_that_the_policy_saw():
     assert torch.equal(data["next", "reward"], expected)
 
 
-def test_observation_groups_add_up():
+def test_only_speeds_of_joints_are_scaled():
+    """The suite's 67 numbers, of which the last 27 are speeds in tenths, the pelvis and the gait."""
+    env = make_env(num_envs=2)
+    seen = roll(env, actions(env, 3))[-1].numpy()
+    simulation, kinematics = env.simulation, env.simulation.kinematics()
+    suite = suite_observation(simulation.positions, simulation.velocities, kinematics, env.course)
+    np.testing.assert_allclose(seen[:, :40], suite[:, :40], atol=1e-6)
+    np.testing.assert_allclose(seen[:, 40:67], 0.1 * simulation.velocities, atol=1e-6)
+    np.testing.assert_allclose(seen[:, 67:71], kinematics.pelvis_quaternion, atol=1e-6)
+    np.testing.assert_allclose(seen[:, 71:], env.gait.observe(), atol=1e-6)
     assert sum(width for _, width, _ in OBSERVATION_GROUPS) == 82
+
+
+def test_threads_share_the_physics_and_change_no_number():
+    """One thread is the caller's own, so that there is no pool to wake."""
+    one, two = (HumanoidEnv(num_envs=3, num_threads=n, seed=0) for n in (1, 2))
+    assert (one.simulation.num_threads, two.simulation.num_threads) == (0, 2)
+    assert torch.equal(roll(one, actions(one, 3)), roll(two, actions(two, 3)))
+    two.close()

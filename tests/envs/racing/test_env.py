@@ -17,7 +17,7 @@ from coachable.domains.racing import (
 from coachable.envs.racing import RacingEnv
 from coachable.envs.racing.physics.parameters import Resources
 from coachable.envs.racing.physics.state import HEATS, ROW, WEARS
-from coachable.envs.racing.race.counter_rng import uniforms
+from coachable.envs.racing.race.counter_rng import normal, uniforms
 from coachable.envs.racing.race.driver import LineFollower
 from coachable.envs.racing.race.observation import observation_groups
 from coachable.envs.racing.race.referee import TELEMETRY
@@ -77,6 +77,16 @@ def test_uniform_numbers_are_uniform():
     assert abs(u.mean() - 0.5) < 5 / math.sqrt(12 * u.numel())
     flat = u.reshape(50, -1)
     assert (torch.corrcoef(flat) - torch.eye(50)).abs().max() < 6 / math.sqrt(2000)
+
+
+def test_pairs_of_normal_numbers_are_independent():
+    """On a grid of uniform numbers; the second of a pair lies a quarter turn on, so that their squares add up."""
+    u1, u2 = torch.meshgrid((torch.arange(400.0) + 0.5) / 400, (torch.arange(200.0) + 0.5) / 200, indexing="ij")
+    first, second = normal(u1, u2), normal(u1, (u2 + 0.25) % 1.0)
+    torch.testing.assert_close(first.square() + second.square(), -2 * (1 - u1).log(), rtol=1e-4, atol=1e-6)
+    assert abs((first * second).mean()) < 1e-4
+    for power, moment in ((1, 0.0), (2, 1.0), (3, 0.0), (4, 3.0)):
+        assert abs(first.pow(power).mean() - moment) < 0.05
 
 
 def test_partial_reset_touches_no_other_race():

@@ -1,6 +1,8 @@
 """What cars feel and see of each other and of the road, against closed forms and a loop over cars in numpy."""
 
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,11 +13,12 @@ from coachable.envs.racing.circuit.circuits import load_track
 from coachable.envs.racing.circuit.track import Course
 from coachable.envs.racing.physics.contact import Bodies
 from coachable.envs.racing.physics.dynamics import AIR_DENSITY, GRAVITY, WheelSet, total_mass, wheel_loads
-from coachable.envs.racing.physics.parameters import load_car
+from coachable.envs.racing.physics.parameters import CARS, load_car
 from coachable.envs.racing.physics.state import HEATS, ROW, SPINS, WEARS, CarState
-from coachable.envs.racing.race.observation import opponents_seen, own_columns
+from coachable.envs.racing.race.observation import opponents_seen, own_car, own_columns
 from coachable.envs.racing.race.rescue import RESCUE_SPEED, back_on_track
 from coachable.envs.racing.race.run import SLIPSTREAM_LENGTH, SLIPSTREAM_WIDTH, Run, look_around, slipstream, tyre_view
+from coachable.envs.racing.race.scenarios import _longest_straight, rolling_cars
 
 F64 = torch.float64
 
@@ -45,6 +48,41 @@ def test_finding_a_place_gives_it_back(ring):
     for found, arc, _ in (ring.find(x, y), ring.project(x, y, s + 20.0), ring.project(x, y, s - 20.0)):
         torch.testing.assert_close(found, s, atol=2e-3, rtol=0)
         torch.testing.assert_close(arc.offset, offset, atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("straight", "start", "length"),
+    [
+        ("--((---((-", 4, 3),
+        ("--((--((--", 8, 4),  # over the line
+        ("-((((((((-", 9, 2),
+        ("((--((((--", 2, 2),  # the first of two
+        ("((((((((((", 0, 0),
+        ("----------", 0, 10),
+    ],
+)
+def test_the_longest_straight(straight, start, length):
+    """Nodes 4 m apart, of which some lie in turns of 500 m."""
+    table = torch.zeros(10, 8)
+    table[:, 4] = torch.tensor([{"-": 0.0005, "(": -0.002}[sign] for sign in straight])
+    assert _longest_straight(SimpleNamespace(table=table, spacing=4.0)) == (4.0 * start, 4.0 * length)
+
+
+@pytest.mark.parametrize("name", CARS)
+def test_a_rolling_car_has_a_gear_and_no_slip(ring, name):
+    """One gear per 14 m/s up to the fifth, which every car has."""
+    car = load_car(name)
+    speed = torch.tensor([0.0, 13.9, 14.1, 29.0, 55.9, 56.1, 69.9, 70.1, 95.0], dtype=F64)
+    s, offset, error = torch.linspace(0.0, 1000.0, 9, dtype=F64), torch.full((9,), -2.0, dtype=F64), speed / 100.0
+    packed = rolling_cars(ring, car, s, offset, error, speed)
+    state = CarState(*packed.unbind(0))
+    assert state.gear.tolist() == [1, 1, 2, 3, 4, 5, 5, 5, 5]
+    assert state.gear.max() <= car.top_gear
+    x, y, along = ring.place(s, offset)
+    for found, expected in ((state.x, x), (state.y, y), (state.yaw, along + error), (state.vx, speed)):
+        torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(packed[SPINS] * car.wheel_radius, speed.expand(4, 9))
+    assert packed[HEATS].abs().max() == packed[WEARS].abs().max() == state.fuel.max() == 0.0
 
 
 def test_wheel_loads_hold_the_car_in_equilibrium():
@@ -170,3 +208,27 @@ def test_a_driver_sees_the_scaled_state():
     torch.testing.assert_close(gear, s.gear / 8.0)
     assert ((rpm >= 0) & (rpm <= 1.1)).all() and ((torque >= 0) & (torque <= 1.0)).all()
     assert (block("tyre_load").sum(0) * 5000.0 > 1000.0 * 9.81).all()
+
+
+def test_the_engine_turns_with_the_driven_wheels():
+    """Both axles by their shares of the torque; its torque is limited by power over speed, and ends at full speed."""
+    car = replace(load_car("gt3"), drive_share_front=0.4)
+    wheels, packed, factor = (
+        WheelSet.of(car, dtype=F64),
+        torch.zeros(29, 4, dtype=F64),
+        torch.tensor([0.5, 1.0, 4.0, 5.0]),
+    )
+    packed[ROW["gear"]], packed[ROW["throttle"]] = (
+        torch.tensor([1.0, 3.0, 6.0, 6.0]),
+        torch.tensor([1.0, 0.5, 1.0, 1.0]),
+    )
+    packed[SPINS] = torch.tensor([[40.0], [50.0], [60.0], [70.0]]) * factor
+    run = Run(*torch.ones(25, 4, dtype=F64).unbind(0))
+    columns = own_car(car, wheels, packed, run, tyre_view(car, wheels, packed, torch.ones(4, dtype=F64)), 1000.0)
+    rpm, gear, torque = columns[own_columns("powertrain")]
+    omega = (0.4 * 45.0 + 0.6 * 65.0) * factor * torch.tensor([3.15, 1.8, 1.09, 1.09], dtype=F64) * car.final_drive
+    torch.testing.assert_close(rpm * car.rpm_max, omega * 60.0 / (2.0 * math.pi))
+    torch.testing.assert_close(gear * 8.0, packed[ROW["gear"]])
+    expected = torch.tensor([car.torque, 0.5 * car.torque, car.power / omega[2], 0.0], dtype=F64)
+    torch.testing.assert_close(torque * car.torque, expected)
+    assert rpm[2] < 1.0 < rpm[3] and expected[2] < car.torque < car.power / omega[1]

@@ -78,6 +78,18 @@ def test_a_track_from_a_file(tmp_path):
     torch.testing.assert_close(track.table[:, 4], torch.full((len(track.table),), 0.01).double(), rtol=2e-2, atol=0)
 
 
+def test_a_first_point_that_is_repeated_changes_nothing():
+    angle = np.linspace(0, 2 * np.pi, 61)
+    points = 100.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    left, right = 6.0 + np.cos(angle), 7.0 + np.sin(angle)
+    once = Track.from_points(points[:-1], left[:-1], right[:-1])
+    twice = Track.from_points(points, left, right)
+    assert twice.spacing == once.spacing
+    torch.testing.assert_close(twice.table, once.table, rtol=0, atol=1e-9)
+    widths = torch.tensor([6.0, 7.0]) + once.table[:, :2] / 100.0
+    torch.testing.assert_close(once.table[:, 5:7], widths, atol=0.01, rtol=0)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -89,7 +89,7 @@ class Track:
         ends = np.linalg.norm(points[0] - points[-1])
         steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
         if ends < 1e-6:  # the first point repeated
-            points, left, right, steps = points[:-1], left[:-1], right[:-1], steps[:-1]
+            points, left, right = points[:-1], left[:-1], right[:-1]
         elif ends > max(3.0 * steps.max(), _CLOSURE):
             raise ValueError(f"track {name!r} is open: {ends:.1f} m between its ends, expected a closed centre line")
         closed = np.vstack([points, points[:1]])

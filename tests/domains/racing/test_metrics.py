@@ -4,8 +4,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from coachable.domains.combat.metrics import CombatMeasures
-from coachable.domains.humanoid.metrics import HumanoidMeasures
 from coachable.domains.racing.metrics import RacingMeasures
 from coachable.envs.racing.race.features import GAPS
 from coachable.envs.racing.race.observation import own_columns
@@ -62,26 +60,3 @@ def test_slip_ratios_are_measured_where_they_are_asked_for():
     step["next", "style_features"][0, :4] = torch.tensor([0.1, 0.2, 0.3, 0.4])
     found = RacingMeasures("drift").step(step)
     assert (found["slip_ratio_front"].item(), found["slip_ratio_rear"].item()) == pytest.approx((0.3, 0.4))
-
-
-def test_fights_are_judged_by_damage_under_a_style():
-    nan = float("nan")
-    record = {
-        "damage": torch.tensor([[0.0], [5.0], [5.0], [5.0]]),
-        "requested": torch.tensor([[0.0], [nan], [0.0], [2.0]]),
-    }
-    measures = CombatMeasures()
-    assert measures.judged(record)[:, 0].tolist() == [False, False, True, True]
-    assert measures.complies(record)[:, 0].tolist() == [False, False, False, True]
-
-
-def test_walking_is_judged_by_footsteps():
-    nan = float("nan")
-    record = {
-        "pose_held": torch.tensor([[1.0], [1.0], [0.0], [1.0]]),
-        "step_length": torch.tensor([[nan], [0.5], [0.5], [0.3]]),
-        "step_length_error": torch.tensor([[nan], [0.01], [0.01], [0.21]]),
-    }
-    measures = HumanoidMeasures()
-    assert measures.judged(record)[:, 0].tolist() == [False, True, True, True]
-    assert measures.complies(record)[:, 0].tolist() == [False, True, False, False]
