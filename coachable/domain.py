@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.metadata import entry_points
 from inspect import signature
 from itertools import product
@@ -208,8 +209,7 @@ class Domain:
             reward: style reward; default: the domain's own.
             **options: further arguments of `make_env`.
         """
-        accepted = signature(self.make_env).parameters
-        if "num_threads" in accepted or any(p.kind is p.VAR_KEYWORD for p in accepted.values()):
+        if _takes(self.make_env, "num_threads"):
             options["num_threads"] = num_threads
         simulation = self.make_env(num_envs=num_envs, **options)
         reward = self.make_reward(space) if reward is None else reward
@@ -220,6 +220,15 @@ class Domain:
         if isinstance(self.grid, Mapping):
             return [dict(zip(self.grid, values, strict=True)) for values in product(*self.grid.values())]
         return [dict(cell) for cell in self.grid]
+
+
+def _takes(function: Any, argument: str) -> bool:
+    """Whether a function accepts a keyword argument; of a class, whether its constructor does."""
+    while isinstance(function, partial) or hasattr(function, "__wrapped__"):
+        function = function.func if isinstance(function, partial) else function.__wrapped__
+    # A class of TorchRL seems to take anything, because its metaclass does.
+    parameters = signature(function.__init__ if isinstance(function, type) else function).parameters
+    return argument in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values())
 
 
 def domain_names() -> list[str]:

@@ -1,5 +1,7 @@
 """What a domain gets that declares only an environment, a style space and a style reward."""
 
+from functools import partial, wraps
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -101,6 +103,21 @@ def test_time_is_asked_of_the_environment_when_it_is_first_read():
     assert (domain.control_step, domain.episode_steps, domain.control_step) == (0.25, 20, 0.25)
     assert made == [1, 1]
     assert (time_per_step(StyleEchoEnv), steps_per_episode(StyleEchoEnv)) == (1.0, 1000)
+
+
+@pytest.mark.parametrize(
+    ("make_env", "expected"),
+    [
+        (StyleEchoEnv, None),
+        (partial(StyleEchoEnv, resumable=False), None),
+        (lambda num_envs, num_threads: StyleEchoEnv(num_envs + num_threads - 1), 3),
+        (wraps(StyleEchoEnv)(lambda **options: StyleEchoEnv(**options)), None),
+    ],
+)
+def test_threads_reach_an_environment_that_takes_them(make_env, expected):
+    reward = StyleReward(echo_space(), {"target": Term(lambda features, style: style["target"], ("target",))})
+    domain = Domain("echo", make_env, echo_space, lambda space: reward)
+    assert domain.styled_env(echo_space(), 1, num_threads=3).batch_size == (expected or 1,)
 
 
 def test_the_simulation_of_a_row_lies_below_transforms_and_batches():
