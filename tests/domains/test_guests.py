@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import sys
 import threading
 from pathlib import Path
 
@@ -115,6 +116,12 @@ def test_coach(run, guest):
         page.stop()
         session.close()
         server.stop()
+
+
+def test_without_its_package_the_domain_is_named(run, guest, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "path", [folder for folder in sys.path if not (Path(folder) / f"{guest}.py").is_file()])
+    assert main(["evaluate", run, "--out", str(tmp_path)]) == 2
+    assert f"unknown domain '{guest}': expected one of ['combat'," in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", GUESTS)
