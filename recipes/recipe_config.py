@@ -154,9 +154,10 @@ def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
         raise SystemExit("error: a resumed run keeps its preset: leave preset= out, or start anew with init_from=PATH")
     presets = [f"{config_name}/{preset}" for preset in chosen["preset"]]
     firsts = [f"{group}={choices[0]}" for group, choices in chosen.items() if group != "preset"]
-    known = _composed(config_name, *firsts, f"preset={presets[0]}")
-    for override in overrides:
-        if override.key_or_group not in groups and not override.key_or_group.startswith("hydra"):
+    checked = [o for o in overrides if o.key_or_group not in groups and not o.key_or_group.startswith("hydra")]
+    if checked:
+        known = _composed(config_name, *firsts, f"preset={presets[0]}")
+        for override in checked:
             _check(override, known)
     # Hydra's parser takes overrides in one piece only, not before and after its options.
     return [*options, *(a for a in given if not a.startswith("preset=")), f"preset={','.join(presets)}"]

@@ -1,7 +1,7 @@
 """Fixtures that several test folders share."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,14 @@ if os.environ.get("COACHABLE_SANITIZE") == "1":  # see CONTRIBUTING.md
     native._FLAGS += ("-fsanitize=address,undefined", "-fno-sanitize-recover=undefined", "-g")
     # Each tensor's memory of its own, so that what lies beyond its end is known to be nobody's.
     memory.Arena.empty = lambda _, *shape, dtype=torch.float32: torch.empty(shape, dtype=dtype)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_waiting_for_the_disk() -> Iterator[None]:
+    """What is flushed survives the end of a process; only a power cut, which no test causes, would undo it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _: None)
+        yield
 
 
 @pytest.fixture

@@ -345,5 +345,5 @@ def test_training_on_a_gymnasium_environment(tmp_path):
 
 
 def test_the_documented_program_runs():
-    text = (Path(__file__).resolve().parent.parent / "docs" / "bring_your_gymnasium_env.md").read_text()
+    text = (Path(__file__).resolve().parent.parent / "docs" / "guides" / "gymnasium.md").read_text()
     exec("\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)), {})

@@ -153,7 +153,7 @@ class MixedActionSpec(TensorSpec):
         return action
 
     def is_in(self, val: Tensor) -> bool:
-        """Whether every head is a one-hot and every axis in [-1, 1]."""
+        """Return whether every head is a one-hot and every axis in [-1, 1]."""
         if val.shape[-len(self.shape) :] != self.shape or val.dtype != self.dtype:
             return False
         one_hots, axes = self.heads.split(val)

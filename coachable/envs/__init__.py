@@ -1,1 +1,1 @@
-"""Domains. Each folder is one; no domain imports another."""
+"""Simulators. Each folder is one; none imports another."""

@@ -1,4 +1,4 @@
-"""What QR-SAC, RAC, Cat-RAC and categorical SAC share: one actor-critic loss with four things left open."""
+"""The base class of QR-SAC, RAC, Cat-RAC and categorical SAC: an actor-critic loss with four methods left open."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class ActorCriticLoss(SACLoss):
 
     Subclasses define `_sample` (action and negative entropy), `_values` (critic output to scalars), `_next_value`
     (target critics' output to what is bootstrapped from) and `_errors` (regression of the critics on the target).
-    They are not for `loss` in their names, which TorchRL wraps.
+    Their names must not contain `loss`, because TorchRL wraps such methods.
 
     Args:
         actor_network: Policy, from `make_gaussian_actor` or `make_mixed_actor`.
@@ -105,34 +105,34 @@ class ActorCriticLoss(SACLoss):
     # What a subclass defines.
 
     def _sample(self, policy: MixedAction, *, relaxed: bool) -> tuple[Tensor, Tensor]:
-        """Action (..., A) and estimate of the negative entropy (...,): SAC's log-density of that same action."""
+        """Return an action (..., A) and a negative entropy (...,), here the action's log-density as in SAC."""
         return policy.relaxed_sample() if relaxed else policy.hard_sample()
 
     def _values(self, output: Tensor) -> Tensor:
-        """Critic output (K, ..., out) to values (K, ...)."""
+        """Return values (K, ...) from critic output (K, ..., out)."""
         raise NotImplementedError
 
     def _next_value(self, output: Tensor) -> Tensor:
-        """Target critics' output (K, ..., out) to the successor's value (...,) or its quantiles (..., M)."""
+        """Return the successor's value (...,) or quantiles (..., M) from the target critics' output (K, ..., out)."""
         return self._values(output).min(0).values
 
     def _soft_target(
         self, reward: Tensor, next_value: Tensor, log_prob: Tensor, terminated: Tensor, steps: Tensor | None
     ) -> Tensor:
-        """Target with the entropy of the successor inside the discount: none at terminals."""
+        """Return the target; the successor's entropy is inside the discount, so that terminals have none."""
         if next_value.ndim > log_prob.ndim:
             log_prob = log_prob.unsqueeze(-1)
         soft = next_value - self._alpha * log_prob
         return bootstrap_target(reward, soft, terminated, self._gamma, steps)
 
     def _errors(self, output: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-        """Losses (K, ...) of the critics against the target, and their absolute TD errors (K, ...)."""
+        """Return the losses (K, ...) of the critics against the target, and their absolute TD errors (K, ...)."""
         raise NotImplementedError
 
     # What TorchRL calls.
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Policy loss `mean(alpha log pi - min_k Q_k)` with reparameterised, relaxed actions; no critic gradient.
+        """Return the policy loss `mean(alpha log pi - min_k Q_k)` of relaxed actions, without critic gradient.
 
         Returns:
             The loss, and `log_prob`, the negative entropy (...,) of each state.
@@ -147,7 +147,7 @@ class ActorCriticLoss(SACLoss):
             return self._reduced(loss, tensordict), {"log_prob": log_prob.detach()}
 
     def qvalue_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Critic loss, summed over the critics; the target uses the policy's parameters as they are now.
+        """Return the critic loss, summed over the critics; the target uses the policy's present parameters.
 
         Returns:
             The loss, and `td_error` (...,), the largest of the critics'.
@@ -160,12 +160,12 @@ class ActorCriticLoss(SACLoss):
             return loss, {"td_error": errors.detach().amax(0), **self._extra_metrics(target)}
 
     def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """TorchRL's name of `qvalue_loss`."""
+        """Return `qvalue_loss`; TorchRL calls it by this name."""
         return self.qvalue_loss(tensordict)
 
     @torch.no_grad()
     def compute_target(self, tensordict: TensorDictBase) -> Tensor:
-        """Bootstrap target, (...,) or (..., M), from hard actions of the current policy and the target critics."""
+        """Return the target, (...,) or (..., M), from hard actions of the present policy and the target critics."""
         successor = tensordict.get("next")
         with self._without_dropout():
             policy = self._policy_at(successor)
@@ -184,7 +184,7 @@ class ActorCriticLoss(SACLoss):
 
     @dispatch  # pyright: ignore[reportArgumentType]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Both losses from the same parameters.
+        """Return both losses, computed from the same parameters.
 
         Args:
             tensordict: Batch; only the priority (`td_error`) is written into it.
@@ -228,7 +228,7 @@ class ActorCriticLoss(SACLoss):
     # Pieces.
 
     def _extra_metrics(self, target: Tensor) -> dict[str, Tensor]:
-        """Further scalars of the critic update, for logging."""
+        """Return further scalars of the critic update, for logging."""
         return {}
 
     def _policy_at(self, tensordict: TensorDictBase) -> MixedAction:
@@ -236,7 +236,7 @@ class ActorCriticLoss(SACLoss):
             return self._policy.read(tensordict)
 
     def _critics_at(self, tensordict: TensorDictBase, action: Tensor | None, params: TensorDictBase) -> Tensor:
-        """Raw output (K, ..., out) of all critics, at the stored action or another one."""
+        """Return the raw output (K, ..., out) of all critics at the stored action or another one."""
         inputs = tensordict.select(*self.qvalue_network.in_keys, strict=False)
         if action is not None:
             inputs.set(self.tensor_keys.action, action)
@@ -256,11 +256,11 @@ class ActorCriticLoss(SACLoss):
         return cast(Tensor, self.value_estimator.gamma)
 
     def _critic_width(self) -> int:
-        """Outputs of one critic."""
+        """Return the number of outputs of one critic."""
         return 1
 
     def _scalar(self, tensordict: TensorDictBase, key: Any, required: bool = True) -> Any:
-        """Entry (..., 1) or (...,) as (...,); None if it is missing and not required."""
+        """Return an entry (..., 1) or (...,) as (...,); None if it is missing and not required."""
         value = tensordict[key] if required else tensordict.get(key, None)
         if value is None or value.ndim == tensordict.ndim:
             return value
@@ -279,7 +279,7 @@ class ActorCriticLoss(SACLoss):
 
     @contextmanager
     def _without_dropout(self) -> Iterator[None]:
-        """Evaluation mode for the target: dropout there is noise in what the critics regress on."""
+        """Switch dropout off for the target, where it would be noise in what the critics regress on."""
         training = [m for m in self._dropouts if m.training]
         for module in training:
             module.training = False

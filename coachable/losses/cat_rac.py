@@ -17,7 +17,7 @@ class CatRACLoss(RACLoss):
 
     Values are decoded means; the minimum over critics is taken of those. `td_error` is the absolute difference of the
     target and the decoded mean. The metadata of `qvalue_loss` and the output of `forward` hold `clipped_fraction`, the
-    share of targets outside the support (algorithms.md, section 3).
+    share of targets outside the support (paper, Appendix B; Farebrother et al. 2024).
 
     Build the critics with `make_hl_gauss_critic`, so that they start at a value of 0 instead of the middle of the
     support.

@@ -18,7 +18,7 @@ _BLOCK_ELEMENTS_DEVICE = 1 << 24
 def bootstrap_target(
     reward: Tensor, next_value: Tensor, terminated: Tensor, gamma: Tensor | float, steps: Tensor | None = None
 ) -> Tensor:
-    """TD target `R + gamma^k (1 - d) V'` (algorithms.md, sections 1-3).
+    """Return the TD target `R + gamma^k (1 - d) V'`.
 
     The value of a terminal successor is selected out, not multiplied by zero: what an environment emits after the end
     may be NaN, and NaN times zero is NaN.
@@ -74,7 +74,7 @@ def pessimistic_quantiles(quantiles: Tensor, target_min: TargetMin = "vector") -
 
 
 def quantile_midpoints(num_quantiles: int, like: Tensor) -> Tensor:
-    """Quantile fractions `(2i - 1) / (2M)`, i = 1..M, with the device and type of `like`."""
+    """Return the quantile fractions `(2i - 1) / (2M)`, i = 1..M, with the device and type of `like`."""
     index = torch.arange(num_quantiles, device=like.device, dtype=like.dtype)
     return (index + 0.5) / num_quantiles
 
@@ -88,7 +88,7 @@ def quantile_huber_loss(
     quantile_reduction: QuantileReduction = "mean",
     divide_by_kappa: bool = True,
 ) -> Tensor:
-    """Quantile regression with the Huber loss, every prediction against every target (QR-DQN; IQN's division).
+    """Return the quantile Huber loss of every prediction against every target (QR-DQN, IQN).
 
     `|tau_i - 1{u_ij < 0}| L_kappa(u_ij) / kappa` with `u_ij = target_j - prediction_i`.
 

@@ -1,4 +1,4 @@
-"""How the losses read a policy: whatever actor TorchRL is given becomes one `MixedAction` per call."""
+"""`PolicyReader`: turns the output of any supported TorchRL actor into a `MixedAction`."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from coachable.distributions.mixed_action import MixedAction
 class PolicyReader:
     """Evaluates the deterministic part of an actor and wraps its parameters in a `MixedAction`.
 
-    The distribution that the actor would build is passed over: building a `TanhNormal` costs more than sampling one,
-    and it samples and scores in separate steps, which is wrong where tanh saturates (algorithms.md, section 11).
+    The actor's own distribution is not built. Building a `TanhNormal` costs more than sampling one. It also samples and
+    scores in separate steps, which gives wrong densities where tanh saturates (see `sample_tanh_gaussian`).
 
     Args:
         actor: A `ProbabilisticActor` with a `MixedAction` or a `TanhNormal`.
@@ -72,7 +72,7 @@ class PolicyReader:
         self.body = TensorDictSequential(*cast(Any, actor.module)[:-1])
 
     def read(self, tensordict: TensorDictBase) -> MixedAction:
-        """Distribution at the states of `tensordict`, which is left unchanged."""
+        """Return the distribution at the states of `tensordict`, which stays unchanged."""
         outputs = self.body(tensordict.select(*self.body.in_keys, strict=False))
         parameters = {name: outputs.get(key) for name, key in self._parameters}
         if self._heads is None:
@@ -81,7 +81,7 @@ class PolicyReader:
 
 
 def _number_or_tensor(bound: Any) -> Any:
-    """A bound that is the same everywhere as a number, because ±1 needs no arithmetic; any other as a tensor."""
+    """Return a bound as a number if all its entries are equal (±1 needs no arithmetic), otherwise as a tensor."""
     tensor = torch.as_tensor(bound, dtype=torch.float32)
     first = tensor.flatten()[0].item()
     return first if bool((tensor == first).all()) else tensor

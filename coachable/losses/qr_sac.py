@@ -27,8 +27,8 @@ class QRSACLoss(ActorCriticLoss):
 
     Target `y_j = R + gamma^k (1 - d)(Z_j - alpha log pi(a'|s'))` with the quantiles Z of the target critic of lower
     mean; critic loss the quantile Huber loss of every prediction against every y_j, summed over critics; policy loss
-    `mean(alpha log pi - min_c mean_i Z_ci)` (algorithms.md, section 2). `td_error` is the absolute difference of the
-    means of target and prediction.
+    `mean(alpha log pi - min_c mean_i Z_ci)` (paper, Appendix B; Wurman et al. 2022). `td_error` is the absolute
+    difference of the means of target and prediction.
 
     Args:
         actor_network: tanh-Gaussian policy, from `make_gaussian_actor`, or `make_mixed_actor` with axes only.

@@ -17,11 +17,11 @@ from coachable.ranges import COUNT
 class RACLoss(ActorCriticLoss):
     """Loss of RAC with scalar critics, for mixed, purely continuous and purely categorical actions.
 
-    The log-density of SAC's one sample gives way to `R(s) = -[sum of exact categorical entropies + sum of sampled
-    entropies of the axes]`:
+    `R(s) = -[sum of exact categorical entropies + sum of sampled entropies of the axes]` replaces the log-density of
+    SAC's one sample:
     `L_pi = mean(alpha R - min_k Q_k(s, relaxed action))`,
     `y = r + gamma (1 - d)(min_k Q_k(s', hard action) - alpha R(s'))`,
-    `L_Q = sum_k 1/2 mean (Q_k - y)^2` (algorithms.md, sections 1 and 3.1).
+    `L_Q = sum_k 1/2 mean (Q_k - y)^2` (paper, Appendix B).
 
     Args:
         actor_network: Policy, from `make_mixed_actor` or `make_gaussian_actor`.

@@ -1,4 +1,4 @@
-"""The replay buffer with event tables and multi-tables (paper, Stratified Sampling; algorithms.md sections 6 and 7)."""
+"""The replay buffer with event tables and multi-tables (paper, Appendix B, Stratified Sampling)."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -186,7 +186,7 @@ class EventTableBuffer(TensorDictReplayBuffer):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the tables; `table` in a sample is the position here."""
+        """Names of the tables; `table` in a sample is an index into them."""
         return self.regions.names
 
     def __len__(self) -> int:
@@ -200,7 +200,7 @@ class EventTableBuffer(TensorDictReplayBuffer):
         return super().__getitem__(index)
 
     def table(self, name: str) -> TensorDictBase:
-        """Records of one table, oldest first, without transforms.
+        """Return the records of one table, oldest first, without transforms.
 
         Raises:
             KeyError: If there is no such table.
@@ -221,7 +221,7 @@ class EventTableBuffer(TensorDictReplayBuffer):
         return {**super().stats(), **tables}
 
     def extend(self, tensordicts: TensorDictBase, *, worker: int = 0, update_priority: bool | None = None) -> Tensor:
-        """Adds steps; the input is left as it is.
+        """Add steps; the input is left as it is.
 
         Args:
             tensordicts: `(steps,)`, time-major, or `(num_envs, time)`, as collectors yield them.
@@ -243,11 +243,11 @@ class EventTableBuffer(TensorDictReplayBuffer):
         return index
 
     def add(self, data: TensorDictBase) -> Tensor:
-        """Adds one step; see `extend`."""
+        """Add one step; see `extend`."""
         return self.extend(data.unsqueeze(0))
 
     def finish(self) -> Tensor:
-        """Ends every open episode where its data ends, for instance because the environments are going to be reset.
+        """End every open episode where its data ends, for instance because the environments are going to be reset.
 
         Held back n-step sums are written, bootstrapping from the last state seen, and no later window reaches back over
         this point. Call it after loading a checkpoint, too, unless the environments were restored with it.
@@ -261,25 +261,25 @@ class EventTableBuffer(TensorDictReplayBuffer):
         return index
 
     def update_tensordict_priority(self, data: TensorDictBase) -> None:
-        """Sets priorities from `priority_key` of a sample; of several labels of one record the largest counts."""
+        """Set priorities from `priority_key` of a sample; of several labels of one record the largest counts."""
         if self._sampler.prioritized:
             self.update_priority(data.get("index"), data.get(self.priority_key))
 
     def update_priority(self, index: Tensor, priority: Tensor) -> None:
-        """Sets priorities of slots; see `StratifiedSampler.update_priority`."""
+        """Set priorities of slots; see `StratifiedSampler.update_priority`."""
         with self._replay_lock, self._write_lock:
             self._sampler.update_priority(index, priority)
 
     def mark_update(self, index: int | Tensor) -> None:
-        """Does nothing: records are written by `extend` alone, which sets their priorities."""
+        """Do nothing: records are written by `extend` alone, which sets their priorities."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything, tensors and plain containers only."""
+        """Return the whole state as tensors and plain containers."""
         with self._replay_lock:
             return {"_storage": self._storage.state_dict(), "_batch_size": self._batch_size, **self._light_state()}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restores `state_dict`; the tables must be the same.
+        """Restore `state_dict`; the tables must be the same.
 
         Raises:
             ValueError: If tables, horizon or prioritisation differ.
@@ -292,7 +292,7 @@ class EventTableBuffer(TensorDictReplayBuffer):
             self._batch_size = state_dict["_batch_size"]
 
     def dumps(self, path: Path | str) -> None:
-        """Saves the buffer to a folder, as `.npy` files and tensors, without pickle."""
+        """Save the buffer to a folder, as `.npy` files and tensors, without pickle."""
         path = Path(path).absolute()
         path.mkdir(parents=True, exist_ok=True)
         with self._replay_lock:
@@ -300,7 +300,7 @@ class EventTableBuffer(TensorDictReplayBuffer):
             save_state({"_batch_size": self._batch_size, **self._light_state()}, path / "state.pt")
 
     def loads(self, path: Path | str) -> None:
-        """Restores what `dumps` saved, executing nothing from it; the tables must be the same.
+        """Restore what `dumps` saved, executing nothing from it; the tables must be the same.
 
         Raises:
             CheckpointError: If files are missing, damaged or of another kind.
@@ -315,7 +315,7 @@ class EventTableBuffer(TensorDictReplayBuffer):
             self._batch_size = state["_batch_size"]
 
     def _light_state(self) -> dict[str, Any]:
-        """All but the records."""
+        """Return the state without the records."""
         rng = None if self._rng is None else {"state": self._rng.get_state().clone(), "device": str(self._rng.device)}
         return {
             "_writer": self._writer.state_dict(),

@@ -1,4 +1,4 @@
-"""What the tables are filled by: which event fired at a step, and which table a step belongs to.
+"""Events and routes: which events fired at a step, and which table a step belongs to.
 
 An event predicate is any object with `names`, one per event table, and `__call__(steps)`, which maps a flat tensordict
 of transitions to booleans `(steps, len(names))`. A route has `names` too and returns the table of each step, integers
@@ -26,7 +26,7 @@ class EventPredicate(Protocol):
     names: tuple[str, ...]
 
     def __call__(self, steps: TensorDictBase) -> Tensor:
-        """Maps transitions `(steps,)` to booleans `(steps, len(names))`."""
+        """Map transitions `(steps,)` to booleans `(steps, len(names))`."""
         ...
 
 
@@ -37,12 +37,12 @@ class Route(Protocol):
     names: tuple[str, ...]
 
     def __call__(self, steps: TensorDictBase) -> Tensor:
-        """Maps transitions `(steps,)` to table numbers `(steps,)`, each in `[0, len(names))`."""
+        """Map transitions `(steps,)` to table numbers `(steps,)`, each in `[0, len(names))`."""
         ...
 
 
 class StyleEvents:
-    """Event i is admitted iff the trajectory's weight w_i is set and the event fired (paper, Stratified Sampling).
+    """Admit event i if the trajectory's weight w_i is set and the event fired (paper, Appendix B, Stratified Sampling).
 
     Args:
         names: Names of the styles, in the order of the event columns; the tables are named after them.
@@ -87,7 +87,7 @@ class StyleEvents:
 
     @classmethod
     def of(cls, space: "object", extra: Sequence[str] = (), event_admission: str = "nonzero") -> "StyleEvents":
-        """One event per `Weight` of a `StyleSpace`, in the space's order.
+        """Return events for each `Weight` of a `StyleSpace`, in the space's order.
 
         Args:
             space: A `coachable.styles.StyleSpace`.
@@ -201,7 +201,7 @@ class PredicateRoute:
 
 
 def checked_events(predicate: EventPredicate, steps: TensorDictBase) -> Tensor:
-    """Evaluates a predicate.
+    """Evaluate a predicate.
 
     Raises:
         ValueError: If the result is not boolean `(steps, len(names))`.
@@ -218,7 +218,7 @@ def checked_events(predicate: EventPredicate, steps: TensorDictBase) -> Tensor:
 
 
 def checked_route(route: Route, steps: TensorDictBase) -> Tensor:
-    """Evaluates a route.
+    """Evaluate a route.
 
     Raises:
         ValueError: If the result is not integer `(steps,)` or names no table.

@@ -104,7 +104,7 @@ def read_records(storage: Any, folder: Path) -> int:
 
 
 def record_bytes(storage: Any) -> int:
-    """What the records of a storage take on disk."""
+    """Return the bytes that the records of a storage take on disk."""
     if not len(storage):
         return 0
     first = storage.get(slice(0, 1))

@@ -1,4 +1,4 @@
-"""n-step transitions from a stream of one-step transitions (algorithms.md section 2)."""
+"""n-step transitions from a stream of one-step transitions."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -57,7 +57,7 @@ class NStep:
         return 0 if self._steps is None else len(self._steps)
 
     def push(self, data: TensorDictBase, steps: Steps) -> tuple[TensorDictBase, Steps]:
-        """Adds steps and returns the transitions that became complete, in the order in which they did.
+        """Add steps and return the transitions that became complete, in the order in which they did.
 
         Args:
             data: `(steps,)` one-step transitions.
@@ -69,7 +69,7 @@ class NStep:
         return self._emit(data, steps, finish=False)
 
     def flush(self) -> tuple[TensorDictBase, Steps] | None:
-        """Returns what is held back, every sum ending where the data ends; None if there is nothing."""
+        """Return what is held back, every sum ending where the data ends; None if there is nothing."""
         if self._data is None or self._steps is None:
             return None
         return self._emit(self._data, self._steps, finish=True)
@@ -132,17 +132,17 @@ class NStep:
         return out
 
     def clear(self) -> None:
-        """Forgets the held back steps."""
+        """Forget the held back steps."""
         self._data = self._steps = None
 
     def state_dict(self) -> dict[str, Any]:
-        """What is held back."""
+        """Return the steps that are held back."""
         if self._data is None or self._steps is None:
             return {}
         return {"data": self._data.to_dict(), "steps": self._steps.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any], device: torch.device | None = None) -> None:
-        """Restores what was held back."""
+        """Restore what was held back."""
         self.clear()
         if state:
             self._steps = Steps.from_state_dict(state["steps"])

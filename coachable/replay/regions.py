@@ -57,7 +57,7 @@ class Regions:
         return int((self.offsets + sizes)[sizes > 0].max(initial=0))
 
     def allocate(self, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Takes the next slots, first in first out.
+        """Take the next slots, first in first out.
 
         Args:
             table: `(records,)` table of each record, in the order in which they are appended.
@@ -79,33 +79,33 @@ class Regions:
         return slot, serial
 
     def table_of(self, slot: np.ndarray) -> np.ndarray:
-        """Table that each slot belongs to, `(slots,)`."""
+        """Return the table that each slot belongs to, `(slots,)`."""
         ascending = np.argsort(self.offsets)
         return ascending[np.searchsorted(self.offsets[ascending], slot, side="right") - 1]
 
     def slots(self, table: int) -> np.ndarray:
-        """Slots of the live records of one table, oldest first."""
+        """Return the slots of the live records of one table, oldest first."""
         size, written = int(self.sizes[table]), int(self.written[table])
         return self.offsets[table] + np.arange(written - size, written) % self.capacities[table]
 
     def unused(self) -> np.ndarray:
-        """Slots of the used prefix that were never written, `(used_prefix,)` bool."""
+        """Return which slots of the used prefix were never written, `(used_prefix,)` bool."""
         unused = np.ones(self.used_prefix, dtype=bool)
         for table in range(len(self)):
             unused[self.slots(table)] = False
         return unused
 
     def clear(self) -> None:
-        """Forgets every record."""
+        """Forget every record."""
         self.written[:] = 0
         self.version += 1
 
     def state_dict(self) -> dict[str, Any]:
-        """Names, capacities and write counts, from which cursors and fill counts follow."""
+        """Return names, capacities and write counts, from which cursors and fill counts follow."""
         return {"names": list(self.names), "capacities": self.capacities.tolist(), "written": self.written.tolist()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restores the cursors.
+        """Restore the cursors.
 
         Raises:
             ValueError: If the tables are others than the saved ones.

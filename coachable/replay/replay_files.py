@@ -16,7 +16,7 @@ __all__ = ["read_replay", "replay_bytes", "write_replay"]
 
 
 def write_replay(replay: ReplayBuffer, folder: Path) -> None:
-    """Writes the filled part of a buffer over a `LazyTensorStorage`, with the state of its writer, sampler, transforms.
+    """Write the filled part of a buffer over a `LazyTensorStorage`, with the state of its writer, sampler, transforms.
 
     Args:
         replay: the buffer.
@@ -31,7 +31,7 @@ def write_replay(replay: ReplayBuffer, folder: Path) -> None:
 
 
 def read_replay(replay: ReplayBuffer, folder: Path) -> int:
-    """Fills an empty buffer from `write_replay`'s files.
+    """Fill an empty buffer from `write_replay`'s files.
 
     Args:
         replay: a new buffer, made like the saved one.

@@ -12,7 +12,7 @@ __all__ = ["checked_horizon", "checked_minimum", "checked_proportions", "make_re
 
 
 def make_regions(capacities: Mapping[str, int], route: Route | None, events: EventPredicate | None) -> Regions:
-    """Puts the tables in order: routed tables, then event tables.
+    """Put the tables in order: routed tables, then event tables.
 
     Raises:
         ValueError: If names are missing, unknown or given twice, or a capacity is not positive.
@@ -35,7 +35,7 @@ def make_regions(capacities: Mapping[str, int], route: Route | None, events: Eve
 def checked_horizon(
     regions: Regions, routed: int, events: EventPredicate | None, horizon: int | None, num_envs: int | None
 ) -> int:
-    """Checks H_max against the tables.
+    """Check H_max against the tables.
 
     Raises:
         ValueError: If it is missing, not positive, or larger than a table.
@@ -66,7 +66,7 @@ def checked_horizon(
 
 
 def checked_proportions(names: Sequence[str], routed: int, given: Mapping[str, float] | None) -> np.ndarray:
-    """Shares of the tables in a batch.
+    """Return the shares of the tables in a batch.
 
     Args:
         names: Tables, the routed ones first.
@@ -94,7 +94,7 @@ def checked_proportions(names: Sequence[str], routed: int, given: Mapping[str, f
 
 
 def checked_minimum(regions: Regions, given: int | Mapping[str, int]) -> np.ndarray:
-    """Records below which a table is left out of batches.
+    """Return the number of records below which a table is left out of batches.
 
     Args:
         regions: The tables.

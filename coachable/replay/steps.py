@@ -38,17 +38,17 @@ class Steps:
 
     @staticmethod
     def unrelated(n: int) -> "Steps":
-        """Steps of which nobody needs to know the order."""
+        """Return the bookkeeping of steps whose order does not matter."""
         yes_no, number = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
         return Steps(number, yes_no, yes_no, np.zeros((n, 0), dtype=bool), number, number)
 
     @staticmethod
     def cat(parts: "Sequence[Steps]") -> "Steps":
-        """Concatenates."""
+        """Concatenate."""
         return Steps(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Steps)})
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Columns as tensors."""
+        """Return the columns as tensors."""
         return {f.name: torch.from_numpy(getattr(self, f.name).copy()) for f in fields(self)}
 
     @staticmethod
@@ -57,7 +57,7 @@ class Steps:
         return Steps(**{f.name: state[f.name].cpu().numpy().copy() for f in fields(Steps)})
 
     def in_episodes(self) -> "Episodes":
-        """Sorts the steps by stream and cuts them into episodes."""
+        """Sort the steps by stream and cut them into episodes."""
         order = np.argsort(self.stream, kind="stable")
         stream, ends = self.stream[order], self.ends[order]
         first_of_stream = np.ones(len(order), dtype=bool)
@@ -90,7 +90,7 @@ class Episodes:
 
 
 def flatten_time_major(data: TensorDictBase) -> tuple[TensorDictBase, int | None]:
-    """Flattens a batch so that steps of one environment stay in the order of time.
+    """Flatten a batch so that steps of one environment stay in the order of time.
 
     Args:
         data: `(steps,)`, already time-major, or `(num_envs, time)` as TorchRL's collectors and rollouts yield it.
@@ -119,7 +119,7 @@ def flatten_time_major(data: TensorDictBase) -> tuple[TensorDictBase, int | None
 
 
 def read_steps(data: TensorDictBase, num_envs: int | None, worker: int, arrived: int) -> Steps:
-    """Reads streams and episode ends; events and routes are left empty.
+    """Read streams and episode ends; events and routes are left empty.
 
     Args:
         data: `(steps,)`.

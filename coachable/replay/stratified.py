@@ -18,7 +18,7 @@ __all__ = ["StratifiedSampler", "allot"]
 
 
 def allot(batch_size: int, proportions: np.ndarray, available: np.ndarray) -> np.ndarray:
-    """Records per table: proportions renormalised over the available tables, largest remainder, at least 1 each.
+    """Share a batch among the available tables: renormalised proportions, largest remainder, at least 1 record each.
 
     Tables whose quota is below 1 get exactly 1, and the rest of the batch is shared by the others. Ties of remainders
     go to the table that comes first.
@@ -74,7 +74,7 @@ def allot(batch_size: int, proportions: np.ndarray, available: np.ndarray) -> np
 
 @dataclass
 class _Plan:
-    """What all batches of one size share until a table grows."""
+    """Counts and tables of all batches of one size; valid until a table grows."""
 
     counts: np.ndarray
     table: Tensor  # (B,) int64
@@ -118,7 +118,7 @@ class StratifiedSampler(Sampler):
         self._pending_leaves: Tensor | None = None
 
     def counts(self, batch_size: int) -> dict[str, int]:
-        """How many records of each table a batch holds at present.
+        """Return how many records of each table a batch holds at present.
 
         Raises:
             ValueError: If the buffer cannot fill such a batch.
@@ -126,7 +126,7 @@ class StratifiedSampler(Sampler):
         return dict(zip(self.regions.names, self._allot(batch_size).tolist(), strict=True))
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
-        """Draws slots, grouped by table.
+        """Draw slots, grouped by table.
 
         Returns:
             Slots `(batch_size,)` and `{"table": (batch_size,)}`, with `priority_weight` if prioritised: `(n
@@ -148,7 +148,7 @@ class StratifiedSampler(Sampler):
         return slot, info
 
     def can_sample(self, storage: Storage, batch_size: int) -> bool:
-        """Whether a batch can be drawn."""
+        """Return whether a batch can be drawn."""
         try:
             self._allot(batch_size)
         except ValueError:
@@ -156,7 +156,7 @@ class StratifiedSampler(Sampler):
         return True
 
     def extend(self, index: Tensor) -> None:
-        """Gives new records the largest priority seen so far."""
+        """Give new records the largest priority seen so far."""
         if self.prioritized and len(index):
             tree = self._tree_on(index.device)
             tree.update(index, self._largest_priority(index.device).expand(len(index)))
@@ -166,7 +166,7 @@ class StratifiedSampler(Sampler):
         self.extend(torch.as_tensor(index).reshape(-1))
 
     def update_priority(self, index: Any, priority: Any, *, storage: Storage | None = None) -> None:
-        """Sets priorities to `(|priority| + eps)^alpha`; of a slot given more than once the largest counts.
+        """Set priorities to `(|priority| + eps)^alpha`; of a slot given more than once the largest counts.
 
         Args:
             index: Slots of any shape.
@@ -229,7 +229,7 @@ class StratifiedSampler(Sampler):
         return {"priorities": tree.leaves(), "largest": self._largest_priority(tree.device).clone(), "beta": self.beta}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restores priorities.
+        """Restore priorities.
 
         Raises:
             ValueError: If only one of the two samplers is prioritised.

@@ -67,7 +67,7 @@ class SumTree:
         return self.levels[-1].sum(-1)
 
     def update(self, slot: Tensor, priority: Tensor) -> None:
-        """Sets priorities.
+        """Set priorities.
 
         Args:
             slot: Slots of any shape, possibly repeated: the largest of the given priorities then counts.
@@ -90,7 +90,7 @@ class SumTree:
         return self.levels[0].view(-1)[entry]
 
     def draw(self, region: Tensor, uniform: Tensor) -> Tensor:
-        """Draws slots in proportion to their priority; a slot of priority 0 is never drawn.
+        """Draw slots in proportion to their priority; a slot of priority 0 is never drawn.
 
         Args:
             region: `(draws,)` region of each draw, none of which may be all zero.
@@ -118,7 +118,7 @@ class SumTree:
         return self._offsets[region] + entry
 
     def clear(self) -> None:
-        """Sets every priority to 0."""
+        """Set every priority to 0."""
         for level in self.levels:
             level.zero_()
 
@@ -127,7 +127,7 @@ class SumTree:
         return self.get(torch.arange(int(self.capacities.sum()), device=self.device))
 
     def load_leaves(self, leaves: Tensor) -> None:
-        """Restores what `leaves` returned."""
+        """Restore what `leaves` returned."""
         self.update(torch.arange(leaves.numel(), device=self.device), leaves)
 
     def _locate(self, slot: Tensor) -> tuple[Tensor, Tensor]:

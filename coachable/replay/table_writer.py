@@ -64,11 +64,11 @@ class TableWriter(Writer):
         return int(self.regions.written[: self.base_tables].sum())
 
     def add(self, data: TensorDictBase) -> Tensor:
-        """Writes one step."""
+        """Write one step."""
         return self.extend(data.unsqueeze(0))
 
     def extend(self, data: TensorDictBase, worker: int = 0) -> Tensor:
-        """Writes a batch of steps.
+        """Write a batch of steps.
 
         Args:
             data: `(steps,)`, time-major, or `(num_envs, time)`.
@@ -99,7 +99,7 @@ class TableWriter(Writer):
         return self._write(rows, steps)
 
     def finish(self) -> Tensor:
-        """Ends every open episode where its data ends; held back steps are written, no window reaches back over it.
+        """End every open episode where its data ends; held back steps are written, no window reaches back over it.
 
         Returns:
             Slots written to.
@@ -189,7 +189,7 @@ class TableWriter(Writer):
             self.n_step.clear()
 
     def state_dict(self) -> dict[str, Any]:
-        """Cursors, open episodes and held back steps."""
+        """Return the cursors, the open episodes and the steps that are held back."""
         return {
             "regions": self.regions.state_dict(),
             "arrived": self._arrived,
@@ -200,7 +200,7 @@ class TableWriter(Writer):
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restores what `state_dict` returned.
+        """Restore what `state_dict` returned.
 
         Raises:
             ValueError: If the tables or the horizon are others than the saved ones.

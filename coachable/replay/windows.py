@@ -43,7 +43,7 @@ class WindowHistory:
         self.clear()
 
     def clear(self) -> None:
-        """Forgets every open episode."""
+        """Forget every open episode."""
         self._allocate(1)
 
     def __len__(self) -> int:
@@ -51,7 +51,7 @@ class WindowHistory:
         return int((self.key >= 0).sum())
 
     def update(self, steps: Steps, slot: np.ndarray, serial: np.ndarray) -> Copies:
-        """Takes in a batch.
+        """Take in a batch.
 
         Args:
             steps: The batch.
@@ -193,12 +193,12 @@ class WindowHistory:
         return place
 
     def state_dict(self) -> dict[str, Any]:
-        """Open episodes as tensors."""
+        """Return the open episodes as tensors."""
         names = ("key", "length", "arrival", "last_event", "slot", "serial")
         return {name: torch.from_numpy(getattr(self, name).copy()) for name in names}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores open episodes.
+        """Restore open episodes.
 
         Raises:
             ValueError: If the horizon or the number of event tables differs.

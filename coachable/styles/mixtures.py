@@ -14,14 +14,14 @@ Single = Literal["continuous_one_hot", "one_hot", "independent"]
 
 
 def own(space: StyleSpace) -> Sampler:
-    """The sampler that the space was declared with."""
+    """Return the sampler that the space was declared with."""
     return space.sampler
 
 
 def style_mixture(
     space: StyleSpace, single: Single = "continuous_one_hot", *, neutral: float = 0.03, independent: float = 0.10
 ) -> Sampler:
-    """No style, every weight at once, or one weight alone (paper, combat training distribution).
+    """Return the mixture of no style, all weights at once, and one weight alone (paper, Appendix C, Style Parameters).
 
     Args:
         space: Its parameters, all of them weights. Only `single="independent"` serves set-points and choices as well;
@@ -50,7 +50,7 @@ def style_mixture(
 
 
 def with_requests(space: StyleSpace, *, positive: float = 0.25, full: float = 0.15, neutral: float = 0.1) -> Sampler:
-    """The space's own sampler, mixed with what people ask for and it may hardly ever draw.
+    """Mix the space's own sampler with requests that people make and that it hardly ever draws.
 
     Where each weight is positive on its own one time in four, all four are so once in 256 episodes, and a network that
     has to extrapolate to such a request fails it.
@@ -76,7 +76,7 @@ def with_requests(space: StyleSpace, *, positive: float = 0.25, full: float = 0.
 def with_extremes(
     space: StyleSpace, *, share: float = 0.5, shared: bool = True, only: Sequence[str] | None = None
 ) -> Sampler:
-    """The space's own sampler, mixed with styles whose every parameter is at one of its bounds.
+    """Mix the space's own sampler with styles whose every parameter is at one of its bounds.
 
     What tells two styles apart is largest between bounds, so that networks hear of it sooner.
 
@@ -113,7 +113,7 @@ def with_extremes(
 
 
 def _rest(**probabilities: float) -> float:
-    """What probabilities leave of 1."""
+    """Return 1 minus the sum of the probabilities."""
     for name, value in probabilities.items():
         SHARE.check(name, value)
     rest = 1.0 - sum(probabilities.values())
@@ -124,12 +124,12 @@ def _rest(**probabilities: float) -> float:
 
 
 def _others(space: StyleSpace, kinds: tuple[type, ...]) -> list[str]:
-    """Names of the parameters that are of none of these kinds."""
+    """Return the names of the parameters that are of none of these kinds."""
     return [p.name for p in space.parameters if not isinstance(p, kinds)]
 
 
 def _require(kinds: tuple[type, ...], space: StyleSpace, why: str) -> None:
-    """Refuses parameters of other kinds; "{}" in `why` stands for them."""
+    """Refuse parameters of other kinds; "{}" in `why` stands for them."""
     if others := _others(space, kinds):
         named = f"{', '.join(others)} of the style space {space.name!r}"
         raise ValueError(f"{why.format(named)}: expected sampler=default or sampler=independent")

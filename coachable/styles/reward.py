@@ -87,7 +87,7 @@ class StyleReward(nn.Module):
         return all(isinstance(term, WeightedFeature | WeightedSum) for _, term, _ in self._terms)
 
     def forward(self, features: Features, theta: Tensor) -> Tensor:
-        """Style part of the reward.
+        """Return the style part of the reward.
 
         Args:
             features: `(..., F)`, or a tensordict of batch shape `(...)`.
@@ -110,7 +110,7 @@ class StyleReward(nn.Module):
         return total.to(theta.dtype).unsqueeze(-1)
 
     def terms_of(self, features: Features, theta: Tensor) -> dict[str, Tensor]:
-        """Each term before its scale, `(...,)`, for logging and reports."""
+        """Return each term before its scale, `(...,)`, for logging and reports."""
         style = self.space.lazy_view(theta)
         return {name: self._checked(name, term(features, style), theta) for name, term, _ in self._terms}
 

@@ -14,13 +14,13 @@ _REGISTRY: dict[str, type["Sampler"]] = {}
 
 @lru_cache(maxsize=256)
 def constant(values: tuple[float, ...], device: torch.device) -> Tensor:
-    """A float32 constant `(n,)` on a device; shared, so never write to it."""
+    """Return a float32 constant `(n,)` on a device. It is shared: do not write to it."""
     with torch.inference_mode(False):
         return torch.tensor(values, dtype=torch.float32, device=device)
 
 
 def numbers(values: float | Sequence[float] | Tensor) -> tuple[float, ...]:
-    """A number, a sequence of numbers or a tensor `(n,)` as a tuple of floats."""
+    """Return a number, a sequence of numbers or a tensor `(n,)` as a tuple of floats."""
     if isinstance(values, Tensor):
         values = values.tolist()
     return tuple(float(v) for v in values) if isinstance(values, Sequence) else (float(values),)
@@ -55,7 +55,7 @@ class Sampler:
         generator: Generator | None = None,
         device: torch.device | str | None = None,
     ) -> Tensor:
-        """Draws styles.
+        """Draw styles.
 
         Args:
             shape: Batch shape.
@@ -76,25 +76,25 @@ class Sampler:
         generator: Generator | None = None,
         device: torch.device | str | None = None,
     ) -> Tensor:
-        """Draws styles none of which depends on another, unlike the rows of a batch of `Shared`; see `sample`."""
+        """Draw styles none of which depends on another, unlike the rows of a batch of `Shared`; see `sample`."""
         return self.sample((*shape, 1), generator, device).squeeze(-2)
 
     def _draw(self, shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
         raise NotImplementedError(f"{type(self).__name__} must define _draw")
 
     def support(self) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-        """Lowest and highest value of each entry, or None if not known."""
+        """Return the lowest and highest value of each entry, or None if they are not known."""
         return None
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready description; `Sampler.from_dict` reads it back."""
+        """Return a description that JSON can hold; `Sampler.from_dict` reads it back."""
         if not is_dataclass(self):
             raise TypeError(f"sampler {type(self).__name__} cannot be described: make it a frozen dataclass.")
         return {"type": type(self).__name__, **{f.name: _plain(getattr(self, f.name)) for f in fields(self)}}
 
     @staticmethod
     def from_dict(description: dict[str, Any]) -> "Sampler":
-        """Rebuilds a sampler from `to_dict`.
+        """Rebuild a sampler from `to_dict`.
 
         Raises:
             ValueError: If the type is unknown, for instance because the module that defines it was not imported.

@@ -1,4 +1,4 @@
-"""Composable distributions over theta (paper, training distributions of the three domains; algorithms.md section 4).
+"""Composable distributions over theta (paper, Appendix A, Parameter Sampling).
 
 Every sampler draws float32 of any batch shape from an optional `torch.Generator`. Draws happen on the generator's
 device (on `device` without one) and the result is moved to `device`. How many random numbers a call consumes depends on
@@ -76,7 +76,7 @@ class PointMass(Sampler):
         return constant(self.values, device).expand(*shape, self.dim).clone()
 
     def support(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """The point itself, twice."""
+        """Return the point as lower and as upper bound."""
         return self.values, self.values
 
 

@@ -39,7 +39,7 @@ class StyleTerm(Protocol):
         ...
 
     def __call__(self, features: Features, style: Style) -> Tensor:
-        """Reward of the term, `(...,)`, before its scale."""
+        """Return the reward of the term, `(...,)`, before its scale."""
         ...
 
 
@@ -65,12 +65,12 @@ class Term:
         object.__setattr__(self, "parameters", parameters)
 
     def __call__(self, features: Features, style: Style) -> Tensor:
-        """Calls the function."""
+        """Call the function."""
         return self.function(features, style)
 
 
 def feature(features: Features, key: FeatureKey) -> Tensor:
-    """Picks one feature.
+    """Pick one feature.
 
     Args:
         features: Tensor `(..., F)` or tensordict.
@@ -105,13 +105,13 @@ def _no_such_feature(features: Features, name: Any) -> str:
 
 
 def scalar_feature(features: Features, key: FeatureKey, like: Tensor) -> Tensor:
-    """Like `feature`, but `(...,)`: drops the trailing 1 of an entry that has one dimension more than `like`."""
+    """Return a feature as `(...,)`, without the trailing 1 of an entry that has one dimension more than `like`."""
     value = feature(features, key)
     return value.squeeze(-1) if value.ndim == like.ndim + 1 and value.shape[-1] == 1 else value
 
 
 def weighted_sum(weights: Tensor, values: Tensor) -> Tensor:
-    """Sum of products over the last dimension, with the same bits for every batch shape, memory layout and device.
+    """Sum products over the last dimension, with the same bits for every batch shape, memory layout and device.
 
     Args:
         weights: `(..., k)`.
@@ -261,7 +261,7 @@ class ChoiceTolerance:
 
 
 def _on(copies: dict[torch.device, Tensor], device: torch.device) -> Tensor:
-    """The copy of a constant on a device, made on first use."""
+    """Return the copy of a constant on a device, made on first use."""
     found = copies.get(device)
     if found is None:
         found = copies[device] = next(iter(copies.values())).to(device)

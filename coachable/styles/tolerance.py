@@ -18,7 +18,7 @@ def tolerance(
     sigmoid: str = "gaussian",
     value_at_margin: float = 0.1,
 ) -> Tensor:
-    """1 where `lower <= x <= upper`, falling towards 0 with the distance from the interval.
+    """Return 1 where `lower <= x <= upper`, and less with the distance from the interval.
 
     Equal to `dm_control.utils.rewards.tolerance`, but differentiable, on any device, and with bounds that may be
     tensors, so that a style can set them.
@@ -53,7 +53,7 @@ def tolerance(
 
 
 def _distance(x: Tensor, lower: float | Tensor, upper: float | Tensor) -> Tensor:
-    """Distance from the interval: 0 inside, where every sigmoid is exactly 1. No masks: gradients stay finite.
+    """Return the distance from the interval; it is 0 inside. No mask is used, so that gradients stay finite.
 
     The special cases give the same values in fewer operations, which counts in every environment step.
     """
@@ -68,7 +68,7 @@ def _distance(x: Tensor, lower: float | Tensor, upper: float | Tensor) -> Tensor
 
 @lru_cache(maxsize=256)
 def _scale(sigmoid: str, value: float) -> float:
-    """Factor on the distance that makes the decline pass through `value` at distance 1."""
+    """Return the factor on the distance that makes the sigmoid equal `value` at distance 1."""
     if sigmoid not in _SIGMOIDS:
         raise ValueError(f"unknown sigmoid {sigmoid!r}: expected one of {_SIGMOIDS}.")
     if not (0 < value < 1 or (value == 0 and sigmoid in _MAY_BE_ZERO)):
@@ -96,7 +96,7 @@ def _scale(sigmoid: str, value: float) -> float:
 
 
 def _decline(z: Tensor, sigmoid: str) -> Tensor:
-    """The sigmoid at scaled distance `z >= 0`."""
+    """Return the sigmoid at scaled distance `z >= 0`."""
     match sigmoid:
         case "gaussian":
             return torch.exp(z.square().mul(-0.5))

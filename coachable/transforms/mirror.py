@@ -25,7 +25,7 @@ class MirrorMap:
     sign: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        """Checks that mirroring twice changes nothing."""
+        """Check that mirroring twice changes nothing."""
         if len(self.source) != len(self.sign):
             raise ValueError(f"a mirror map needs as many signs as sources, got {len(self.sign)}, {len(self.source)}")
         for i, (j, sign) in enumerate(zip(self.source, self.sign, strict=True)):
@@ -93,5 +93,5 @@ class MirrorSymmetry(Transform):
         return self.generator.get_state()
 
     def set_extra_state(self, state: Any) -> None:
-        """Restores the generator from `state_dict`."""
+        """Restore the generator from `state_dict`."""
         self.generator.set_state(state.to("cpu", torch.uint8))

@@ -74,7 +74,7 @@ class StyleRewardTransform(Transform):
         return tensordict_reset
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Adds the style reward if the task reward is declared as an observation."""
+        """Add the style reward if the task reward is declared as an observation."""
         return self._beside_task_reward(observation_spec)
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:

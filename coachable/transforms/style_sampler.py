@@ -86,7 +86,7 @@ class StyleSampler(Transform):
         self._held = self.space.clamp(theta.detach(), strict=strict)
 
     def release(self) -> None:
-        """Draws styles again from the next reset on."""
+        """Draw styles again from the next reset on."""
         self._held = None
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
@@ -123,7 +123,7 @@ class StyleSampler(Transform):
         )
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Adds the style, bounded by the space's ranges."""
+        """Add the style, bounded by the space's ranges."""
         shape = torch.Size((*observation_spec.shape, self.space.dim))
         device = observation_spec.device
         low, high = self.space.low.to(device).expand(shape), self.space.high.to(device).expand(shape)
@@ -131,7 +131,7 @@ class StyleSampler(Transform):
         return observation_spec
 
     def transform_state_spec(self, state_spec: Composite) -> Composite:
-        """Adds the style here too: otherwise a style given at reset would be ignored."""
+        """Add the style here too: otherwise a style given at reset would be ignored."""
         return self.transform_observation_spec(state_spec)
 
     def get_extra_state(self) -> Tensor:
@@ -139,7 +139,7 @@ class StyleSampler(Transform):
         return self.generator.get_state()
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Restores the generator from `state_dict`."""
+        """Restore the generator from `state_dict`."""
         self.generator.set_state(state.to("cpu", torch.uint8))
         self._seeded = True
 
@@ -179,7 +179,7 @@ class CoachableEnv(TransformedEnv):
             sampler.hold(theta, strict)
 
     def release_style(self) -> None:
-        """Draws styles again from the next reset on."""
+        """Draw styles again from the next reset on."""
         for sampler in self._samplers():
             sampler.release()
 
@@ -200,7 +200,7 @@ def coachable_env(
     sampler_device: torch.device | str = "cpu",
     **kwargs: Any,
 ) -> CoachableEnv:
-    """Adds styles to a domain: `StyleSampler`, then `StyleRewardTransform`, then any further transforms.
+    """Add styles to a domain: `StyleSampler`, then `StyleRewardTransform`, then any further transforms.
 
     Args:
         base_env: Emits `task_reward` and `style_features`, and never sees theta.

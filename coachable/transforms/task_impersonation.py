@@ -172,7 +172,7 @@ class TaskImpersonation(Transform):
         return {"generator": self.generator.get_state()}
 
     def set_extra_state(self, state: dict[str, Tensor]) -> None:
-        """Restores the generator."""
+        """Restore the generator."""
         self.generator.set_state(state["generator"].cpu().clone())
 
     def extra_repr(self) -> str:

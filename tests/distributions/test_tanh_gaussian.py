@@ -117,7 +117,7 @@ def test_sample_and_its_density() -> None:
 
 
 def test_saturated_samples_keep_their_density() -> None:
-    """Mean of -log pi at scale e^2 is -7.07; scoring the rounded action gives -4.8 or NaN (algorithms.md, 11.1)."""
+    """Mean of -log pi at scale e^2 is -7.07; scoring the rounded action gives -4.8 or NaN."""
     torch.manual_seed(0)
     n = 200_000
     action, log_prob = sample_tanh_gaussian(torch.zeros(n), torch.full((n,), float(np.exp(2.0))))

@@ -1,5 +1,6 @@
 """The ONNX file says what torch says, describes itself, and runs where there is no torch."""
 
+import copy
 import json
 import re
 import subprocess
@@ -114,10 +115,18 @@ def test_only_the_components_that_exist(tmp_path, heads, mean_bound):
     torch.testing.assert_close(only, expected)
 
 
-def test_a_file_that_disagrees_is_noticed(tmp_path):
+@pytest.fixture(scope="module")
+def traced():
+    """A small policy, and its graph."""
     actor = make_gaussian_actor(3, 2, SPACE, widths=(8,)).eval()
+    return actor, _trace(DeterministicAction(actor))
+
+
+def test_a_file_that_disagrees_is_noticed(traced, tmp_path):
+    actor = copy.deepcopy(traced[0])
     plain = DeterministicAction(actor)
-    out = write(plain, tmp_path / "old.onnx")
+    out = tmp_path / "old.onnx"
+    out.write_bytes(traced[1].model_proto.SerializeToString())
     assert largest_difference(out, plain, SPACE) <= TOLERANCE
     with torch.no_grad():
         policy_network(actor).trunk.head.bias += 0.5
@@ -126,8 +135,9 @@ def test_a_file_that_disagrees_is_noticed(tmp_path):
         assert largest_difference(out, plain, SPACE) == float("inf"), "NaN is no agreement"
 
 
-def test_a_full_disk_is_one_sentence_with_the_space_needed(make_train, tmp_path, monkeypatch):
-    make_train(total_frames=80).run()
+def test_a_full_disk_is_one_sentence_with_the_space_needed(traced, make_train, tmp_path, monkeypatch):
+    make_train(total_frames=4).run()
+    monkeypatch.setattr("coachable.coach.export._trace", lambda _: traced[1])
 
     def full(*_):
         raise OSError(28, "No space left on device")
@@ -147,7 +157,7 @@ def test_a_policy_without_style_is_refused():
 
 def test_the_command(make_train, tmp_path, capsys):
     """An agent of a domain that is not built in: everything but the control step."""
-    make_train(total_frames=80).run()
+    make_train(total_frames=4).run()
     out = tmp_path / "echo.onnx"
     assert main(["export", str(tmp_path / "run"), "--out", str(out)]) == 0
     assert re.search(r"wrote .*echo\.onnx .* from torch", capsys.readouterr().out)

@@ -34,6 +34,7 @@ LOSSES: dict[str, tuple[Callable[..., LossModule], Callable[..., Any], dict[str,
     "sac_categorical": (CategoricalSACLoss, make_hl_gauss_critic, {"alpha": 0.2, **BINS}, "policy_first"),
 }
 ONLY_AXES = ("sac", "qr_sac")
+UPDATES = {"sac": 130, "qr_sac": 130, "rac": 200, "cat_rac": 300, "sac_categorical": 300}  # more for binned critics
 # Mixed actions have both kinds of component: where a loss serves them, actions of one kind are left to the slow tests.
 SERVED = [
     pytest.param(loss, kind, marks=() if loss in ONLY_AXES or kind == "mixed" else pytest.mark.slow)
@@ -87,7 +88,7 @@ def answers(actor: Any, heads: ActionHeads) -> tuple[Tensor, Tensor]:
 @pytest.mark.parametrize(("name", "kind"), SERVED)
 def test_learns_to_echo(name: str, kind: str) -> None:
     heads = HEADS[kind]
-    actor = train(name, heads, updates=200 if name in ("sac", "qr_sac", "rac") else 300)  # more for binned critics
+    actor = train(name, heads, UPDATES[name])
     styles, said = answers(actor, heads)
     error = (said - styles).abs().mean(0)
     components = ["level"] * len(heads.categorical) + ["axis"] * heads.axes

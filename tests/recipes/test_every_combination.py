@@ -16,8 +16,9 @@ from coachable.training.loop import REPLAY_KEYS
 
 RECIPES = sorted(file.stem for file in (Path(__file__).resolve().parents[2] / "recipes" / "configs").glob("*_*.yaml"))
 TINY = ["preset=smoke", "env.num_envs=2", "threads.simulator=1", "threads.learner=1", "train.eval_interval=0"]
-TINY += ["init_random_frames=8", "train.warmup_frames=8", "train.batch_size=12", "eval.max_steps=5"]
-TINY += ["train.total_frames=28", "train.utd_ratio=0.125", "impersonation.n=0"]
+TINY += ["init_random_frames=8", "train.warmup_frames=8", "train.batch_size=12", "eval.max_steps=3"]
+TINY += ["train.total_frames=28", "train.utd_ratio=0.125", "impersonation.n=0", "eval.num_envs=1"]
+BRIEF = ["train.utd_ratio=0", "train.total_frames=3"]
 POLICY_FIRST = {"qr_sac", "rac", "cat_rac", "sac_categorical"}  # paper, Appendix B
 
 
@@ -46,9 +47,9 @@ def test_recipes_were_found():
 
 @pytest.mark.parametrize("recipe, loss, replay", list(_losses_and_buffers()))
 def test_every_loss_and_every_replay_buffer_train(recipe, loss, replay, tmp_path):
-    choice = [f"loss={loss}", f"replay={replay}", "impersonation.n=1", "n_steps=1", "train.total_frames=50"]
+    choice = [f"loss={loss}", f"replay={replay}", "impersonation.n=1", "n_steps=1", "train.total_frames=26"]
     train = _train(recipe, tmp_path, *choice)
-    assert train.learner.updates == (50 - 8) // 8
+    assert train.learner.updates == (26 - 8) // 8
     assert train.learner.update_order == ("policy_first" if loss in POLICY_FIRST else "simultaneous")
     for name, value in train.learner.loss_module.named_parameters():
         assert torch.isfinite(value).all(), name
@@ -107,11 +108,11 @@ def test_the_presets_of_races_are_of_their_family(preset, margins, tmp_path):
 
 
 def test_a_driver_who_drove_alone_starts_out_blind_to_others(tmp_path):
-    alone = _train("racing_qr_sac", tmp_path / "alone", "family=resources")
+    alone = _train("racing_qr_sac", tmp_path / "alone", "family=resources", "train.total_frames=16")
     choice = ["family=resources", "+env.cars=3", "env.num_envs=3", f"init_from={tmp_path / 'alone'}"]
     with pytest.raises(RuntimeError, match=r"\(\d+, 141\) in the checkpoint, \(\d+, 174\) here"):
         _train("racing_qr_sac", tmp_path / "refused", *choice)
-    among = _train("racing_qr_sac", tmp_path / "among", *choice, "init_new_observations=33", "train.utd_ratio=0")
+    among = _train("racing_qr_sac", tmp_path / "among", *choice, "init_new_observations=33", *BRIEF)
     seen, theta, others = torch.randn(5, 137), torch.randn(5, 4), torch.randn(5, 33)
     action = alone.collector.policy(TensorDict({"observation": seen, "style": theta}, [5]))["loc"]
     wider = TensorDict({"observation": torch.cat([seen, others], -1), "style": theta}, [5])
@@ -120,9 +121,9 @@ def test_a_driver_who_drove_alone_starts_out_blind_to_others(tmp_path):
 
 def test_a_wide_network_that_drove_alone_still_can_while_nobody_is_near(tmp_path):
     wide = ["family=resources", *(f"network.{part}.widths=[256,256]" for part in ("actor", "critic"))]
-    alone = _train("racing_qr_sac", tmp_path / "alone", *wide)
+    alone = _train("racing_qr_sac", tmp_path / "alone", *wide, "train.total_frames=16")
     choice = ["+env.cars=3", "env.num_envs=3", f"init_from={tmp_path / 'alone'}", "init_new_observations=33"]
-    among = _train("racing_qr_sac", tmp_path / "among", *wide, *choice, "train.utd_ratio=0")
+    among = _train("racing_qr_sac", tmp_path / "among", *wide, *choice, *BRIEF)
     seen, theta, action = torch.randn(5, 137), torch.randn(5, 4), torch.rand(5, 2)
     drive = TensorDict({"observation": seen, "style": theta, "action": action}, [5])
     nobody = drive.clone().set("observation", torch.cat([seen, torch.zeros(5, 33)], -1))
@@ -140,7 +141,7 @@ def _value(loss, params, data):
 
 def test_networks_without_room_for_others_are_refused(tmp_path):
     narrow = ["family=resources", *(f"network.{part}.widths=[150,150]" for part in ("actor", "critic"))]
-    _train("racing_qr_sac", tmp_path / "alone", *narrow)
+    _train("racing_qr_sac", tmp_path / "alone", *narrow, *BRIEF)
     choice = ["+env.cars=3", "env.num_envs=3", "init_new_observations=33", f"init_from={tmp_path / 'alone'}"]
     with pytest.raises(CheckpointError, match=r"layers of \[150, 150\] units cannot get 33 inputs"):
         _train("racing_qr_sac", tmp_path / "among", *narrow, *choice)
@@ -149,9 +150,9 @@ def test_networks_without_room_for_others_are_refused(tmp_path):
 @pytest.mark.parametrize("loss, replay", [("sac", "uniform"), ("cat_rac", "event_tables")])
 def test_runs_with_tables_resume_bit_for_bit(loss, replay, tmp_path):
     choice = [f"loss={loss}", f"replay={replay}", "n_steps=3", "replay.prioritized=true"]
-    _train("humanoid_sac", tmp_path / "whole", *choice, "train.total_frames=72")
-    _train("humanoid_sac", tmp_path / "half", *choice, "train.total_frames=36")
-    rest = compose_config("humanoid_sac", [f"resume={tmp_path / 'half'}", "train.total_frames=72"])
+    _train("humanoid_sac", tmp_path / "whole", *choice, "train.total_frames=56")
+    _train("humanoid_sac", tmp_path / "half", *choice, "train.total_frames=28")
+    rest = compose_config("humanoid_sac", [f"resume={tmp_path / 'half'}", "train.total_frames=56"])
     import_module("humanoid_sac").build(rest).run()
     states = [read_state(find_checkpoint(tmp_path / name)) for name in ("whole", "half")]
     for name, value in states[0]["actor"].items():

@@ -22,7 +22,7 @@ from coachable.training.weights import load_policy
 REPOSITORY = Path(__file__).resolve().parents[2]
 RECIPE = REPOSITORY / "recipes" / "humanoid_sac.py"
 TINY = ["preset=smoke", "env.num_envs=2", "threads.simulator=1", "threads.learner=1", "train.eval_interval=0"]
-TINY += ["init_random_frames=8", "train.warmup_frames=8", "train.batch_size=8", "eval.max_steps=5"]
+TINY += ["init_random_frames=8", "train.warmup_frames=8", "train.batch_size=8", "eval.max_steps=3"]
 
 
 def _compose(*arguments):
@@ -114,12 +114,12 @@ def test_hydras_options_pass_through():
 
 def test_resumed_runs_equal_uninterrupted_ones(tmp_path):
     """Bit for bit on one thread, the physics of the running episodes included."""
-    _run(tmp_path / "whole", "train.total_frames=72")
-    _run(tmp_path / "half", "train.total_frames=36")
-    _resume(tmp_path / "half", "train.total_frames=72")
+    _run(tmp_path / "whole", "train.total_frames=56")
+    _run(tmp_path / "half", "train.total_frames=28")
+    _resume(tmp_path / "half", "train.total_frames=56")
     states = [read_state(find_checkpoint(tmp_path / name)) for name in ("whole", "half")]
     updates = {state["learner"]["updates"] for state in states}
-    assert updates == {(72 - 8) // 8}
+    assert updates == {(56 - 8) // 8}
     for part in ("learner", "collector", "rng", "loop"):
         _assert_equal(states[0][part], states[1][part], part)
 
@@ -162,7 +162,7 @@ def test_a_new_run_starts_from_another_ones_weights(tmp_path):
 
 def test_the_command_line_from_another_folder(tmp_path):
     """The smoke preset as a user starts it: trains, evaluates, writes a checkpoint that loads and can be resumed."""
-    command = [sys.executable, str(RECIPE), "preset=smoke", "train.total_frames=400", "train.eval_interval=200"]
+    command = [sys.executable, str(RECIPE), "preset=smoke", "train.total_frames=240", "train.eval_interval=120"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stderr
     (run,) = (tmp_path / "runs" / "humanoid").iterdir()
@@ -171,13 +171,13 @@ def test_the_command_line_from_another_folder(tmp_path):
     assert json.loads((run / "config.json").read_text())["preset"] == "smoke"
     with (run / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert int(rows[-1]["frames"]) == 400 and any(row["eval/return"] for row in rows)
+    assert int(rows[-1]["frames"]) == 240 and any(row["eval/return"] for row in rows)
     assert [row for row in rows if row["loss/loss_qvalue"] and float(row["loss/loss_qvalue"]) > 0]
     assert [row for row in rows if row["step/style_pose"]]
     policy = load_policy(run)
-    assert policy.metadata["frames"] == 400 and policy.space.dim == 4
+    assert policy.metadata["frames"] == 240 and policy.space.dim == 4
     last = json.loads(done.stderr.strip().splitlines()[-1])
-    assert last["frames"] == 400 and last["updates"] == 25
+    assert last["frames"] == 240 and last["updates"] == 5
 
 
 @pytest.mark.slow

@@ -559,7 +559,7 @@ def test_unknown_table():
 
 
 def test_n_step_closed_forms():
-    """Rewards 1, 2, 4, 8 with gamma 1/2 (algorithms.md section 10)."""
+    """Rewards 1, 2, 4, 8 with gamma 1/2."""
 
     def run(n, done=(), terminated=()):
         buffer = EventTableBuffer({"default": 9}, n_steps=n, gamma=0.5, num_envs=1)

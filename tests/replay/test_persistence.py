@@ -108,7 +108,7 @@ def by_replay_files(saved, fresh, folder):
     [{}, {"n_steps": 4}, {"prioritized": True}, {"n_steps": 3, "prioritized": True, "relabel": True}],
     ids=["plain", "n-step", "prioritised", "all"],
 )
-@pytest.mark.parametrize("before", [2, 30], ids=["filling", "full"])
+@pytest.mark.parametrize("before", [2, 20], ids=["filling", "full"])
 def test_resumed_equals_uninterrupted(way, kwargs, before, tmp_path):
     saved = make(**kwargs)
     use(saved, 0, before)

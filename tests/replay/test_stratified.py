@@ -61,7 +61,7 @@ def test_allotment_is_the_largest_remainder(batch, tables):
 
 
 def test_default_shares():
-    """Half for the default table, the rest equal (algorithms.md section 7)."""
+    """The default table has half of the batch, the event tables share the rest equally."""
     names = [f"e{i}" for i in range(19)]
     rb = EventTableBuffer(
         {"default": 100, **dict.fromkeys(names, 10)},

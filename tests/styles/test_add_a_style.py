@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-GUIDE = Path(__file__).resolve().parents[2] / "docs" / "add_a_style.md"
+GUIDE = Path(__file__).resolve().parents[2] / "docs" / "guides" / "add_a_style.md"
 
 
 def test_the_guide_runs():

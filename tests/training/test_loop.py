@@ -33,15 +33,15 @@ def test_the_test_environment_keeps_its_specs(make_echo_env):
 
 
 def test_n_plus_n_equals_2n_bit_for_bit(make_train, tmp_path):
-    whole = make_train(tmp_path / "whole", total_frames=480)
+    whole = make_train(tmp_path / "whole", total_frames=320)
     whole.run()
-    half = make_train(tmp_path / "half", total_frames=240)
+    half = make_train(tmp_path / "half", total_frames=160)
     half.run()
-    rest = make_train(tmp_path / "half", total_frames=480, seed=7)  # the checkpoint decides everything, not the seed
+    rest = make_train(tmp_path / "half", total_frames=320, seed=7)  # the checkpoint decides everything, not the seed
     rest.resume(tmp_path / "half")
-    assert rest.frames == 240
+    assert rest.frames == 160
     rest.run()
-    assert whole.learner.updates == rest.learner.updates == (480 - 40) // 4
+    assert whole.learner.updates == rest.learner.updates == (320 - 40) // 4
     states = [read_state(find_checkpoint(tmp_path / name)) for name in ("whole", "half")]
     expected, found = (dict(_tensors(state)) for state in states)
     assert expected.keys() == found.keys()
@@ -102,9 +102,8 @@ def test_resume_with_another_number_of_threads_says_so(make_train, tmp_path):
         torch.set_num_threads(1)
 
 
-def test_what_happened_before_a_checkpoint_is_in_the_metrics(make_train, tmp_path, monkeypatch):
+def test_what_happened_before_a_checkpoint_is_in_the_metrics(make_train, tmp_path):
     """A training that ends without a last word, right after a checkpoint, has told of every episode up to it."""
-    monkeypatch.setattr(os, "fsync", lambda _: None)
     train = make_train(total_frames=400, checkpoint_interval=0.0, log_interval=1e9, utd_ratio=0.0)
     save = train.checkpoints.try_save
 
@@ -148,10 +147,10 @@ def test_learning_rates_fall_to_a_tenth_over_the_last_share(make_train, tmp_path
     assert [settings.learning_rate_factor(frames) for frames in (0, 300, 350, 400, 450)] == pytest.approx(
         [1.0, 1.0, 0.55, 0.1, 0.1]
     )
-    train = make_train(total_frames=400, anneal=0.25)
+    train = make_train(total_frames=200, anneal=0.25)
     train.run()
     assert train.learner.optimizers["actor"].param_groups[0]["lr"] == pytest.approx(1e-4)
-    again = make_train(total_frames=800, anneal=0.25)
+    again = make_train(total_frames=400, anneal=0.25)
     again.resume(tmp_path / "run")
     assert again.learner.optimizers["actor"].param_groups[0]["lr"] == pytest.approx(1e-3)
 
@@ -160,10 +159,10 @@ def test_the_entropy_weight_falls_with_the_learning_rates(make_train, tmp_path):
     settings = TrainSettings(total_frames=400, anneal=0.25, anneal_entropy=0.2)
     assert [settings.entropy_factor(frames) for frames in (0, 300, 350, 400)] == pytest.approx([1.0, 1.0, 0.6, 0.2])
     before = make_train(total_frames=400).learner.loss_module.log_alpha.exp()
-    train = make_train(total_frames=400, anneal=0.25, anneal_entropy=0.2)
+    train = make_train(total_frames=200, anneal=0.25, anneal_entropy=0.2)
     train.run()
     assert train.learner.loss_module.log_alpha.exp() == pytest.approx(0.2 * before)
-    again = make_train(total_frames=800, anneal=0.25, anneal_entropy=0.2)
+    again = make_train(total_frames=400, anneal=0.25, anneal_entropy=0.2)
     again.resume(tmp_path / "run")
     assert again.learner.loss_module.log_alpha.exp() == pytest.approx(before)
 
@@ -214,7 +213,7 @@ def test_replay_holds_raw_style_and_no_copy_of_it(make_train):
 
 
 def test_metrics_are_sums_over_episodes(make_train, tmp_path):
-    train = make_train(total_frames=400, log_interval=0.0)
+    train = make_train(total_frames=200, log_interval=0.0)
     train.run()
     with (tmp_path / "run" / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -226,7 +225,7 @@ def test_metrics_are_sums_over_episodes(make_train, tmp_path):
             assert float(row["episode/task_return"]) == 0.0
             assert float(row["episode/return"]) == pytest.approx(float(row["episode/style_return"]))
     counted = sum(int(row["episode/count"]) for row in rows)
-    ended = int(train.replay.storage.get(slice(0, 300))["next", "done"].sum())
+    ended = int(train.replay.storage.get(slice(0, 200))["next", "done"].sum())
     assert counted >= ended > 0
 
 
@@ -265,7 +264,7 @@ def test_evaluation_counts_each_episode_once(make_echo_env):
 def test_a_signal_ends_the_training_with_a_checkpoint(make_train, tmp_path, number):
     train = make_train(total_frames=10**9)
     before = signal.getsignal(number)
-    timer = threading.Timer(0.5, os.kill, (os.getpid(), number))
+    timer = threading.Timer(0.2, os.kill, (os.getpid(), number))
     timer.start()
     train.run()
     assert signal.getsignal(number) is before

@@ -1,4 +1,4 @@
-"""What replay keeps tables of in racing: rare or hard moments (Kompella et al. 2023; racing.md, section 5.3)."""
+"""Events that fill the replay tables of racing: rare or hard moments (Kompella et al. 2023)."""
 
 from __future__ import annotations
 

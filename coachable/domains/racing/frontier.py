@@ -1,4 +1,4 @@
-"""Lap time against tyre wear and fuel without learning: a dynamic programme over speeds on a fixed line (racing.md, 8).
+"""Lap time against tyre wear and fuel without learning: a dynamic programme over speeds on a fixed line.
 
     python -m coachable.domains.racing.frontier docs/results/racing
 

@@ -134,7 +134,7 @@ def evaluate_resources(
 
 
 def frontier(track: str, car: str, resource: str) -> list[dict[str, float]]:
-    """Lap time [s] and range [km] of a point mass on a fixed line, the fastest lap first (racing.md, section 8).
+    """Return lap time [s] and range [km] of a point mass on a fixed line, the fastest lap first.
 
     Args:
         track: name of a shipped circuit.

@@ -118,7 +118,7 @@ BOTS: dict[str, Bot] = {bot.name: bot for bot in (*(Bot(a, a) for names in AMMO 
 def fight_all(
     bot: Bot, machines: Sequence[str], fights: int = 8, steps: int = 2400, seed: int = 0, **options: object
 ) -> dict[str, dict[str, float]]:
-    """Lets a bot fight every machine.
+    """Let a bot fight every machine.
 
     Args:
         bot: who fights.

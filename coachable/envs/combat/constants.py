@@ -1,4 +1,4 @@
-"""Numbers of the game that are no tables, each with its unit. (paper) where the paper gives it, otherwise ours."""
+"""Constants of the game that are in no table, with their units. "(paper)" marks the paper's; others are ours."""
 
 import math
 

@@ -45,7 +45,7 @@ class Totals:
 
     @classmethod
     def zeros(cls, like: Tensor, slots: int) -> Totals:
-        """Nothing yet; `like` is (E, N)."""
+        """Return an empty record; `like` is (E, N)."""
         shapes = (6, len(ELEMENTS), len(ELEMENTS), slots, slots)
         return cls(*(like.new_zeros((rows, *like.shape)) for rows in shapes), taken=like.new_zeros(like.shape[-1]))
 
@@ -60,7 +60,7 @@ class ElementNumbers:
 
     @classmethod
     def load(cls, device: torch.device) -> ElementNumbers:
-        """From the data file."""
+        """Read the numbers from the data file."""
         table = load_table("elements")
 
         def column(name: str) -> Tensor:
@@ -72,7 +72,7 @@ class ElementNumbers:
 def shoot(
     s: State, intent: Intent, traits: Traits, relative: Tensor, distance: Tensor, spread: Tensor, blocked_at: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """One frame of the weapon: whether it fires, what the shot meets first, and the damage to the parts.
+    """Advance the weapon by one frame: whether it fires, what the shot meets first, and the damage to the parts.
 
     There are no projectiles: everything is shifted by what it will have moved when the shot arrives.
 
@@ -145,7 +145,7 @@ def _dot(offset: Tensor, vector: tuple[Tensor, ...]) -> Tensor:
 
 
 def _entry(along: Tensor, squared: Tensor) -> Tensor:
-    """Distance at which a ray enters a sphere; far out of range if it misses.
+    """Return the distance at which a ray enters a sphere; far out of range if it misses.
 
     Args:
         along: projection of the centre on the ray [m].
@@ -158,7 +158,7 @@ def _entry(along: Tensor, squared: Tensor) -> Tensor:
 
 
 def damage_parts(s: State, traits: Traits, damage: Tensor, totals: Totals) -> Tensor:
-    """Takes damage (12, E, N) off the parts; at most one unit of each is removed.
+    """Take damage (12, E, N) off the parts; at most one unit of each is removed.
 
     Returns:
         (E, N) canisters burst, 0 or 1.
@@ -174,7 +174,7 @@ def damage_parts(s: State, traits: Traits, damage: Tensor, totals: Totals) -> Te
 
 
 def swing(s: State, intent: Intent, traits: Traits) -> Tensor:
-    """One frame of the spear: lunge and damage on the first frame of a swing.
+    """Advance the spear by one frame: lunge and damage on the first frame of a swing.
 
     Returns:
         (E, N) damage [HP].
@@ -203,7 +203,7 @@ _MELEE_COSINE = float(torch.tensor(c.MELEE_CONE).cos())
 
 
 def build_up(s: State, gain: Tensor, source: Tensor | float, totals: Totals) -> None:
-    """Adds build-up to the gauges; a running state takes none.
+    """Add build-up to the gauges; a running state takes none.
 
     Args:
         s: state.
@@ -226,7 +226,7 @@ def build_up(s: State, gain: Tensor, source: Tensor | float, totals: Totals) -> 
 def run_elements(
     s: State, numbers: ElementNumbers, traits: Traits, totals: Totals
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """One frame of the elements: decay, states that start and end, damage over time.
+    """Advance the elements by one frame: decay, states that start and end, damage over time.
 
     Returns:
         Active states (7, E, N) as 0 or 1 before they end, damage over time (7, E, N) [HP], plasma's ending (E, N)
@@ -253,7 +253,7 @@ def hit_factor(s: State, numbers: ElementNumbers) -> Tensor:
 
 
 def take_damage(s: State, raw: Tensor, active: Tensor, burst: Tensor, totals: Totals) -> Tensor:
-    """Takes damage off the machines, clipped to what is left, and keeps the books.
+    """Subtract damage from the machines, clipped to their health, and record who caused it.
 
     Args:
         s: state.

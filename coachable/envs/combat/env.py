@@ -124,7 +124,7 @@ class CombatEnv(EnvBase):
         self._look_up()
 
     def assign(self, machines: Sequence[str | Sequence[str]], sites: Sequence[str]) -> None:
-        """Gives every fight its scenario from its next reset on, instead of drawing it.
+        """Give every fight its scenario from its next reset on, instead of drawing it.
 
         Args:
             machines: one type, or one per enemy, for each of the N fights.
@@ -158,7 +158,7 @@ class CombatEnv(EnvBase):
         self._place_pillars(self._site_pool)
 
     def _place_pillars(self, sites: Tensor) -> None:
-        """Pillars are looked for only where a fight may have them."""
+        """Look up pillars only if some fight may have them."""
         needed = bool((self._sites[sites, 2] > 0).any())
         self._pillars = torch.tensor(c.PILLARS, device=self._on).T.contiguous() if needed else None
 
@@ -236,7 +236,7 @@ class CombatEnv(EnvBase):
     # -- state -----------------------------------------------------------------------------------------------------
 
     def _fresh(self) -> State:
-        """New fights for all rows; draws the same amount of random numbers whatever is needed."""
+        """Return new fights for all rows; the amount of random numbers drawn does not depend on which rows need one."""
         n, on = self.num_envs, self._on
         drawn = torch.randint(len(self._machine_pool), (self.num_enemies, n), generator=self._random, device=on)
         machine = self._machine_pool[drawn]
@@ -254,14 +254,14 @@ class CombatEnv(EnvBase):
         self.rules = Rules(self.traits, site, self._elements, traps, self._pillars, c.ASSIST[self.assist])
 
     def simulator_state(self) -> dict[str, Any]:
-        """Everything that the next step depends on, fights first, for exact resumption."""
+        """Return everything that the next step depends on, fights first, for exact resumption."""
         tensors: dict[str, Any] = {
             name: value.movedim(-1, 0).clone().cpu() for name, value in self.state.tensors().items()
         }
         return tensors | {"random": {"generator": self._random.get_state().clone()}}
 
     def load_simulator_state(self, state: dict[str, Any]) -> None:
-        """Restores what `simulator_state` returned.
+        """Restore what `simulator_state` returned.
 
         Raises:
             ValueError: if it comes from another number of envs or enemies.
@@ -279,7 +279,7 @@ class CombatEnv(EnvBase):
 
 
 def _numbers(what: str, names: Sequence[str], known: Sequence[str]) -> Tensor:
-    """Indices of names, (len(names),) int64."""
+    """Return the indices of names, (len(names),) int64."""
     unknown = sorted({name for name in names if name not in known})
     if unknown or isinstance(names, str) or not names:
         raise ValueError(f"{what} are {names!r}: expected a list of at least one of {list(known)}")

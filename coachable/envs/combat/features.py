@@ -67,7 +67,7 @@ def _enemy(small: bool) -> list[tuple[str, int]]:
 
 
 def observation_groups(observation: str) -> list[tuple[str, int]]:
-    """Name and width of every group, in order; enemies are sorted by distance, "2" marks the second one's.
+    """Return name and width of every group, in order; enemies are sorted by distance, and "2" marks the second one's.
 
     Args:
         observation: "full" (629 numbers) or "small" (190).
@@ -92,18 +92,18 @@ def observation_groups(observation: str) -> list[tuple[str, int]]:
 
 
 def observation_size(observation: str) -> int:
-    """Number of numbers."""
+    """Return the width of the observation."""
     return sum(width for _, width in observation_groups(observation))
 
 
 def encode_position(offset: Tensor) -> Tensor:
-    """Direction and distance of offsets (3, ..., N) [m] as (6, ..., N): x/d, y/d, z/d, sin d, sin 0.1 d, sin 0.01 d."""
+    """Encode offsets (3, ..., N) [m] as (6, ..., N): x/d, y/d, z/d, sin d, sin 0.1 d, sin 0.01 d (Appendix C)."""
     distance = offset.square().sum(0, keepdim=True).sqrt().clamp(min=1e-3)
     return torch.cat([offset / distance, distance.sin(), (0.1 * distance).sin(), (0.01 * distance).sin()])
 
 
 def to_camera(vector: Tensor, axes: Tensor) -> Tensor:
-    """World vectors (2, ..., N) as forward and left of the camera; `axes` is its forward direction (2, N).
+    """Return world vectors (2, ..., N) as forward and left of the camera; `axes` is its forward direction (2, N).
 
     The camera's pitch is left out: up stays up.
     """
@@ -113,7 +113,7 @@ def to_camera(vector: Tensor, axes: Tensor) -> Tensor:
 
 
 def _ground(position: Tensor, s: State, axes: Tensor) -> Tensor:
-    """Encoded places on the ground (2, k, N) or (2, N), seen from the eye."""
+    """Encode places on the ground (2, k, N) or (2, N), seen from the eye."""
     own = s.position.view(2, *[1] * (position.ndim - 2), -1)
     flat = to_camera(position - own, axes)
     return encode_position(torch.cat([flat, torch.full_like(flat[:1], -c.EYE_HEIGHT)]))
@@ -125,7 +125,7 @@ def one_hot_rows(index: Tensor, size: int) -> Tensor:
 
 
 def _body(s: State, traits: Traits, axes: Tensor) -> Tensor:
-    """Body centres from the eye (3, E, N), camera-aligned [m]."""
+    """Return body centres from the eye (3, E, N), camera-aligned [m]."""
     flat = to_camera(s.enemy_position - s.position.unsqueeze(1), axes)
     return torch.cat([flat, (s.enemy_z + traits.radius - c.EYE_HEIGHT).unsqueeze(0)])
 
@@ -151,7 +151,7 @@ def kept_features(s: State, traits: Traits) -> Tensor:
 
 
 def observe(s: State, traits: Traits, ammo: Tensor, observation: str, episode_steps: int) -> Tensor:
-    """The observation (N, 629) or (N, 190): a function of the state alone.
+    """Return the observation (N, 629) or (N, 190), a function of the state alone.
 
     Args:
         s: state.

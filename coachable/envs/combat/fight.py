@@ -20,7 +20,7 @@ from coachable.envs.combat.traps import closeness
 
 
 def run_step(s: State, pad_rows: Tensor, rules: Rules, noise: Noise, ammo_table: Tensor, sections: Tensor) -> Tensor:
-    """Advances the fights by one step. Changes `s`.
+    """Advance the fights by one step. Changes `s`.
 
     Args:
         s: state.
@@ -98,7 +98,7 @@ def _credit(s: State, totals: Totals, source: Tensor) -> dict[str, Tensor]:
 
 
 def _off_screen(s: State, traits: Traits, offset: Tensor, second: Tensor) -> Tensor:
-    """How far the nearest enemy is outside of a cone of 60 degrees around the camera's axis, in [0, 1.87]."""
+    """Return how far the nearest enemy is outside a cone of 60 degrees around the camera's axis, in [0, 1.87]."""
     rise = pick(s.enemy_z + traits.radius, second) - c.EYE_HEIGHT
     length = (offset.square().sum(0) + rise.square()).sqrt().clamp(min=1e-3)
     ahead = s.pitch.cos() * (offset[0] * s.yaw.cos() + offset[1] * s.yaw.sin()) + rise * s.pitch.sin()

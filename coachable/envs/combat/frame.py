@@ -57,7 +57,7 @@ class Noise:
 
     @classmethod
     def draw(cls, enemies: int, n: int, generator: torch.Generator) -> Noise:
-        """Draws everything; how many numbers depends on the shapes only."""
+        """Draw everything; how many numbers depends on the shapes only."""
         frames, device = c.FRAMES_PER_STEP, generator.device
         normal = torch.randn((frames, 2 + 2 * enemies, n), generator=generator, device=device)
         uniform = torch.rand((2 * frames + ATTACK_SLOTS + 2, enemies, n), generator=generator, device=device)
@@ -66,13 +66,13 @@ class Noise:
         return cls(normal[:, :2], aim, flip, shot, choice, pause[0], hit[0])
 
     def rows(self, rows: slice) -> Noise:
-        """The same for some of the fights."""
+        """Return the numbers of some of the fights."""
         return Noise(*(getattr(self, name)[..., rows] for name in self.__dataclass_fields__))
 
 
 @dataclass
 class Rules:
-    """What stays the same over a step, besides the pad.
+    """Quantities that stay the same over a step, besides the pad.
 
     Attributes:
         traits: of the machines.
@@ -92,7 +92,7 @@ class Rules:
 
 
 def run_frames(s: State, intent: Intent, rules: Rules, noise: Noise) -> Totals:
-    """All frames of a step. Changes `s` and `intent.loaded`."""
+    """Advance the fights by all frames of a step. Changes `s` and `intent.loaded`."""
     totals = Totals.zeros(s.enemy_hp, PART_SLOTS)
     strength = ranged_strength(s, rules.traits)
     for frame in range(c.FRAMES_PER_STEP):
@@ -103,7 +103,7 @@ def run_frames(s: State, intent: Intent, rules: Rules, noise: Noise) -> Totals:
 def run_frame(
     s: State, intent: Intent, rules: Rules, totals: Totals, strength: Tensor, noise: Noise, frame: int
 ) -> None:
-    """One frame, in the order of the design: player, what it does to the machine, the machine, what it does back."""
+    """Advance one frame: the player, what it does to the machine, the machine, what it does to the player."""
     traits, site = rules.traits, rules.site
     run_timers(s, intent)
     move_player(s, intent, traits, site)

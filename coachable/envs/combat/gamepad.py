@@ -56,7 +56,7 @@ for _head, _values in HEADS.items():
 
 
 def _legal(face: str, dpad: str, left_mode: str, right_mode: str) -> bool:
-    """Whether the thumbs reach what they press: a thumb on its stick presses no button, except L3 with the left."""
+    """Return whether the thumbs reach what they press: a thumb on its stick presses only L3, and that with the left."""
     left = dpad in ("none", "L3") if left_mode == "joystick" else dpad != "L3"
     return left and (face == "none" or right_mode == "buttons")
 
@@ -118,7 +118,7 @@ def canonical(action: Tensor) -> Tensor:
 
 
 def read_pad(rows: Tensor) -> Pad:
-    """Names the rows of a canonical action `(24, ...)`."""
+    """Name the rows of a canonical action `(24, ...)`."""
     names = (
         *("face.cross", "face.circle", "face.square", "dpad.up", "dpad.down", "dpad.left", "dpad.right", "dpad.L3"),
         *("left_shoulder.L1", "left_shoulder.L2", "right_shoulder.R1", "right_shoulder.R2"),

@@ -49,7 +49,7 @@ def ranged_strength(s: State, traits: Traits) -> Tensor:
 def decide(
     s: State, traits: Traits, strength: Tensor, gap: Tensor, shocked: Tensor, choice: Tensor, pause: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """One frame of the phases: idle, telegraph, active, recover, and staggered.
+    """Advance the phases by one frame: idle, telegraph, active, recover, and staggered.
 
     Args:
         s: state.
@@ -107,7 +107,7 @@ def decide(
 
 
 def move_machines(s: State, traits: Traits, site: Tensor, blow: Tensor, flip: Tensor) -> None:
-    """One frame of motion: approach or strafe, charge, turn, dive; bodies never overlap.
+    """Advance the motion by one frame: approach or strafe, charge, turn, dive; bodies never overlap.
 
     Args:
         s: state.
@@ -159,7 +159,7 @@ def strike_player(
     pillars: Tensor | None,
     blocks: Tensor,
 ) -> Tensor:
-    """One frame of the attacks: hits, shots that are fired and that land, and what the player suffers.
+    """Advance the attacks by one frame: hits, shots that are fired and that land, and what the player suffers.
 
     Args:
         s: state.
@@ -221,7 +221,7 @@ def _spread(roll: Tensor) -> Tensor:
 def _fire_shots(
     s: State, blow: Tensor, firing: Tensor, distance: Tensor, noise: Tensor, pillars: Tensor | None, blocks: Tensor
 ) -> Tensor:
-    """Starts the shots that are due in this frame, spread evenly over the active phase.
+    """Start the shots that are due in this frame, spread evenly over the active phase.
 
     Returns:
         (4, E, N) bool, slots that were filled.
@@ -244,7 +244,7 @@ def _fire_shots(
 
 
 def segment_blocked(start: Tensor, end: Tensor, pillars: Tensor) -> Tensor:
-    """Whether a pillar (2, 4) stands between points (2, E, N): (E, N) bool."""
+    """Return whether a pillar (2, 4) stands between points (2, E, N): (E, N) bool."""
     along = end - start
     length = along.square().sum(0).clamp(min=1e-6)
     x, y = pillars.view(2, -1, 1, 1)
@@ -255,7 +255,7 @@ def segment_blocked(start: Tensor, end: Tensor, pillars: Tensor) -> Tensor:
 
 
 def ray_blocked_at(position: Tensor, yaw: Tensor, pillars: Tensor) -> Tensor:
-    """Distance at which a level ray from (2, N) meets a pillar (2, 4), (N,) [m]; infinite if none."""
+    """Return the distance (N,) [m] at which a level ray from (2, N) meets a pillar (2, 4); infinite if none."""
     x, y = pillars.unsqueeze(-1)
     cos, sin = facing(yaw)
     offset_x, offset_y = x - position[0], y - position[1]  # (4, N)
@@ -266,7 +266,7 @@ def ray_blocked_at(position: Tensor, yaw: Tensor, pillars: Tensor) -> Tensor:
 
 
 def _suffer(s: State, hit: Tensor, charged: Tensor) -> None:
-    """The player takes a hit (N,) [HP]: health, stagger and a moment of safety."""
+    """Apply a hit (N,) [HP] to the player: health, stagger and a moment of safety."""
     s.hp = (s.hp - hit).clamp(min=0.0)
     heavy = hit > c.HEAVY_HIT
     stagger = torch.where(charged, c.CHARGE_STAGGER_TIME * c.FPS, c.STAGGER_TIME * c.FPS) * heavy

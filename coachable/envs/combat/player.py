@@ -40,7 +40,7 @@ from coachable.envs.combat.traits import RELOAD as RELOAD_FRAMES
 
 @dataclass
 class Intent:
-    """What holds for all six frames of a step.
+    """Intent of the player, which holds for all six frames of a step.
 
     Attributes:
         move: (2, N) left stick, at most of length 1.
@@ -73,36 +73,36 @@ class Intent:
 
 
 def rows_where(timers: Tensor, row: int, mask: Tensor, value: Tensor | float) -> None:
-    """Writes one row of a tensor that nobody else holds, where `mask` (N,)."""
+    """Write one row of a tensor that nobody else holds, where `mask` (N,)."""
     timers[row] = torch.where(mask, value, timers[row])
 
 
 def facing(yaw: Tensor) -> Tensor:
-    """Unit vectors (2, ...) of angles (...,)."""
+    """Return unit vectors (2, ...) of angles (...,)."""
     return torch.stack((yaw.cos(), yaw.sin()))
 
 
 def from_stick(stick: Tensor, forward: Tensor) -> Tensor:
-    """Stick (2, N), x right and y forward, as a direction of the world (2, N)."""
+    """Return a stick (2, N), x right and y forward, as a direction of the world (2, N)."""
     x, y = stick
     fx, fy = forward
     return torch.stack((fx * y + fy * x, fy * y - fx * x))
 
 
 def to_stick(direction: Tensor, yaw: Tensor) -> Tensor:
-    """Directions of the world (2, N) as a stick, x right and y forward: the inverse of `from_stick`."""
+    """Return directions of the world (2, N) as a stick, x right and y forward; the inverse of `from_stick`."""
     x, y = direction
     fx, fy = facing(yaw)
     return torch.stack((fy * x - fx * y, fx * x + fy * y))
 
 
 def element_of(section: Tensor, ammo_table: Tensor) -> Tensor:
-    """One-hot of the element of wheel sections (N,), (7, N)."""
+    """Return one-hots (7, N) of the elements of wheel sections (N,)."""
     return ammo_table[:, 11:].index_select(0, section).T
 
 
 def command(s: State, pad: Pad, traits: Traits, site: Tensor, ammo_table: Tensor, sections: Tensor) -> Intent:
-    """Acts on the pad at the start of a step: wheel, berries, tools, traps, evasions. Changes `s`.
+    """Act on the pad at the start of a step: wheel, berries, tools, traps, evasions. Changes `s`.
 
     Args:
         s: state.
@@ -160,7 +160,7 @@ def command(s: State, pad: Pad, traits: Traits, site: Tensor, ammo_table: Tensor
 
 
 def _choose_weapon(s: State, wheel: Tensor, stick: Tensor, timers: Tensor, sections: Tensor) -> None:
-    """The wheel: six sectors of 60 degrees, counter-clockwise from the right, each cut into its ammo sections."""
+    """Act on the wheel: six sectors of 60 degrees, counter-clockwise from the right, each with its ammo sections."""
     x, y = stick
     pointing = wheel & (stick.square().sum(0) > c.WHEEL_REACH**2)
     turns = torch.remainder(torch.atan2(y, x) / (2.0 * torch.pi), 1.0) * len(WEAPONS)
@@ -176,7 +176,7 @@ def _choose_weapon(s: State, wheel: Tensor, stick: Tensor, timers: Tensor, secti
 
 
 def _use_tools(s: State, pad: Pad, able: Tensor, timers: Tensor, forward: Tensor) -> None:
-    """Berries, the tool menu, and traps set ahead of the player."""
+    """Act on berries, the tool menu, and traps that are set ahead of the player."""
     eats = able & (pad.up > 0) & (s.hp < c.PLAYER_HP) & (s.berries > 0) & (timers[BERRY] <= 0)
     s.hp = torch.where(eats, (s.hp + c.BERRY_HP).clamp(max=c.PLAYER_HP), s.hp)
     s.berries = s.berries - 1.0 * eats
@@ -216,7 +216,7 @@ def _evade(s: State, pad: Pad, able: Tensor, timers: Tensor, forward: Tensor) ->
 
 
 def run_timers(s: State, intent: Intent) -> None:
-    """One frame of the timers, a finished reload, and regeneration."""
+    """Advance the timers, reloading and regeneration by one frame."""
     reloading = s.timers[RELOAD] > 0
     s.timers = (s.timers - 1.0).clamp(min=0.0)
     finished = reloading & (s.timers[RELOAD] <= 0)
@@ -227,7 +227,7 @@ def run_timers(s: State, intent: Intent) -> None:
 
 
 def move_player(s: State, intent: Intent, traits: Traits, site: Tensor) -> None:
-    """One frame of walking, dodging or sliding; walls and bodies stop it."""
+    """Advance walking, dodging or sliding by one frame; walls and bodies stop the player."""
     direction = from_stick(intent.move, facing(s.yaw))
     swinging, helpless = s.timers[MELEE] > 0, s.timers[HELPLESS].amax(0) > 0
     speed = intent.speed * torch.where(swinging, c.SWING_FACTOR, 1.0)
@@ -240,12 +240,12 @@ def move_player(s: State, intent: Intent, traits: Traits, site: Tensor) -> None:
 
 
 def inside_wall(position: Tensor, site: Tensor) -> Tensor:
-    """Positions (2, ..., N) brought inside the site's wall."""
+    """Return positions (2, ..., N) moved inside the site's wall."""
     return position * (site[3] / position.square().sum(0).sqrt().clamp(min=1.0)).clamp(max=1.0)
 
 
 def keep_out(position: Tensor, s: State, traits: Traits) -> Tensor:
-    """Player positions (2, N) moved out of the body of the nearest living enemy."""
+    """Return player positions (2, N) moved out of the body of the nearest living enemy."""
     second = nearest(s)
     centre, space = pick(s.enemy_position, second), pick(traits.radius, second) + c.BODY_RADIUS
     solid = pick(s.enemy_hp, second) > 0
@@ -256,7 +256,7 @@ def keep_out(position: Tensor, s: State, traits: Traits) -> Tensor:
 
 
 def turn_camera(s: State, intent: Intent, cone: float, share: float, bearing: Tensor, elevation: Tensor) -> None:
-    """One frame of the camera, with the aim assist.
+    """Advance the camera by one frame, with the aim assist.
 
     Args:
         s: state.
@@ -276,5 +276,5 @@ def turn_camera(s: State, intent: Intent, cone: float, share: float, bearing: Te
 
 
 def wrap(angle: Tensor) -> Tensor:
-    """Angle in [-pi, pi)."""
+    """Return the angle in [-pi, pi)."""
     return torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi

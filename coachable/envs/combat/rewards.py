@@ -1,4 +1,4 @@
-"""What a step is worth: raw components, task reward, style features and events, all free of the style."""
+"""Raw components of a step, and the task reward, style features and events made of them; none depends on the style."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ REWARD_SCALES = ("sim", "paper")
 
 
 def pack_components(**parts: Tensor) -> Tensor:
-    """Components (44, N) from named rows, `(width, N)` or `(N,)`.
+    """Pack components (44, N) from named rows, `(width, N)` or `(N,)`.
 
     Raises:
         ValueError: if the names are not those of `COMPONENTS`.
@@ -63,7 +63,7 @@ def pack_components(**parts: Tensor) -> Tensor:
 
 
 def _selection(sources: dict[str, list[tuple[int, float]]]) -> Tensor:
-    """(rows, 44) from `{row name: [(component, weight), ...]}`."""
+    """Return (rows, 44) from `{row name: [(component, weight), ...]}`."""
     matrix = torch.zeros(len(sources), NUM_COMPONENTS)
     for row, entries in enumerate(sources.values()):
         for component, weight in entries:
@@ -72,7 +72,7 @@ def _selection(sources: dict[str, list[tuple[int, float]]]) -> Tensor:
 
 
 def task_weights() -> Tensor:
-    """(44,) what each component adds to the task reward (paper)."""
+    """Return the weight of each component in the task reward, (44,) (paper)."""
     table, weights = load_table("task_rewards"), torch.zeros(NUM_COMPONENTS)
     for name in table.rows:
         weights[COMPONENT_SLICES[name]] = table.number(name, "weight")
@@ -80,7 +80,7 @@ def task_weights() -> Tensor:
 
 
 def style_weights(reward_scale: str) -> Tensor:
-    """(18, 44) the inner weights: row i is g_i as a sum of components (paper; `sim` scales removals down).
+    """Return the inner weights (18, 44): row i is g_i as a sum of components (paper; `sim` scales removals down).
 
     Raises:
         ValueError: if the scale is unknown.
@@ -123,7 +123,7 @@ def style_weights(reward_scale: str) -> Tensor:
 
 
 def event_components() -> Tensor:
-    """(18, 44) 0 or 1: an event fires where one of its components is above 0."""
+    """Return (18, 44) of 0 and 1: an event fires where one of its components is above 0."""
     weights = style_weights("paper")
     quiet = [COMPONENT_SLICES[name] for name in ("proximity", "lure", "ammo_change", "buildup")]
     fires = (weights != 0).float()
@@ -133,7 +133,7 @@ def event_components() -> Tensor:
 
 
 def style_counts(styles: Sequence[str]) -> Tensor:
-    """(len(styles), 44) 0 or 1: the damage, or the removals of the part styles, that count for each style."""
+    """Return (len(styles), 44) of 0 and 1: the damage, or for part styles the removals, that count for each style."""
     counts = event_components()
     counts[:, COMPONENT_SLICES["part_damage"]] = 0.0
     return counts[[STYLES.index(name) for name in styles]]

@@ -133,11 +133,11 @@ class State:
     features: Tensor
 
     def tensors(self) -> dict[str, Tensor]:
-        """Every field by name."""
+        """Return every field by name."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def replaced_where(self, mask: Tensor, other: State) -> State:
-        """`other` in the fights where `mask` (N,) holds, this state elsewhere."""
+        """Return `other` in the fights where `mask` (N,) holds, and this state elsewhere."""
         theirs = other.tensors()
         return State(**{name: torch.where(mask, theirs[name], mine) for name, mine in self.tensors().items()})
 
@@ -152,14 +152,14 @@ def nearest(state: State) -> Tensor:
 
 
 def pick(values: Tensor, second: Tensor) -> Tensor:
-    """Values (..., E, N) of the enemy that `nearest` chose, (..., N)."""
+    """Return the values (..., N) of the enemy that `nearest` chose from (..., E, N)."""
     return values[..., 0, :] if values.shape[-2] == 1 else torch.where(second, values[..., 1, :], values[..., 0, :])
 
 
 def start_fights(
     machine: Tensor, site: Tensor, traits: Traits, magazines: Tensor, traps: float, generator: torch.Generator
 ) -> State:
-    """Fresh fights: random places in the disc, orientations, weapon, cooldowns (paper: spawns within 25 m).
+    """Return new fights: random places in the disc, orientations, weapon, cooldowns (paper: spawns within 25 m).
 
     Args:
         machine: (E, N) int64.
@@ -244,7 +244,7 @@ def start_fights(
 
 
 def _spawn(enemies: int, uniform) -> tuple[Tensor, Tensor]:
-    """Player (2, N) and enemies (2, E, N), uniform in the disc, at least `SPAWN_GAP` apart."""
+    """Draw places of player (2, N) and enemies (2, E, N), uniform in the disc, at least `SPAWN_GAP` apart."""
     tries = 12  # one try is too close with probability 0.1 to 0.2; all of them, with less than 1e-8
     radius = c.SPAWN_RADIUS * uniform(0.0, 1.0, tries, 1 + enemies).sqrt()
     angle = uniform(-torch.pi, torch.pi, tries, 1 + enemies)

@@ -34,7 +34,7 @@ class Table:
     rows: Mapping[str, Mapping[str, str]]
 
     def fail(self, row: str, problem: str) -> ValueError:
-        """The error for a row."""
+        """Return the error for a row."""
         return ValueError(f"coachable/envs/combat/data/{self.file}, row {row!r}: {problem}")
 
     def number(self, row: str, column: str) -> float:
@@ -70,7 +70,7 @@ class Table:
 
 
 def parse_table(file: str, text: str) -> Table:
-    """Reads the text of a data file: a line of column names, a line of origins, one line per row.
+    """Read the text of a data file: a line of column names, a line of origins, one line per row.
 
     Raises:
         ValueError: if a row is incomplete or repeated, or an origin is unknown; names file and row.

@@ -82,13 +82,13 @@ _SHAPES = {
 
 
 def machine_table(device: torch.device) -> Tensor:
-    """All machines, (22, S) float32: what `look_up_traits` reads."""
+    """Return a table of all machines, (22, S) float32, for `look_up_traits`."""
     rows = [_machine_row(index, machine) for index, machine in enumerate(ALL_MACHINES.values())]
     return torch.from_numpy(np.stack(rows)).to(device)
 
 
 def look_up_traits(table: Tensor, machine: Tensor) -> Traits:
-    """Traits of machine numbers (E, N)."""
+    """Return the traits of machine numbers (E, N)."""
     found = table[machine].permute(2, 0, 1).contiguous()  # (S, E, N)
     pieces = list(found[:_SCALARS])
     first = _SCALARS
@@ -100,7 +100,7 @@ def look_up_traits(table: Tensor, machine: Tensor) -> Traits:
 
 
 def part_layout(machine: Machine) -> list[tuple[str, int]]:
-    """Type and units of every used part slot, shields first; units are spread as evenly as possible."""
+    """Return type and units of every used part slot, shields first; units are spread as evenly as possible."""
     layout = []
     for part, count, slots in zip(PART_TYPES, machine.parts, machine.slots(), strict=True):
         layout += [(part, count // slots + (i < count % slots)) for i in range(slots)]
@@ -108,7 +108,7 @@ def part_layout(machine: Machine) -> list[tuple[str, int]]:
 
 
 def unit_hp(machine: Machine, part: str) -> float:
-    """Health of one unit of a part [HP]."""
+    """Return the health of one unit of a part [HP]."""
     return c.UNIT_HP[part] * 1.6 * machine.hp**0.85
 
 
@@ -162,7 +162,7 @@ def _attack_rows(machine: Machine) -> np.ndarray:
 
 
 def ammo_table(device: torch.device) -> Tensor:
-    """Numbers and element one-hots of every wheel section, (18, 11 + 7) float32; section 3 i + j of weapon i."""
+    """Return numbers and element one-hots of every wheel section, (18, 11 + 7) float32; section 3 i + j of weapon i."""
     table = load_table("weapons")
     numbers = ("impact", "elemental", "tear", "buildup", "interval", "magazine", "reload", "speed", "spread_deg")
     rows = np.zeros((len(AMMO) * AMMO_SLOTS, 11 + len(ELEMENTS)))
@@ -178,12 +178,12 @@ def ammo_table(device: torch.device) -> Tensor:
 
 
 def ammo_sections(device: torch.device) -> Tensor:
-    """Number of ammo sections of each weapon, (6,) int64."""
+    """Return the number of ammo sections of each weapon, (6,) int64."""
     return torch.tensor([len(names) for names in AMMO], device=device)
 
 
 def site_table(device: torch.device) -> Tensor:
-    """Velocity lag, speed factor, pillars and wall radius of each site, (3, 4) float32."""
+    """Return velocity lag, speed factor, pillars and wall radius of each site, (3, 4) float32."""
     table = load_table("sites")
     columns = ("velocity_lag", "speed_factor", "pillars", "wall_radius")
     return torch.tensor([[table.number(site, column) for column in columns] for site in SITES], device=device)

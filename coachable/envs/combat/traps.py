@@ -29,7 +29,7 @@ class TrapNumbers:
 
     @classmethod
     def of(cls, traits: Traits) -> TrapNumbers:
-        """Looks the numbers up."""
+        """Look the numbers up."""
         table, device = load_table("traps"), traits.hp.device
         element = torch.zeros((len(ELEMENTS), len(TRAPS)), device=device)
         for i, trap in enumerate(TRAPS):
@@ -45,7 +45,7 @@ class TrapNumbers:
 
 
 def spring_traps(s: State, traits: Traits, numbers: TrapNumbers) -> tuple[Tensor, Tensor, Tensor]:
-    """One frame of the traps: an armed one fires when a machine is near, and is gone.
+    """Advance the traps by one frame: an armed trap fires when a machine is near, and disappears.
 
     Returns:
         (E, N) damage [HP], (7, E, N) build-up, (N,) damage to the player [HP].
@@ -67,7 +67,7 @@ def spring_traps(s: State, traits: Traits, numbers: TrapNumbers) -> tuple[Tensor
 
 
 def closeness(s: State, trap_type: Tensor) -> Tensor:
-    """How close the nearest enemy and the player are to a set trap, (2, N) in [0, 1].
+    """Return how close the nearest enemy and the player are to a set trap, (2, N) in [0, 1].
 
     Args:
         s: state.
@@ -80,7 +80,7 @@ def closeness(s: State, trap_type: Tensor) -> Tensor:
 
 
 def burn_player(s: State) -> Tensor:
-    """One frame of the zones: (N,) damage to the player [HP]."""
+    """Advance the zones by one frame and return the damage to the player (N,) [HP]."""
     s.hazard_timer = (s.hazard_timer - 1.0).clamp(min=0.0)
     inside = (s.position.unsqueeze(1) - s.hazard_position).square().sum(0) < c.HAZARD_RADIUS**2
     return (inside & (s.hazard_timer > 0)).any(0) * (c.HAZARD_DPS * c.DT)

@@ -177,7 +177,7 @@ class HumanoidEnv(EnvBase):
     # -- state -----------------------------------------------------------------------------------------------------
 
     def simulator_state(self) -> dict[str, Any]:
-        """Everything that the next step depends on, as tensors and plain values, for exact resumption."""
+        """Return everything that the next step depends on, as tensors and plain values, for exact resumption."""
         arrays = {
             "state": self.simulation.state,
             "course": self.course,
@@ -206,7 +206,7 @@ class HumanoidEnv(EnvBase):
         self._random.bit_generator.state = state["random"]
 
     def _start_episodes(self, rows: np.ndarray) -> None:
-        """Upright, feet on the ground, random arms, heading near the course."""
+        """Place walkers upright, with feet on the ground, random arms and a heading near the course."""
         positions = np.tile(self.simulation.model.dynamics.qpos0, (len(rows), 1))  # all joints at 0
         postures = self._random.integers(0, len(self._postures), len(rows))
         positions[:, self.simulation.model.arm_positions] = self._postures[postures]
@@ -223,7 +223,7 @@ class HumanoidEnv(EnvBase):
         self._observation[rows] = self._observe(kinematics, rows)
 
     def _find_postures(self) -> np.ndarray:
-        """Arm postures (M, 6) without self-collision, drawn uniformly within the joint limits."""
+        """Draw arm postures (M, 6) without self-collision, uniformly within the joint limits."""
         # Always the same set, so that an env's seed decides only which of them an episode starts with.
         random = np.random.default_rng(0)
         model = self.simulation.model
@@ -244,7 +244,7 @@ class HumanoidEnv(EnvBase):
         return self.simulation.positions[:, self.simulation.model.knee_positions]
 
     def _observe(self, kinematics: Kinematics, rows: np.ndarray) -> np.ndarray:
-        """Scaled observation (len(rows), 82) float32 of the states that `kinematics` belongs to."""
+        """Return the scaled observation (len(rows), 82) float32 of the states that `kinematics` belongs to."""
         course = self.course[rows]
         suite = suite_observation(self.simulation.positions[rows], self.simulation.velocities[rows], kinematics, course)
         pelvis = orientation_to_course(kinematics.pelvis_quaternion, course)

@@ -1,4 +1,4 @@
-"""What the humanoid emits for styles to judge: arm angles, and what the gait did in this control step."""
+"""Style features of the humanoid: arm angles, and what the gait did in this control step."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ STYLE_FEATURES_SIZE = TIMED_OUT + 1
 
 
 def pack_style_features(arms: np.ndarray, report: StepReport) -> np.ndarray:
-    """Raw quantities of both style terms under any theta.
+    """Pack the raw quantities of both style terms, which do not depend on theta.
 
     Args:
         arms: (N, 6) arm joint angles [rad].

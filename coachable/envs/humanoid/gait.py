@@ -65,7 +65,7 @@ class GaitTracker:
 
     @classmethod
     def create(cls, num_envs: int, step_max: float) -> GaitTracker:
-        """A tracker of `num_envs` walkers that have not started."""
+        """Return a tracker of `num_envs` walkers that have not started."""
         return cls(
             expected=np.zeros(num_envs, dtype=np.int64),
             clock=np.zeros(num_envs, dtype=np.int64),
@@ -98,7 +98,7 @@ class GaitTracker:
         self.stride_vector[rows] = self.step_vector[rows]
 
     def update(self, feet: np.ndarray, clearance: np.ndarray, knees: np.ndarray) -> StepReport:
-        """Account for one control step.
+        """Update the gait by one control step.
 
         Args:
             feet: (N, 2, 2) foot positions along and across the course [m].
@@ -148,7 +148,7 @@ class GaitTracker:
         self.knee_max = np.where(column, knees, self.knee_max)
 
     def observe(self) -> np.ndarray:
-        """What the policy must know about the step under way.
+        """Return what the policy observes of the step under way.
 
         Returns:
             (N, 11): one-hot of the expected foot 2, smallest and largest angle of each knee since the step began 4
@@ -161,6 +161,6 @@ class GaitTracker:
         )
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Every per-env array by name, for checkpoints."""
+        """Return every per-env array by name, for checkpoints."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}

@@ -8,6 +8,7 @@ our features need and every force switched off, so that one cheap step of it rea
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from importlib.resources import files
 
 import mujoco
@@ -70,7 +71,7 @@ class HumanoidModel:
 
 
 def load_spec() -> mujoco.MjSpec:
-    """The suite's humanoid as an editable specification."""
+    """Return the suite's humanoid as an editable specification."""
     suite = files("dm_control") / "suite"  # read as files: importing the suite loads every task and SciPy
     common = {f"common/{name}.xml": (suite / "common" / f"{name}.xml").read_bytes() for name in _INCLUDES}
     # dm_control prefixes its includes with "./", which MjSpec does not resolve.
@@ -78,8 +79,9 @@ def load_spec() -> mujoco.MjSpec:
     return mujoco.MjSpec.from_string(text, include=common)
 
 
+@cache
 def build_model() -> HumanoidModel:
-    """Compile the dynamics and kinematics models."""
+    """Compile the dynamics and kinematics models, once for all simulations of a process: only states change."""
     dynamics_spec = load_spec()
     for sensor in list(dynamics_spec.sensors):
         dynamics_spec.delete(sensor)

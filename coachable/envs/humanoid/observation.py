@@ -26,7 +26,7 @@ OBSERVATION_SCALE = np.concatenate([np.full(width, scale) for _, width, scale in
 
 
 def rotate_to_course(vectors: np.ndarray, course: np.ndarray) -> np.ndarray:
-    """Components along and across the course of horizontal vectors.
+    """Return the components of horizontal vectors along and across the course.
 
     Args:
         vectors: (N, ..., 2 or 3) world x, y (and z, which is left out).
@@ -42,7 +42,7 @@ def rotate_to_course(vectors: np.ndarray, course: np.ndarray) -> np.ndarray:
 
 
 def orientation_to_course(quaternion: np.ndarray, course: np.ndarray) -> np.ndarray:
-    """Unit quaternion (N, 4) of an orientation relative to the course, with w >= 0 so that each has one code."""
+    """Return the unit quaternion (N, 4) of an orientation relative to the course, with w >= 0 to make it unique."""
     half = 0.5 * course
     cosine, sine = np.cos(half), np.sin(half)
     w, x, y, z = quaternion.T
@@ -53,7 +53,7 @@ def orientation_to_course(quaternion: np.ndarray, course: np.ndarray) -> np.ndar
 
 
 def cosine_to_course(quaternion: np.ndarray, course: np.ndarray) -> np.ndarray:
-    """Cosine (N,) between the forward axis of bodies of the given orientations (N, 4) and the course."""
+    """Return the cosine (N,) between the forward axis of bodies of the given orientations (N, 4) and the course."""
     _, _, y, z = orientation_to_course(quaternion, course).T
     return 1.0 - 2.0 * (y * y + z * z)
 
@@ -61,7 +61,7 @@ def cosine_to_course(quaternion: np.ndarray, course: np.ndarray) -> np.ndarray:
 def suite_observation(
     positions: np.ndarray, velocities: np.ndarray, kinematics: Kinematics, course: np.ndarray
 ) -> np.ndarray:
-    """The 67 numbers of dm_control's humanoid, with horizontal velocities along and across the course.
+    """Return the 67 numbers of dm_control's humanoid, with horizontal velocities along and across the course.
 
     With the course along +x they equal the suite's own.
 

@@ -23,7 +23,7 @@ def move_reward(
     facing: np.ndarray,
     controls: np.ndarray,
 ) -> np.ndarray:
-    """Task reward `r_move` (Appendix C, DMC Humanoid), within [-1, 1].
+    """Return the task reward `r_move` (paper, Appendix C, DMC Humanoid), within [-1, 1].
 
     The factors are those of the suite's walk task. What differs, and what training settles on without it:
 

@@ -115,12 +115,12 @@ class HumanoidSimulation:
         return diverged
 
     def kinematics(self, rows: np.ndarray | None = None) -> Kinematics:
-        """Geometry of the current states, or of `rows` of them."""
+        """Return the geometry of the current states, or of `rows` of them."""
         states = self.state if rows is None else np.ascontiguousarray(self.state[rows])
         return self.kinematics_of(states)
 
     def kinematics_of(self, states: np.ndarray) -> Kinematics:
-        """Geometry of any (M, nstate) states."""
+        """Return the geometry of any (M, nstate) states."""
         _, readings = self._rollout.rollout(self.model.kinematics, self._kinematics_data, states, nstep=1)
         readings = readings[:, 0]
 

@@ -1,4 +1,4 @@
-"""Thirty-six requests to the humanoid: 28 name a pose, 24 a gait, 16 both (see docs/coach_live.md).
+"""Thirty-six requests to the humanoid: 28 name a pose, 24 a gait, 16 both (see docs/guides/coach_live.md).
 
 Each with what it means: the pose, and the step length relative to 0.475 m ("shorter", "longer") or in metres; None
 where the request leaves it alone.

@@ -136,7 +136,7 @@ def test_the_evaluation_has_the_switches(domain, tmp_path):
     timeline = list(csv.DictReader(rows["timeline"]))
     assert [row["requested"] for row in timeline] == ["melee"] * 10 + ["skykiller"] * 10
     assert (tmp_path / "timeline.png").stat().st_size > 5_000
-    settings = EvaluationSettings(episodes=1, switch_episodes=0, steps=5, progress=False)
+    settings = EvaluationSettings(episodes=1, switch_episodes=0, steps=2, progress=False, sweeps=sweeps)
     without = evaluate_fights(domain, agent, tmp_path / "b", settings)
     assert "switched" not in without and not (tmp_path / "b" / "timeline.csv").exists()
 

@@ -80,7 +80,7 @@ def test_fights_are_counted_by_style_and_machine(tmp_path):
         "combat", {"env": {"styles": ["melee", "corrosive_blastsling", "acid"], "observation": "small", "traps": 0}}
     )
     agent = _Idle(domain.make_space())
-    settings = EvaluationSettings(episodes=2, steps=4, progress=False)
+    settings = EvaluationSettings(episodes=2, steps=3, progress=False)
     report = evaluate_fights(domain, agent, tmp_path, settings)
     again = evaluate_fights(domain, agent, tmp_path / "again", settings)
     assert report == again and (tmp_path / "report.md").read_text() == report

@@ -90,7 +90,7 @@ def test_resource_reward_by_hand():
 
 
 def test_margin_reward_by_hand():
-    """Gaps (3, 2) and (0.5, 0.25) m, margins (2, 1): -2.25 (algorithms.md, section 10). A far car costs nothing."""
+    """Gaps (3, 2) and (0.5, 0.25) m, margins (2, 1): -1.5 - 0.75 = -2.25. A far car costs nothing."""
     space = aggressiveness_style_space()
     features = torch.tensor([[0.0] * 8 + [3.0, 2.0, 1.0, 0.5, 0.25, 1.0, 0.0, 0.0, 0.0]])
     theta = torch.tensor([[2.0, 1.0]])

@@ -1,4 +1,4 @@
-"""Scripted players: they fight as their name says, and the order of the weapons is the design's."""
+"""Scripted players: they fight as their names say, and the weapons have the intended order of strength."""
 
 import pytest
 import torch
@@ -27,13 +27,13 @@ def test_one_bot_per_ammo_and_the_spear():
 
 @pytest.mark.parametrize("name", ["Fire Light Arrow", "Spear"])
 def test_bots_act_validly_and_fight_as_they_are_called(name):
-    env = CombatEnv(6, seed=0, machines=["Longleg"], sites=["Arena"], components=True)
+    env = CombatEnv(12, seed=0, machines=["Longleg"], sites=["Arena"], components=True)
     env.reset()
     generator, damage = torch.Generator().manual_seed(0), torch.zeros(44)
-    for _ in range(60):
+    for _ in range(30):
         action = BOTS[name].act(env, generator)
-        assert GAMEPAD.spec((6,)).is_in(action)
-        damage += env._step(TensorDict({"action": action}, [6]))["components"].sum(0)
+        assert GAMEPAD.spec((12,)).is_in(action)
+        damage += env._step(TensorDict({"action": action}, [12]))["components"].sum(0)
     bow, spear = damage[1 + WEAPONS.index("Carja's Bane")], damage[7]
     assert damage[0] > 500
     torch.testing.assert_close(bow if name != "Spear" else spear, damage[0])

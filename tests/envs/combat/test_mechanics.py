@@ -174,7 +174,7 @@ def test_a_swing_lunges_to_a_near_machine_and_not_at_one_behind():
     assert part(components, "damage").item() == 0.0
 
 
-@pytest.mark.parametrize(("element", "rate", "seconds"), [(ACID, 5, 14), (BURNING, 9, 12)])
+@pytest.mark.parametrize(("element", "rate", "seconds"), [(ACID, 5, 4), (BURNING, 9, 3)])
 def test_damage_over_time_counts_for_the_state_and_for_its_source(element, rate, seconds):
     env = still_fight("Grimhorn")  # weak to acid, strong to fire
     env.state.state_timer[element] = seconds * 30.0
@@ -273,11 +273,11 @@ def test_a_shot_at_a_part_does_body_and_tear_damage():
 
 
 def test_no_weapon_parts_no_ranged_attack():
-    env = CombatEnv(256, seed=0, machines=["Ravager", "Slaughterspine"], sites=["Arena"])
+    env = CombatEnv(512, seed=0, machines=["Ravager", "Slaughterspine"], sites=["Arena"])
     env.reset()
     env.state.count = env.state.count * (1.0 - env.traits.part_type[1])
     kinds = set()
-    for _ in range(60):
+    for _ in range(30):
         act_plain(env, NOTHING)
         kind = env.traits.attacks[KIND].gather(0, env.state.attack.unsqueeze(0))[0]
         kinds |= set(kind[env.state.phase == ACTIVE].int().tolist())
@@ -290,10 +290,10 @@ def act_plain(env, action):
 
 
 def test_flyers_dive_and_shoot_only_and_come_down_to_dive():
-    env = CombatEnv(64, seed=0, machines=["Sunwing"], sites=["Arena"])
+    env = CombatEnv(256, seed=0, machines=["Sunwing"], sites=["Arena"])
     env.reset()
     kinds, low = set(), 0
-    for _ in range(60):
+    for _ in range(30):
         act_plain(env, NOTHING)
         kind = env.traits.attacks[KIND].gather(0, env.state.attack.unsqueeze(0))[0]
         active = env.state.phase == ACTIVE
@@ -305,13 +305,13 @@ def test_flyers_dive_and_shoot_only_and_come_down_to_dive():
 
 
 def test_hidden_attacks_never_show_an_id_and_others_do():
-    env = CombatEnv(256, seed=0, sites=["Arena"], observation="small")
+    env = CombatEnv(512, seed=0, sites=["Arena"], observation="small")
     env.reset()
     names = dict(zip(MACHINE_NAMES, ALL_MACHINES.values(), strict=True))
     assert len(names) == 22
     first = 48 + 7 + 16 + 13 + 2 + 7 + 14 + 5 + 1  # of the attack id
     shown = 0
-    for _ in range(40):
+    for _ in range(20):
         observation = act_plain(env, NOTHING)["observation"]
         kind = env.traits.attacks[KIND].gather(0, env.state.attack.unsqueeze(0))[0, 0]
         ids = observation[:, first : first + 4]

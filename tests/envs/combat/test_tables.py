@@ -1,4 +1,4 @@
-"""The data files against the paper's tables, line by line, and against the design's own numbers."""
+"""The data files against the paper's tables, line by line, and against the numbers that are ours."""
 
 import pytest
 import torch

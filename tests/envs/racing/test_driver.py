@@ -32,7 +32,7 @@ def test_it_keeps_to_the_road_of_an_oval():
 @pytest.mark.slow
 @pytest.mark.parametrize("car, bound", [("gt3", 120.0), ("x2019", 96.0)])
 def test_a_lap_of_lakeside(car, bound):
-    """racing.md, 3.3: a naive preview driver needs 115.5 s and 93.4 s."""
+    """The bounds leave room for a simple driver, which needs 115.5 s and 93.4 s."""
     env = RacingEnv(3, track="lakeside", car=car, seed=0, scenarios=ALONE)
     line = minimum_curvature_line(env.track, margin=2.0)
     driver = LineFollower(env.track, env.garage.typical, grip=0.93, line=line)

@@ -136,7 +136,7 @@ def test_unknown_tracks_are_refused():
 
 @pytest.mark.parametrize(("car", "expected"), [("gt3", 113.9), ("x2019", 88.8)])
 def test_quasi_steady_state_laps(car, expected):
-    """On Lakeside's centre line to 2 % (racing.md, section 4); the line of least curvature is 4 to 8 % faster."""
+    """Compare with known laps of Lakeside's centre line to 2 %; the line of least curvature is 4 to 8 % faster."""
     track = load_track("lakeside")
     line = minimum_curvature_line(track)
     assert (np.abs(line) <= 6.0 - 1.2 + 1e-9).all()

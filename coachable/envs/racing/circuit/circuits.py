@@ -129,7 +129,7 @@ def generate_track(
 
 
 def _candidate(random: np.random.Generator, turns: int, length: float) -> list[tuple[float, float, float]]:
-    """Turns that go round once, more of them one way than the other."""
+    """Draw the sections of a closed circuit as (straight [m], angle [deg], radius [m]), with more turns one way."""
     sign = random.choice([-1.0, 1.0])
     angles = random.uniform(30.0, 130.0, turns) * np.where(random.random(turns) < 0.68, 1.0, -1.0)
     angles *= 1.0 - 0.4 * (angles < 0)

@@ -55,7 +55,7 @@ _Sum = TypeVar("_Sum", PlanarForce, Damping)
 
 
 def sum_wheels(parts: _Sum) -> _Sum:
-    """Adds up the wheels, the first axis of every field, first to last."""
+    """Add up the wheels, the first axis of every field, first to last."""
     return type(parts)(*(reduce(operator.add, field.unbind(0)) for field in parts))
 
 

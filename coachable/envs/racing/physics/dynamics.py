@@ -107,7 +107,7 @@ def total_mass(car: Car, fuel: Tensor) -> Tensor:
 
 
 def wheel_loads(car: Car, wheels: WheelSet, s: CarState, front_lift: Tensor | float = 1.0) -> Tensor:
-    """Vertical loads (4, N) [N]: the front gains under braking, the outside in corners (racing.md, 3.1)."""
+    """Return the vertical loads (4, N) [N]: braking loads the front wheels, cornering the outer ones."""
     mass = total_mass(car, s.fuel)
     lift = 0.5 * AIR_DENSITY * car.lift_area * (s.vx * s.vx + s.vy * s.vy)
     lift = lift * (1.0 + wheels.front * (front_lift - 1.0))
@@ -129,7 +129,7 @@ def wheel_grip(car: Car, load: Tensor, heat: Tensor, wear: Tensor, compound: Ten
 def substep(
     packed: Tensor, packed_inputs: Tensor, car: Car, wheels: WheelSet, resources: Resources, h: float
 ) -> Tensor:
-    """Advances the cars by h.
+    """Advance the cars by h.
 
     Args:
         packed: (29, N) rows of `CarState`.

@@ -61,7 +61,7 @@ def drive_wheels(
     fuel: Tensor,
     h: float,
 ) -> Drive:
-    """One substep of the engine and the automatic gearbox (racing.md, 3.1).
+    """Advance the engine and the automatic gearbox by one substep.
 
     Partial throttle shifts up earlier, which saves fuel under the game-like law.
 

@@ -25,7 +25,7 @@ def tangent(angle: Any) -> Any:
 
 
 def slip_curve(rho: Tensor, shape: Any) -> Tensor:
-    """Normalised force over normalised slip, sin(C atan(B ρ)) / ρ; B puts the peak at ρ = 1 (racing.md, 3.1)."""
+    """Normalised force over normalised slip, sin(C atan(B ρ)) / ρ; B puts the peak at ρ = 1."""
     stiffness = tangent(math.pi / 2 / shape)
     return torch.sin(shape * torch.atan(stiffness * rho)) / rho
 
@@ -54,7 +54,7 @@ def roll_wheel(
     peak_tangent: Any,
     shape: Any,
 ) -> WheelForces:
-    """Advances a wheel's spin implicitly and gives the tyre's forces (racing.md, 3.1).
+    """Advance a wheel's spin implicitly and return the tyre's forces.
 
     The spin settles within a fraction of a substep, so the force is linearised as a secant, k (ωR - v). Brake torque is
     Coulomb friction: it stops the wheel exactly and never turns it backwards.

@@ -1,4 +1,4 @@
-"""What races emit for styles to judge: slip, metres gained, wear, fuel, gaps to other cars."""
+"""Style features of racing: slip, metres gained, wear, fuel, and gaps to other cars."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ def style_features_size(cars: int) -> int:
 
 
 def anyone_near(features: Tensor) -> Tensor:
-    """Whether an opponent is near, (...) bool, from style features (..., F) of races."""
+    """Return whether an opponent is near, (...) bool, from style features (..., F) of races."""
     return gap_columns(features)[2].any(-1)
 
 
 def anyone_beside(features: Tensor, *, within: float) -> Tensor:
-    """Whether an opponent overlaps lengthwise and is less than so many metres away sideways, (...) bool."""
+    """Return whether an opponent overlaps lengthwise and is less than so many metres away sideways, (...) bool."""
     long, lat, near = gap_columns(features)
     return ((near > 0.0) & (long == 0.0) & (lat < within)).any(-1)
 

@@ -39,7 +39,7 @@ class Garage:
             self._assemble()
 
     def reset(self, seed: int) -> None:
-        """Forgets which cars spin."""
+        """Forget which cars spin."""
         if self.pooled:
             self.spinning.zero_()
 
@@ -62,7 +62,7 @@ class Garage:
         return {"spinning": self.spinning.clone(), "model": self.model.clone()} if self.pooled else {}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Restores what `state` returned."""
+        """Restore what `state` returned."""
         if self.pooled:
             self.spinning = state["spinning"].to(self.device, copy=True)
             self.model = state["model"].to(self.device, copy=True)

@@ -89,7 +89,7 @@ def own_car(car: Car, wheels: WheelSet, packed: Tensor, run: Run, tyres: TyreVie
 
 
 def car_columns(car: Car) -> Tensor:
-    """What sort of car it is, (N, 8), for races with different cars; the car's fields must be tensors."""
+    """Return the columns that describe the car, (N, 8), for races with different cars; its fields must be tensors."""
     base = car.front_axle + car.rear_axle
     columns = (
         car.mass / 1500.0,
@@ -131,7 +131,7 @@ def course_ahead(course: Course, packed: Tensor, run: Run, points: int) -> Tenso
 
 
 def _squeezed(distance: Tensor) -> Tensor:
-    """Of a distance [m] something near 1 at 50 m, in which half a metre between cars side by side still counts."""
+    """Scale a distance [m] to about 1 at 50 m, such that half a metre between cars side by side stays visible."""
     return torch.asinh(distance * 0.5) * 0.25
 
 

@@ -1,4 +1,4 @@
-"""Between two control steps: what the cars are told to do, and what became of it. Pure functions, fit for compiling."""
+"""The task between two control steps: inputs of the cars, verdict, observation. Pure functions that can be compiled."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Referee:
     wrong_way_time: float = WRONG_WAY_TIME
 
     def command(self, packed: Tensor, packed_run: Tensor, action: Tensor, compound: Tensor) -> tuple[Tensor, Tensor]:
-        """State and inputs of the next control step.
+        """Return the state and the inputs of the next control step.
 
         Args:
             packed: (29, N).
@@ -128,7 +128,7 @@ class Referee:
         group: Tensor | None = None,
         impact: Tensor | None = None,
     ) -> Verdict:
-        """What became of a control step.
+        """Return the verdict on a control step.
 
         Args:
             old: (29, N) state before it.

@@ -16,7 +16,7 @@ _CLEAR_BEHIND, _CLEAR_AHEAD = 60.0, 15.0  # [m], nobody may be there
 
 
 def way_clear(course: Course, run: Run, stranded: Tensor, group: Tensor) -> Tensor:
-    """Whether nobody is near a car along the track, (N,) bool. Of stranded cars in one place, the first goes first.
+    """Return whether the track near a car is clear, (N,) bool; the first of several stranded cars has priority.
 
     Args:
         course: track.

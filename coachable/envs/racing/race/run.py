@@ -80,7 +80,7 @@ FRAME = slice(Run._fields.index("node_x"), RUN_ROWS)
 
 
 class TyreView(NamedTuple):
-    """Of each wheel, (4, N)."""
+    """Slip and grip of each wheel, (4, N)."""
 
     load: Tensor  # [N]
     ratio: Tensor  # slip ratio
@@ -131,7 +131,7 @@ def look_around(s: Tensor, offset: Tensor, group: Tensor, length: float) -> Othe
 
 
 def slipstream(others: Others, car_length: Tensor | float) -> Tensor:
-    """Strength of the strongest slipstream, (A, B), in [0, 1] (racing.md, 3.1)."""
+    """Return the strength of the strongest slipstream that each car is in, (A, B), in [0, 1]."""
     clear = others.gap - car_length  # from nose to tail
     beside = torch.clamp(1.0 - others.aside.abs() / SLIPSTREAM_WIDTH, min=0.0)
     strength = torch.exp(-clear.clamp(min=0.0) / SLIPSTREAM_LENGTH) * beside

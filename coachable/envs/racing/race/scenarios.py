@@ -58,11 +58,11 @@ def drift_scenarios() -> tuple[Scenario, ...]:
 
 
 def race_scenarios(cars: int, shares: Mapping[str, float] | None = None) -> tuple[Scenario, ...]:
-    """The mixture of multi-tables (racing.md, 5.3).
+    """Return the kinds of starts that a training mixes (paper, Appendix C: scenarios of Gran Turismo).
 
     Args:
         cars: of a race.
-        shares: of each kind of start, by its name; by default the design's, and with one car those without opponents.
+        shares: of each kind of start, by its name; by default `_SHARES`, and with one car those without opponents.
 
     Raises:
         ValueError: if there is no such kind.
@@ -84,7 +84,7 @@ def race_scenarios(cars: int, shares: Mapping[str, float] | None = None) -> tupl
 
 
 def rolling_start(cars: int) -> tuple[Scenario, ...]:
-    """Races only: every car in one group."""
+    """Return rolling starts of races in which every car is in one group."""
     return (Scenario("rolling", 1.0, "rolling", cars),)
 
 
@@ -106,12 +106,12 @@ class Conditions:
 
     @classmethod
     def resources(cls) -> Conditions:
-        """Of the tyre and fuel task."""
+        """Return the conditions of the tyre and fuel task."""
         return cls(wear=True, fuel=None, heat=None, compounds=RACE_COMPOUNDS)
 
     @classmethod
     def any_compound(cls) -> Conditions:
-        """Of the aggressiveness task: nine compounds, uniformly."""
+        """Return the conditions of the aggressiveness task: nine compounds, drawn uniformly."""
         return cls(compounds=tuple(range(len(COMPOUNDS))))
 
 
@@ -157,7 +157,7 @@ class Starter:
         self._straight = _longest_straight(course)
 
     def draw(self, seed: Tensor, episode: Tensor, car: Car) -> Starts:
-        """Starts of all races from their seeds (B,) and episode numbers (B,)."""
+        """Draw the starts of all races from their seeds (B,) and episode numbers (B,)."""
         u = uniforms(seed, episode, _DRAWS, self.cars)
         first = u[:, 0]  # (rows, B), what cars of a race share
         scenario = torch.bucketize(first[0], self._bounds, right=True)

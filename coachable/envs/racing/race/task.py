@@ -1,4 +1,4 @@
-"""Task reward and style features of one control step (racing.md, section 6)."""
+"""Task reward and style features of one control step (docs/domains/racing.md, Rewards)."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Outcome(NamedTuple):
 
 
 def metres_gained(before: Others, after: Others) -> tuple[Tensor, Tensor]:
-    """Metres gained on cars ahead and on cars behind, (A, B) each.
+    """Return the metres gained on cars ahead and on cars behind, (A, B) each.
 
     A car counts while it is at most 40 m ahead or 20 m behind, before or after the step. It is ahead or behind by where
     it was before.
@@ -79,7 +79,7 @@ def metres_gained(before: Others, after: Others) -> tuple[Tensor, Tensor]:
 
 
 def impacts_of(impact: Tensor, cars: int) -> Tensor:
-    """Each car's contacts with the others, (A - 1, A, B), from those of the pairs (A // 2, A, B)."""
+    """Return each car's contacts with the others, (A - 1, A, B), from those of the pairs (A // 2, A, B)."""
     rows: list[Tensor] = []
     for k in range(1, cars):
         rows.append(impact[k - 1] if k <= cars // 2 else impact[cars - k - 1].roll(-k, 0))
@@ -87,7 +87,7 @@ def impacts_of(impact: Tensor, cars: int) -> Tensor:
 
 
 def contacts(impact: Tensor, before: Others, cars: int) -> tuple[Tensor, Tensor]:
-    """Whether a car was touched, and Σ squared relative speed where the other car was ahead, (A, B) each."""
+    """Return whether a car was touched, and Σ squared relative speed where the other car was ahead, (A, B) each."""
     each = impacts_of(impact, cars)
     touched = (each > 0.0).any(0).to(impact.dtype)
     return touched, torch.where(before.gap > 0.0, each, 0.0).sum(0)
@@ -109,7 +109,7 @@ def task_reward(weights: TaskWeights, state: CarState, run: Run, tyres: TyreView
 def style_features(
     old: Tensor, new: Tensor, tyres: TyreView, outcome: Outcome, bodies: Bodies | None, group: Tensor | None
 ) -> Tensor:
-    """Raw quantities of all style terms, (N, F): see `styles`.
+    """Return the raw quantities of all style terms, (N, F).
 
     Args:
         old: (29, N) state before the step.
