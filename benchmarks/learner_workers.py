@@ -87,10 +87,11 @@ def _updates(learner, batch):
     return run
 
 
-def coachable(precision, fused=True, order="simultaneous"):
+def coachable(precision, fast="on", order="simultaneous"):
     import torch
     from torchrl.objectives import SACLoss
 
+    from coachable.fast import accelerate
     from coachable.networks import make_critic, make_gaussian_actor
     from coachable.training.learner import Learner
 
@@ -104,7 +105,8 @@ def coachable(precision, fused=True, order="simultaneous"):
         alpha_init=ALPHA,
     )
     loss.make_value_estimator(gamma=GAMMA)
-    learner = Learner(loss, actor_lr=LR, critic_lr=LR, tau=TAU, precision=precision, fused=fused, update_order=order)
+    learner = Learner(loss, actor_lr=LR, critic_lr=LR, tau=TAU, precision=precision, update_order=order)
+    accelerate(learner, fast)
     return _updates(learner, _batch())
 
 
@@ -112,6 +114,7 @@ def our_loss(name, precision="bf16"):
     """Another of our losses on the same trunks, policy first as in the paper's recipes."""
     import torch
 
+    from coachable.fast import accelerate
     from coachable.losses import CategoricalSACLoss, CatRACLoss, QRSACLoss, RACLoss
     from coachable.networks import make_critic, make_gaussian_actor, make_hl_gauss_critic
     from coachable.training.learner import Learner
@@ -133,6 +136,7 @@ def our_loss(name, precision="bf16"):
     loss = make_loss(make_gaussian_actor(OBS, ACT, _Space(), widths), [critic(), critic()], alpha=ALPHA, **arguments)
     loss.make_value_estimator(gamma=GAMMA)
     learner = Learner(loss, actor_lr=LR, critic_lr=LR, tau=TAU, precision=precision, update_order="policy_first")
+    accelerate(learner)
     return _updates(learner, _batch())
 
 
@@ -141,6 +145,7 @@ def gamepad(entropy_samples):
     import torch
 
     from coachable.envs.combat.gamepad import GAMEPAD
+    from coachable.fast import accelerate
     from coachable.losses import CatRACLoss
     from coachable.networks.hl_gauss_critic import make_hl_gauss_critic
     from coachable.networks.mixed import make_mixed_actor
@@ -153,6 +158,7 @@ def gamepad(entropy_samples):
     loss = CatRACLoss(actor, critics, alpha=ALPHA, entropy_samples=entropy_samples)
     loss.make_value_estimator(gamma=GAMMA)
     learner = Learner(loss, actor_lr=LR, critic_lr=LR, tau=TAU, precision="bf16", update_order="policy_first")
+    accelerate(learner)
     batch = _batch()
     batch["action"] = GAMEPAD.spec(batch.batch_size).rand()
     return _updates(learner, batch)
@@ -380,7 +386,7 @@ WORKERS = {
     "coachable-fp32": lambda: coachable("fp32"),
     "coachable-bf16": lambda: coachable("bf16"),
     "coachable-bf16-policy-first": lambda: coachable("bf16", order="policy_first"),
-    "coachable-bf16-autocast": lambda: coachable("bf16", fused=False),
+    "coachable-bf16-autocast": lambda: coachable("bf16", fast="off"),
     "coachable-qr_sac": lambda: our_loss("qr_sac"),
     "coachable-rac": lambda: our_loss("rac"),
     "coachable-cat_rac": lambda: our_loss("cat_rac"),

@@ -11,6 +11,7 @@ from hydra.utils import instantiate
 from recipe_config import save_config
 from tensordict import NestedKey
 
+from coachable.fast import accelerate
 from coachable.keys import STYLE_FEATURES
 from coachable.replay import EventTableBuffer
 from coachable.replay.replay_files import replay_bytes
@@ -113,6 +114,7 @@ def build_training(
     if config["init_from"]:
         initialise_from(config["init_from"], actor, loss_module, space, config["init_new_observations"])
     learner = make(config["learner"])(loss_module)
+    accelerate(learner, config.get("fast", "auto"))  # runs that were saved before this setting existed have none
 
     # Collector
     collector = make(config["collector"])(

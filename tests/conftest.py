@@ -11,13 +11,9 @@ import pytest
 # Imported inside the fixtures: a test that needs none of this should not pay for it.
 
 if os.environ.get("COACHABLE_SANITIZE") == "1":  # see CONTRIBUTING.md
-    import torch
-
-    from coachable.fast import memory, native
+    from coachable.fast import native
 
     native._FLAGS += ("-fsanitize=address,undefined", "-fno-sanitize-recover=undefined", "-g")
-    # Each tensor's memory of its own, so that what lies beyond its end is known to be nobody's.
-    memory.Arena.empty = lambda _, *shape, dtype=torch.float32: torch.empty(shape, dtype=dtype)
 
 
 @pytest.fixture(scope="session", autouse=True)

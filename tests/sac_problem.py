@@ -1,14 +1,16 @@
-"""Small losses with style, and batches for them."""
+"""Small losses with style, learners of them, and batches."""
 
 import torch
 from tensordict import TensorDict
 from torchrl.objectives import SACLoss
 
 from coachable.distributions.action_heads import ActionHeads
+from coachable.fast import accelerate
 from coachable.losses import CatRACLoss, QRSACLoss
 from coachable.networks import make_critic, make_gaussian_actor
 from coachable.networks.hl_gauss_critic import make_hl_gauss_critic
 from coachable.networks.mixed import make_mixed_actor
+from coachable.training import Learner
 
 OBS, ACT = 7, 3
 WIDTHS = (64, 48)
@@ -48,6 +50,13 @@ def cat_rac():
     heads = ActionHeads(axes=ACT)
     critics = [make_hl_gauss_critic(OBS, ACT, ScaledStyle(), WIDTHS) for _ in range(2)]
     return CatRACLoss(make_mixed_actor(OBS, heads, ScaledStyle(), WIDTHS), critics, entropy_samples=10)
+
+
+def make_learner(loss, fast, **options):
+    """A learner in plain torch, or one with hand-written passes."""
+    learner = Learner(loss, **options)
+    assert accelerate(learner, "on" if fast else "off") is fast
+    return learner
 
 
 def make_batch(*shape, seed=1):

@@ -46,10 +46,6 @@ GROUP = "coachable.domains"  # of the entry points, through which domains are fo
 # Imports that still point up. Each has to be needed; remove it here when it is gone.
 EXCEPTIONS = {
     ("coachable", "coachable.coach.session.session"),  # `CoachSession`, resolved on first use
-    ("coachable.networks.residual", "coachable.fast.fused"),
-    ("coachable.training.learner", "coachable.fast.accelerate"),
-    ("coachable.training.learner", "coachable.fast.flat_adam"),
-    ("coachable.training.lean_sac", "coachable.fast.accelerate"),
 }
 
 

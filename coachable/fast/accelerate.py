@@ -2,127 +2,118 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import Any, Literal, get_args
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
-from torchrl.objectives import LossModule
+from torchrl.objectives import LossModule, SoftUpdate
 
-from coachable.fast.ensemble import CriticEnsemble, Triple, make_plan, planned_copy, residual_networks
+from coachable.fast.ensemble import CriticEnsemble, Triple, make_plan, planned_copy, residual_networks, use_plan
 from coachable.fast.flat import FlatBuffers
+from coachable.fast.flat_adam import FlatAdam
 from coachable.fast.fused import Plan
+from coachable.training.backend import Backend
+from coachable.training.learner import Learner
+
+__all__ = ["Acceleration", "When", "accelerate", "obstacle"]
+
+_LOG = logging.getLogger(__name__)
+
+When = Literal["auto", "on", "off"]
 
 
-class Acceleration:
-    """Hand-written passes for a loss's policy and critics.
+def accelerate(learner: Learner, when: When | bool = "auto") -> bool:
+    """Switch a learner to hand-written passes, a flat optimiser and, with a C compiler, the kernels of `kernels.c`.
 
-    Inside of :meth:`active`, gradients go to the parameters' `.grad`, which are parts of one buffer each for the policy
-    and the critics. Outside, the loss is as it was. Call :meth:`bind` if its parameters are others since.
+    The results are the same up to rounding, and so is the format of `learner.state_dict()`.
 
     Args:
-        loss_module: A loss for which :meth:`supports` holds.
-        dtype: Dtype of the matrix products, `None` for that of the parameters.
+        learner: The learner. Its optimisers keep their state.
+        when: `"auto"` switches where that is possible and logs why where it is not, `"on"` raises there, and `"off"`
+            does nothing. `True` and `False` stand for `"on"` and `"off"`, because YAML reads these words so.
+
+    Returns:
+        Whether the learner is switched.
+
+    Raises:
+        ValueError: If `when` is unknown, or `"on"` is impossible.
+    """
+    if not isinstance(when, bool) and when not in get_args(When):
+        raise ValueError(f"fast={when}: expected one of {', '.join(get_args(When))}")
+    if when in ("off", False):
+        return False
+    if reason := obstacle(learner.loss_module):
+        if when in ("on", True):
+            raise ValueError(f"fast=on is impossible: {reason}. Expected fast=auto or fast=off")
+        _LOG.info("fast=auto leaves the learner in plain torch: %s", reason)
+        return False
+    learner.use_backend(Acceleration)
+    return True
+
+
+def obstacle(loss_module: LossModule) -> str | None:
+    """Return why a loss cannot be accelerated, or `None` if it can.
+
+    It can if all networks are residual ones on a CPU, are trained entirely, and evaluate their critics as TorchRL's
+    `SACLoss` does.
+    """
+    loss: Any = loss_module
+    if device := {p.device.type for p in loss_module.parameters()} - {"cpu"}:
+        return f"the networks are on the device {device.pop()}, not on a CPU"
+    if not hasattr(loss, "_vmap_qnetworkN0"):
+        return f"{type(loss).__name__} does not evaluate its critics as SACLoss does"
+    networks = {"actor_network_params", "qvalue_network_params"}
+    parts = {(name.split(".")[0], p.requires_grad) for name, p in loss_module.named_parameters()}
+    if others := {part for part, trained in parts if trained} - networks - {"log_alpha"}:
+        return f"the loss trains {', '.join(sorted(others))} besides its policy and critics"
+    if frozen := {part for part, trained in parts if not trained} & networks:
+        return f"some parameters of {', '.join(sorted(frozen))} are frozen"
+    critic = loss.qvalue_network
+    if not isinstance(critic, TensorDictModule) or not isinstance(critic.module, nn.Module):
+        return "the critic is not a module inside a TensorDictModule"
+    for name, network in (("policy", loss.actor_network), ("critic", critic)):
+        if not residual_networks(network):
+            return f"the {name} has parameters outside of residual networks"
+    if not any(name.startswith("target_qvalue_network_params") for name, _ in loss_module.named_buffers()):
+        return "the critics have no target network"
+    return None
+
+
+class Acceleration(Backend):
+    """Hand-written passes for a loss's policy and critics, and `FlatAdam` for both.
+
+    During an update, gradients go to the parameters' `.grad`, which are parts of one buffer each for the policy and the
+    critics. Between updates, the loss is as it was.
+
+    Args:
+        loss_module: A loss without an :func:`obstacle`.
+        precision: Precision of the matrix products.
+        target_updater: Its rate is that of the target networks, which the optimiser of the critics moves.
     """
 
-    def __init__(self, loss_module: LossModule, dtype: torch.dtype | None) -> None:
+    compiles = False
+
+    def __init__(self, loss_module: LossModule, precision: Literal["fp32", "bf16"], target_updater: SoftUpdate) -> None:
+        super().__init__(loss_module, precision, target_updater)
         loss: Any = loss_module
+        dtype = torch.bfloat16 if precision == "bf16" else None
         self._loss = loss
         self._actor_names = [name for name, _ in loss.actor_network.named_parameters()]
         self._critic_names = [name for name, _ in loss.qvalue_network.named_parameters()]
         actor, critic, target = self._leaves()
-        self.actor = FlatBuffers(actor, dtype, trained=True)
-        self.critic = FlatBuffers(critic, dtype, trained=True)
-        self.target = FlatBuffers(target, dtype, trained=False)
-        self._buffers = (self.actor, self.critic, self.target)
+        self._actor = FlatBuffers(actor, dtype, trained=True)
+        self._critic = FlatBuffers(critic, dtype, trained=True)
+        self._target = FlatBuffers(target, dtype, trained=False)
+        self._buffers = (self._actor, self._critic, self._target)
         self._prepare()
-
-    def _leaves(self) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
-        """Parameters of policy, critics and target critics that the loss has now."""
-        loss = self._loss
-        return (
-            _leaves(loss.actor_network_params, self._actor_names),
-            _leaves(loss.qvalue_network_params, self._critic_names),
-            _leaves(loss.target_qvalue_network_params, self._critic_names),
-        )
-
-    def _prepare(self) -> None:
-        """Make what works on the tensors in the buffers."""
-        critic = self._loss.qvalue_network
-        members = self.critic.tensors[0].shape[0]
-        self._trained = [*zip(self.actor.originals, self.actor.grads, strict=True)]
-        self._trained += zip(self.critic.originals, self.critic.grads, strict=True)
-        self._policies = residual_networks(self._loss.actor_network)
-        self._actor_plans = {
-            name: make_plan(network, name, _triples(self.actor, self._actor_names), 0, trained=True)
-            for name, network in self._policies.items()
-        }
-
-        def plans(flat: FlatBuffers, trained: bool) -> dict[str, Plan]:
-            tensors = _triples(flat, self._critic_names)
-            networks = residual_networks(critic).items()
-            return {name: make_plan(net, name, tensors, members, trained=trained) for name, net in networks}
-
-        self._critic_plans = plans(self.critic, True)
-        self.trained_critics = _critics(critic, self._critic_plans)
-        self.frozen_critics = _critics(critic, plans(self.critic, False))
-        self.target_critics = _critics(critic, plans(self.target, False))
-        self._ensemble = CriticEnsemble(critic, self._choose, members)
-
-    def bind(self) -> None:
-        """Go on with the loss's parameters as they are now, after they were replaced, cast or given other memory.
-
-        Raises:
-            RuntimeError: If :meth:`supports` does not hold any more.
-        """
-        if not self.supports(self._loss):
-            raise RuntimeError(
-                f"{type(self._loss).__name__} changed since its learner was made (another device, frozen parameters or "
-                "other networks): make a new learner for it"
-            )
-        for flat, tensors in zip(self._buffers, self._leaves(), strict=True):
-            flat.bind(tensors)
-        self._prepare()
-
-    @staticmethod
-    def supports(loss_module: LossModule) -> bool:
-        """Whether all networks are residual ones, on a CPU, and the critics are evaluated in SACLoss's way."""
-        loss: Any = loss_module
-        critic = getattr(loss, "qvalue_network", None)
-        networks = {"actor_network_params", "qvalue_network_params"}
-        parts = {(name.split(".")[0], p.requires_grad) for name, p in loss_module.named_parameters()}
-        return (
-            hasattr(loss, "_vmap_qnetworkN0")
-            and {part for part, trained in parts if trained} <= networks | {"log_alpha"}
-            and not any(part in networks for part, trained in parts if not trained)
-            and all(p.device.type == "cpu" for p in loss_module.parameters())
-            and isinstance(critic, TensorDictModule)
-            and isinstance(critic.module, nn.Module)
-            and bool(residual_networks(critic))
-            and bool(residual_networks(loss.actor_network))
-            and any(name.startswith("target_qvalue_network_params") for name, _ in loss_module.named_buffers())
-        )
-
-    def _choose(self, params: TensorDictBase) -> nn.Module:
-        loss = self._loss
-        if params is loss.qvalue_network_params:
-            return self.trained_critics
-        if params is loss.target_qvalue_network_params:
-            return self.target_critics
-        first: Tensor = next(iter(params.values(True, True)))  # pyright: ignore[reportAssignmentType]
-        own: Tensor = next(iter(loss.qvalue_network_params.values(True, True)))
-        if first.data_ptr() == own.data_ptr() and not first.requires_grad:
-            return self.frozen_critics
-        raise RuntimeError(
-            f"{type(loss).__name__} evaluates its critics with parameters that are neither its own nor its targets': "
-            "pass fused=False to the learner"
-        )
 
     @contextmanager
-    def active(self) -> Iterator[None]:
+    def updating(self) -> Iterator[None]:
         """Evaluate policy and critics with the hand-written passes inside the block."""
         loss = self._loss
         ordinary = loss._vmap_qnetworkN0
@@ -134,25 +125,100 @@ class Acceleration:
             parameter.grad = grad
         loss._vmap_qnetworkN0 = self._ensemble
         for name, network in self._policies.items():
-            network.use_plan(self._actor_plans[name])
+            use_plan(network, self._actor_plans[name])
         try:
             yield
         finally:
             loss._vmap_qnetworkN0 = ordinary
             for network in self._policies.values():
-                network.use_plan(None)
+                use_plan(network, None)
             for parameter, _ in self._trained:
                 parameter.grad = None
 
-    def buffers(self, name: str) -> tuple[FlatBuffers, FlatBuffers | None]:
-        """Buffers of the `"actor"` or the `"critic"`, and those of its target network."""
-        return (self.actor, None) if name == "actor" else (self.critic, self.target)
+    def evaluating(self) -> AbstractContextManager[Any]:
+        """Return a context without effect, because the passes choose their precision themselves."""
+        return nullcontext()
 
-    def gradient(self, name: str) -> Tensor:
-        """Gradient of the `"actor"` or the `"critic"` as one vector, after the backward pass."""
-        for plan in (self._actor_plans if name == "actor" else self._critic_plans).values():
+    def make_optimizer(self, name: str, params: list[nn.Parameter], lr: float, eps: float) -> torch.optim.Adam:
+        """Return `FlatAdam` for the policy and the critics, `torch.optim.Adam` for the temperature."""
+        if name == "alpha":
+            return super().make_optimizer(name, params, lr, eps)
+        flat, target = (self._actor, None) if name == "actor" else (self._critic, self._target)
+        return FlatAdam(params, flat, target, 1.0 - self.target_updater.eps, lr=lr, eps=eps)
+
+    def gradient_norm(self, name: str, params: list[nn.Parameter]) -> Tensor:
+        """Return the norm of the gradient, which is zero where no backward pass came by."""
+        if name == "alpha":
+            return super().gradient_norm(name, params)
+        plans, flat = (self._actor_plans, self._actor) if name == "actor" else (self._critic_plans, self._critic)
+        for plan in plans.values():
             plan.finish()
-        return (self.actor if name == "actor" else self.critic).grad
+        return torch.linalg.vector_norm(flat.grad)
+
+    def move_targets(self) -> None:
+        """Do nothing, because the optimiser of the critics has moved the targets."""
+
+    def follow(self) -> None:
+        """Continue with the parameters that the loss has now.
+
+        Raises:
+            RuntimeError: If the loss has an :func:`obstacle` now.
+        """
+        if reason := obstacle(self._loss):
+            raise RuntimeError(
+                f"{type(self._loss).__name__} changed since its learner was accelerated: {reason}. Make a new learner "
+                "for it"
+            )
+        for flat, tensors in zip(self._buffers, self._leaves(), strict=True):
+            flat.bind(tensors)
+        self._prepare()
+
+    def _leaves(self) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
+        """Return the parameters of policy, critics and target critics that the loss has now."""
+        loss = self._loss
+        return (
+            _leaves(loss.actor_network_params, self._actor_names),
+            _leaves(loss.qvalue_network_params, self._critic_names),
+            _leaves(loss.target_qvalue_network_params, self._critic_names),
+        )
+
+    def _prepare(self) -> None:
+        """Make the plans and modules that work on the tensors in the buffers."""
+        critic = self._loss.qvalue_network
+        members = self._critic.tensors[0].shape[0]
+        self._trained = [*zip(self._actor.originals, self._actor.grads, strict=True)]
+        self._trained += zip(self._critic.originals, self._critic.grads, strict=True)
+        self._policies = residual_networks(self._loss.actor_network)
+        self._actor_plans = {
+            name: make_plan(network, name, _triples(self._actor, self._actor_names), 0, trained=True)
+            for name, network in self._policies.items()
+        }
+
+        def plans(flat: FlatBuffers, trained: bool) -> dict[str, Plan]:
+            tensors = _triples(flat, self._critic_names)
+            networks = residual_networks(critic).items()
+            return {name: make_plan(net, name, tensors, members, trained=trained) for name, net in networks}
+
+        self._critic_plans = plans(self._critic, True)
+        self._trained_critics = _critics(critic, self._critic_plans)
+        self._frozen_critics = _critics(critic, plans(self._critic, False))
+        self._target_critics = _critics(critic, plans(self._target, False))
+        self._ensemble = CriticEnsemble(critic, self._choose, members)
+
+    def _choose(self, params: TensorDictBase) -> nn.Module:
+        loss = self._loss
+        if params is loss.qvalue_network_params:
+            return self._trained_critics
+        if params is loss.target_qvalue_network_params:
+            return self._target_critics
+        first: Tensor = next(iter(params.values(True, True)))  # pyright: ignore[reportAssignmentType]
+        own: Tensor = next(iter(loss.qvalue_network_params.values(True, True)))
+        if first.data_ptr() == own.data_ptr() and not first.requires_grad:
+            return self._frozen_critics
+        raise RuntimeError(
+            f"{type(loss).__name__} evaluates its critics with parameters that are neither its own nor its targets': "
+            "do not accelerate its learner (fast=off)"
+        )
 
 
 def _critics(critic: TensorDictModule, plans: dict[str, Plan]) -> nn.Module:

@@ -1,4 +1,4 @@
-"""Evaluate the critics of a loss together, without vmap, and build the plans of residual networks."""
+"""Build the plans of residual networks, and evaluate the critics of a loss together, without vmap."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from coachable.fast.fused import Member, Plan
-from coachable.networks.residual import ResidualMLP
+from coachable.fast.fused import Layer, Member, Plan, residual_network
+from coachable.networks.residual import ResidualBlock, ResidualMLP
 
 Triple = tuple[Tensor, Tensor, Tensor | None]
-"""A parameter, its rounded copy, and where its gradient goes."""
+"""Parameter, its rounded copy, and the place of its gradient."""
 
 
 def residual_networks(module: nn.Module) -> dict[str, ResidualMLP]:
@@ -25,8 +25,35 @@ def residual_networks(module: nn.Module) -> dict[str, ResidualMLP]:
     return networks if inside == everything else {}
 
 
+def layers_of(network: ResidualMLP) -> tuple[Layer, ...]:
+    """Return the shapes of the layers of a residual network."""
+    return tuple(
+        Layer(
+            in_features=block.linear.in_features,
+            out_features=block.linear.out_features,
+            side=block.side,
+            narrowing=block.narrowing,
+            eps=block.norm.eps if block.norm is not None else 0.0,
+            norm=block.norm is not None,
+        )
+        for block in network.blocks
+        if isinstance(block, ResidualBlock)
+    )
+
+
+def use_plan(network: ResidualMLP, plan: Plan | None) -> None:
+    """Evaluate a residual network with `plan` from now on, or layer by layer again (`None`).
+
+    With a plan, gradients go where the plan says and not into the parameters' `.grad`.
+    """
+    if plan is None:
+        vars(network).pop("forward", None)
+    else:
+        vars(network)["forward"] = lambda *inputs: residual_network(plan, inputs)
+
+
 def make_plan(network: ResidualMLP, name: str, tensors: Mapping[str, Triple], members: int, trained: bool) -> Plan:
-    """Plan of a residual network from tensors that were moved into flat buffers.
+    """Return the plan of a residual network whose gradients and rounded copies are in flat buffers.
 
     Args:
         network: The network, for its shapes and the names of its parameters.
@@ -49,11 +76,11 @@ def make_plan(network: ResidualMLP, name: str, tensors: Mapping[str, Triple], me
         )
 
     every = [member(k) for k in range(members)] if members else [member(None)]
-    return Plan(network.layers(), network.head is not None, every, stacked=members > 0)
+    return Plan(layers_of(network), network.head is not None, every, stacked=members > 0)
 
 
 def planned_copy(module: nn.Module, plans: Mapping[str, Plan]) -> nn.Module:
-    """Copy the structure of `module`, not its tensors, and let its residual networks follow `plans`."""
+    """Copy the structure of `module`, not its tensors, and evaluate the residual networks of the copy with `plans`."""
 
     def shell(part: nn.Module) -> nn.Module:
         new = copy.copy(part)
@@ -62,12 +89,12 @@ def planned_copy(module: nn.Module, plans: Mapping[str, Plan]) -> nn.Module:
 
     root = shell(module)
     for name, network in residual_networks(root).items():
-        network.use_plan(plans[name])
+        use_plan(network, plans[name])
     return root
 
 
 class CriticEnsemble:
-    """Stands in for the vmapped critic of a TorchRL loss (`loss._vmap_qnetworkN0`).
+    """Replacement of the vmapped critic of a TorchRL loss, `loss._vmap_qnetworkN0`.
 
     Called with a tensordict and a stack of parameters, it evaluates the K critics and returns a tensordict
     `[K, *batch]` that holds the critic's output keys.

@@ -8,25 +8,23 @@ import torch
 from torch import Tensor
 from torch.autograd.graph import increment_version
 
-from coachable.fast.memory import Arena
-
 _ALIGN = 32  # elements: one cache line of 64 bytes at bfloat16, so that products see aligned matrices
 
 
 class FlatBuffers:
-    """What the hand-written passes keep besides the parameters, which stay where they are.
+    """Gradients and rounded copies for the hand-written passes; the parameters themselves stay where they are.
 
     Args:
         tensors: Float tensors on one device, trained parameters or not.
-        low_dtype: Dtype of the rounded copies; `None` to use the tensors themselves.
-        trained: Whether there are gradients.
+        low_dtype: Dtype of the rounded copies; with `None` the passes use the tensors themselves.
+        trained: Whether the passes compute gradients.
 
     Attributes:
-        originals: The tensors as they were given.
-        tensors: The same memory as that of the originals, without autograd.
+        originals: The given tensors.
+        tensors: The memory of the originals, without autograd.
         low: The rounded copies.
         grad: All gradients as one vector.
-        grads: The gradients, parts of `grad`.
+        grads: The gradients of the tensors, parts of `grad`.
     """
 
     def __init__(self, tensors: Sequence[Tensor], low_dtype: torch.dtype | None, trained: bool) -> None:
@@ -35,10 +33,10 @@ class FlatBuffers:
         self.bind(tensors)
 
     def bind(self, tensors: Sequence[Tensor]) -> None:
-        """Take other tensors, or the same ones after their memory was replaced. The gradients become zero.
+        """Use other tensors, or the same ones after their memory was replaced. The gradients become zero.
 
         Args:
-            tensors: As in the constructor. One that is not contiguous is made so in place, because kernels read rows.
+            tensors: As in the constructor. Kernels read rows, so others become contiguous in place.
         """
         for tensor in tensors:
             if not tensor.is_contiguous():
@@ -50,24 +48,23 @@ class FlatBuffers:
         self._versions: list[int] = []
 
     def refresh(self) -> None:
-        """Renew the rounded copies, if the tensors changed (through `.data` they change unseen)."""
+        """Round the tensors again if they changed. Changes through `.data` go unnoticed."""
         versions = [tensor._version for tensor in self.tensors]
         if self.rounds and versions != self._versions:
             torch._foreach_copy_(self.low, self.tensors)
             self._versions = versions
 
     def renewed(self) -> None:
-        """Take note that a kernel changed the tensors, of which torch knows nothing, and renewed their copies."""
+        """Tell torch that a kernel changed the tensors, and remember that it rounded them again."""
         increment_version(self.tensors)
         self._versions = [tensor._version for tensor in self.tensors]
 
     def _views(self, dtype: torch.dtype) -> tuple[Tensor, list[Tensor]]:
-        """A buffer of zeros, and its parts in the shapes of the tensors."""
+        """Return a buffer of zeros and its parts in the shapes of the tensors."""
         starts, total = [], 0
         for tensor in self.tensors:
             starts.append(total)
             total += -(-tensor.numel() // _ALIGN) * _ALIGN
-        on_cpu = self.tensors[0].device.type == "cpu"
-        buffer = Arena().zeros(total, dtype=dtype) if on_cpu else self.tensors[0].new_zeros(total, dtype=dtype)
+        buffer = self.tensors[0].new_zeros(total, dtype=dtype)
         parts = zip(starts, self.tensors, strict=True)
         return buffer, [buffer[start : start + t.numel()].view(t.shape) for start, t in parts]

@@ -11,16 +11,16 @@ from torch import Tensor, nn
 from torch.autograd.graph import increment_version
 
 from coachable.fast.flat import FlatBuffers
-from coachable.fast.memory import Arena
 from coachable.fast.native import KERNEL_THREADS, load_kernels
 
-__all__ = ["FlatAdam", "place_moments"]
+__all__ = ["FlatAdam"]
 
 
 class FlatAdam(torch.optim.Adam):
     """Adam for a network of the hand-written passes.
 
-    The same numbers as `torch.optim.Adam`, whose state it keeps, and its state dict.
+    It gives the same numbers as `torch.optim.Adam` and keeps the same state, so that a state dict of either loads into
+    the other.
 
     Args:
         params: The trained parameters.
@@ -29,9 +29,6 @@ class FlatAdam(torch.optim.Adam):
         tau: Polyak rate by which the target moves after every step.
         lr: Learning rate.
         eps: Adam's epsilon.
-
-    Attributes:
-        grad_norm: Norm of the gradient of the last step.
     """
 
     def __init__(
@@ -46,17 +43,19 @@ class FlatAdam(torch.optim.Adam):
     ) -> None:
         super().__init__(params, lr=lr, eps=eps, fused=True)
         self._flat, self._target, self._tau = flat, target, tau
-        self.grad_norm = torch.zeros(())
-        place_moments(self)
+        self._complete_state()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore a state of this class or of `torch.optim.Adam`."""
         super().load_state_dict(state_dict)
-        place_moments(self)
+        self._complete_state()
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """Leave the gradients alone, because every backward pass writes them anew."""
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Step on the gradients in the buffers, renew the rounded copies, move the target."""
+        """Step on the gradients in the buffers, renew the rounded copies, and move the target."""
         (group,) = self.param_groups
         (beta1, beta2), rate, eps = group["betas"], group["lr"], group["eps"]
         flat, target, tensors = self._flat, self._target, self._flat.tensors
@@ -67,14 +66,12 @@ class FlatAdam(torch.optim.Adam):
             taken = steps[0].item() + 1.0
             rate, root = rate / (1.0 - beta1**taken), (1.0 - beta2**taken) ** -0.5
             table = _table(flat, target, first, second, steps)
-            squares = kernels[torch.float32].adam(table, len(tensors), rate, beta1, beta2, root, eps, self._tau)
-            self.grad_norm = torch.scalar_tensor(squares**0.5)
+            kernels[torch.float32].adam(table, len(tensors), rate, beta1, beta2, root, eps, self._tau)
             flat.renewed()
             if target is not None:
                 target.renewed()
             return
         torch._foreach_add_(steps, 1.0)
-        self.grad_norm = torch.linalg.vector_norm(flat.grad)
         options = {"lr": rate, "beta1": beta1, "beta2": beta2, "eps": eps, "weight_decay": 0.0}
         torch._fused_adam_(tensors, flat.grads, first, second, [], steps, **options, amsgrad=False, maximize=False)
         increment_version(tensors)  # torch's function does not
@@ -83,11 +80,20 @@ class FlatAdam(torch.optim.Adam):
             torch._foreach_lerp_(target.tensors, tensors, self._tau)
             target.refresh()
 
+    def _complete_state(self) -> None:
+        """Make the moments contiguous tensors of this optimiser's own, zeros where there are none yet."""
+        for parameter in self._flat.originals:
+            state = self.state[parameter]
+            state.setdefault("step", torch.zeros(()))
+            for name in ("exp_avg", "exp_avg_sq"):
+                moment = torch.zeros(parameter.shape, dtype=parameter.dtype)
+                state[name] = moment.copy_(state[name]) if name in state else moment
+
 
 def _table(
     flat: FlatBuffers, target: FlatBuffers | None, first: list[Tensor], second: list[Tensor], steps: list[Tensor]
 ) -> Any:
-    """Sizes and addresses for one call of the kernel, see `Parameter` in kernels.c."""
+    """Return sizes and addresses for one call of the kernel, see `Parameter` in kernels.c."""
     columns = [flat.tensors, first, second, flat.grads, flat.low if flat.rounds else []]
     columns += [[], []] if target is None else [target.tensors, target.low if target.rounds else []]
     columns += [steps]
@@ -95,15 +101,3 @@ def _table(
     addresses = [[tensor.data_ptr() for tensor in column] or nothing for column in columns]
     rows = zip([tensor.numel() for tensor in flat.tensors], *addresses, strict=True)
     return (ctypes.c_int64 * (len(steps) * (1 + len(columns))))(*itertools.chain.from_iterable(rows))
-
-
-def place_moments(optimizer: torch.optim.Adam) -> None:
-    """Place Adam's moments on huge pages, zeros if there are none yet."""
-    arena = Arena()
-    for group in optimizer.param_groups:
-        for p in group["params"]:
-            state = optimizer.state[p]
-            state.setdefault("step", torch.zeros(()))
-            for name in ("exp_avg", "exp_avg_sq"):
-                moment = arena.zeros(*p.shape, dtype=p.dtype)
-                state[name] = moment.copy_(state[name]) if name in state else moment

@@ -1,8 +1,8 @@
 """Residual networks with forward and backward by hand, for one network or an ensemble of equal ones.
 
-The same numbers as `ResidualMLP` gives layer by layer, with less work: no autograd node per operation, weights that
-were cast to bfloat16 once per update instead of at every use, gradients written to where the optimiser reads them, and
-no gradient that nobody asked for. The learner uses it during its updates, on CPUs.
+They compute the same numbers as `ResidualMLP` with less work: there is no autograd node per operation, weights are cast
+to bfloat16 once per update instead of at every use, gradients go to where the optimiser reads them, and only the
+gradients that are needed are computed.
 
 Numerics at bfloat16: products accumulate in float32; layer-norm statistics, heads, parameters and their gradients are
 float32; activations between the layers are bfloat16.
@@ -41,7 +41,7 @@ class Plan:
         self.head = head
         self.members = tuple(members)
         self.stacked = stacked
-        # Stands for the parameters in autograd's graph, so that an output without other trained inputs has a gradient.
+        # Represents the parameters in autograd's graph, so that outputs require a gradient even if no input does.
         self.anchor = torch.zeros((), requires_grad=True) if members[0].grads else None
         self.written = False
         self._spaces: dict[tuple[int, ...], list[Workspace]] = {}
@@ -55,18 +55,18 @@ class Plan:
         return self.members[0].parameters[-1].shape[0] if self.head else self.layers[-1].out_features
 
     def begin(self) -> None:
-        """Forget the gradients: the next backward pass overwrites them, further ones add to them."""
+        """Start new gradients: the next backward pass overwrites the old ones, and later passes add to it."""
         self.written = False
 
     def finish(self) -> None:
-        """Make the gradients zero if no backward pass came by."""
+        """Set the gradients to zero if there was no backward pass since :meth:`begin`."""
         if not self.written:
             for member in self.members:
                 for grad in member.grads:
                     grad.zero_()
 
     def acquire(self, widths: Sequence[int], rows: int, keep: bool) -> Workspace | TorchPasses:
-        """Means of one evaluation: prepared memory for the compiled kernels, or torch's operations without them.
+        """Return what evaluates the plan once: prepared memory for the compiled kernels, or torch's operations.
 
         Args:
             widths: Widths of the inputs.
@@ -83,7 +83,7 @@ class Plan:
         return free.pop() if free else Workspace(kernels, self.layers, self.members, widths, rows, keep)
 
     def release(self, passes: Workspace | TorchPasses) -> None:
-        """Give prepared memory back after its last use."""
+        """Take prepared memory back for the next evaluation of the same size."""
         if isinstance(passes, Workspace):
             free = self._spaces.get((passes.rows, passes.keep, *passes.widths))
             if free is not None:
@@ -151,7 +151,7 @@ class _Residual(torch.autograd.Function):
 
 
 def _columns(widths: Sequence[int], needs: Sequence[bool]) -> slice | None:
-    """Smallest range of input columns that covers all inputs which need a gradient."""
+    """Return the smallest range of input columns that covers all inputs which need a gradient."""
     start, wanted = 0, []
     for width, need in zip(widths, needs, strict=True):
         if need:
@@ -161,9 +161,9 @@ def _columns(widths: Sequence[int], needs: Sequence[bool]) -> slice | None:
 
 
 def _active_rows(grad: Tensor, step: int) -> Tensor | None:
-    """Rows of `(rows, out)` with a gradient, filled up to a multiple of `step`; `None` if most rows have one.
+    """Return the rows of `(rows, out)` with a gradient, filled up to a multiple of `step`; `None` if most have one.
 
-    The policy's loss follows the smaller of the critics' values, so each critic receives about half of the rows.
+    The policy's loss uses the smaller of the critics' values, so each critic has a gradient in about half of the rows.
     """
     count = grad.shape[0]
     active = (grad != 0).any(-1)

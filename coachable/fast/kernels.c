@@ -1,5 +1,5 @@
 /* Element-wise halves of a residual layer, one pass over memory each: see workspace.py; and the optimiser's step, see
- * adam.py.
+ * flat_adam.py.
  *
  * The layer is out = relu(gamma * (z + bias - mean) * rstd + beta) + skip, row by row, with z the matrix product in
  * bfloat16 or float32 (the file includes itself once for each) and everything else here in float32. Plain C without
@@ -44,12 +44,11 @@ typedef struct {
     float *steps; /* taken so far */
 } Parameter;
 
-static inline __attribute__((always_inline)) float adam_on(
-    int64_t from, int64_t to, float *restrict value, float *restrict first, float *restrict second,
+static inline __attribute__((always_inline)) void adam_on(
+    int64_t size, float *restrict value, float *restrict first, float *restrict second,
     const float *restrict grad, uint16_t *restrict rounded, float *restrict target, uint16_t *restrict target_rounded, int rounds, int follows,
     float rate, float beta1, float beta2, float root, float eps, float tau) {
-    float squares = 0.0f;
-    for (int64_t j = from; j < to; j++) {
+    for (int64_t j = 0; j < size; j++) {
         const float g = grad[j], m = first[j] + (1.0f - beta1) * (g - first[j]);
         const float v = beta2 * second[j] + (1.0f - beta2) * g * g;
         const float x = value[j] - rate * m / (sqrtf(v) * root + eps);
@@ -62,32 +61,25 @@ static inline __attribute__((always_inline)) float adam_on(
             target[j] = y;
             if (rounds) target_rounded[j] = narrow(y);
         }
-        squares += g * g;
     }
-    return squares;
 }
 
 /* One step of Adam with rate = learning rate / (1 - beta1^t) and root = 1 / sqrt(1 - beta2^t); the targets, if there
- * are any, then move by tau, and the rounded copies, if any, are renewed. Returns the gradient's squared norm. */
-double adam(const Parameter *parameters, int64_t count, float rate, float beta1, float beta2, float root, float eps,
+ * are any, then move by tau, and the rounded copies, if any, are renewed. */
+void adam(const Parameter *parameters, int64_t count, float rate, float beta1, float beta2, float root, float eps,
           float tau) {
-    double squares = 0.0;
     for (int64_t i = 0; i < count; i++) {
         const Parameter p = parameters[i];
         *p.steps += 1.0f;
-        for (int64_t from = 0; from < p.size; from += 4096) { /* short sums round little */
-            const int64_t to = from + 4096 < p.size ? from + 4096 : p.size;
-#define ADAM(rounds, follows)                                                                                       \
-    adam_on(from, to, p.value, p.first, p.second, p.grad, p.rounded, p.target, p.target_rounded, rounds, follows, rate, \
+#define ADAM(rounds, follows)                                                                                     \
+    adam_on(p.size, p.value, p.first, p.second, p.grad, p.rounded, p.target, p.target_rounded, rounds, follows, rate, \
             beta1, beta2, root, eps, tau)
-            if (p.rounded)
-                squares += p.target ? ADAM(1, 1) : ADAM(1, 0);
-            else
-                squares += p.target ? ADAM(0, 1) : ADAM(0, 0);
+        if (p.rounded)
+            p.target ? ADAM(1, 1) : ADAM(1, 0);
+        else
+            p.target ? ADAM(0, 1) : ADAM(0, 0);
 #undef ADAM
-        }
     }
-    return squares;
 }
 
 #define ELEMENT uint16_t

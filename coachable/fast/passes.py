@@ -12,7 +12,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Layer:
-    """Shape facts of one residual layer."""
+    """Shapes of one residual layer."""
 
     in_features: int
     out_features: int
@@ -23,12 +23,12 @@ class Layer:
 
     @property
     def tensors(self) -> int:
-        """Number of parameters: weight, bias, and the layer norm's scale and shift."""
+        """Return the number of parameters: weight, bias, and the layer norm's scale and shift."""
         return 4 if self.norm else 2
 
     @property
     def skip_columns(self) -> tuple[int, int, int]:
-        """Where `fit` reads in the input, where it adds to the output, and how many columns."""
+        """Return where `fit` reads in the input, where it adds to the output, and how many columns."""
         n, m = self.in_features, self.out_features
         if n <= m:
             return 0, 0 if self.side == "end" else m - n, n
@@ -45,7 +45,7 @@ class Layer:
         return out
 
     def skip_adjoint(self, grad: Tensor) -> Tensor:
-        """Gradient of `fit(x)` with respect to x."""
+        """Return the gradient of `fit(x)` with respect to x."""
         start, to, width = self.skip_columns
         missing = self.in_features - width
         return F.pad(grad, (start, missing - start)) if missing else grad[:, to : to + width]
@@ -53,13 +53,13 @@ class Layer:
 
 @dataclass(frozen=True)
 class Member:
-    """Tensors of one network, none of which autograd knows.
+    """Tensors of one network, without autograd.
 
     Args:
         parameters: Per layer weight `(o, i)`, bias `(o,)`, and with layer norm scale and shift `(o,)`; then weight and
             bias of the head.
         products: The same list in the dtype of the matrix products (only weights and biases of the layers are read).
-        grads: Where the parameters' gradients go, or empty if nobody wants them.
+        grads: Where the parameters' gradients go; empty if they are not needed.
     """
 
     parameters: list[Tensor]
@@ -90,7 +90,7 @@ class TorchPasses:
     def backward(
         self, k: int, grad: Tensor, trained: bool, add: bool, rows: Tensor | None, columns: slice | None
     ) -> Tensor:
-        """Backward pass of member `k`.
+        """Run the backward pass of member `k`.
 
         Args:
             k: Which member.

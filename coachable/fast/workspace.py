@@ -1,8 +1,8 @@
 """The hand-written passes of residual networks on prepared memory, with the kernels of `kernels.c`.
 
-Between two products of matrices that fill the cache, every Python call is a cold one; so all views, addresses and
-buffers that do not change from update to update are made once. A workspace is good for as long as the parameters stay
-where they are; when they have moved, a new plan is made (the learner looks at the beginning of each update).
+Products of matrices fill the cache, so that every Python call between them is slow. All views, addresses and buffers
+that do not change from update to update are therefore made once. A workspace is valid while the parameters stay where
+they are in memory. When they move, the backend of the learner makes new plans before the next update.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from coachable.fast.memory import Arena
 from coachable.fast.native import Kernels, Products
 from coachable.fast.passes import Layer, Member
 
@@ -42,35 +41,38 @@ class Workspace:
         keep: bool,
     ) -> None:
         self.rows, self.keep, self.widths = rows, keep, tuple(widths)
-        self._arena, self._dtype = Arena(), members[0].products[0].dtype
+        self._dtype = members[0].products[0].dtype
         widest = max(layer.out_features for layer in layers)
-        self._scratch = self._arena.empty(2 * widest)
+        self._scratch = torch.empty(2 * widest, dtype=torch.float32)
         width = sum(widths)
-        self._input = self._arena.zeros(rows, width + width % 2, dtype=self._dtype)[:, :width]
+        self._input = torch.zeros(rows, width + width % 2, dtype=self._dtype)[:, :width]
         self._slots = self._input.split(list(widths), -1)
         if keep:
-            self._flow = [self._arena.empty(rows, widest, dtype=self._dtype) for _ in range(2)]
-            self._dz = self._arena.empty(rows, widest, dtype=self._dtype)
-            self._dw = self._arena.empty(max(layer.in_features for layer in layers) * widest, dtype=self._dtype)
+            self._flow = [torch.empty(rows, widest, dtype=self._dtype) for _ in range(2)]
+            self._dz = torch.empty(rows, widest, dtype=self._dtype)
+            self._dw = torch.empty(max(layer.in_features for layer in layers) * widest, dtype=self._dtype)
         shared = None if keep else self._buffers(layers)
         self._members = [
             _MemberSpace(self, kernels, layers, member, shared or self._buffers(layers)) for member in members
         ]
 
     def _buffers(self, layers: Sequence[Layer]) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
-        """Product, output, mean and reciprocal deviation of each layer; little memory if nothing is kept."""
+        """Return product, output, mean and reciprocal deviation of each layer; layers share them if `keep` is false."""
 
         def buffer(layer: Layer) -> Tensor:
-            return self._arena.empty(self.rows, layer.out_features, dtype=self._dtype)
+            return torch.empty(self.rows, layer.out_features, dtype=self._dtype)
+
+        def statistic() -> Tensor:
+            return torch.empty(self.rows, dtype=torch.float32)
 
         if self.keep or len({layer.out_features for layer in layers}) > 1:
-            return [(buffer(n), buffer(n), self._arena.empty(self.rows), self._arena.empty(self.rows)) for n in layers]
-        z, outs, statistic = buffer(layers[0]), (buffer(layers[0]), buffer(layers[0])), self._arena.empty(self.rows)
-        return [(z, outs[i % 2], statistic, statistic) for i in range(len(layers))]
+            return [(buffer(n), buffer(n), statistic(), statistic()) for n in layers]
+        z, outs, both = buffer(layers[0]), (buffer(layers[0]), buffer(layers[0])), statistic()
+        return [(z, outs[i % 2], both, both) for i in range(len(layers))]
 
     @property
     def own_products(self) -> bool:
-        """Whether the products are those of the kernels now."""
+        """Whether the kernels compute the products at the present number of threads."""
         return self._members[0].products() is not None
 
     def forward(self, inputs: Sequence[Tensor], out: Sequence[Tensor]) -> None:
@@ -83,7 +85,7 @@ class Workspace:
     def backward(
         self, k: int, grad: Tensor, trained: bool, add: bool, rows: Tensor | None, columns: slice | None
     ) -> Tensor:
-        """Backward pass of member `k`, see `TorchPasses.backward`."""
+        """Run the backward pass of member `k`, see `TorchPasses.backward`."""
         return self._members[k].backward(grad, trained, add, rows, columns)
 
 
@@ -150,8 +152,10 @@ class _MemberSpace:
             self._head_kernels = kernels.head_forward, kernels.head_backward
             self._head_targets.append(scratch)
             return
-        self._hidden = x if x.dtype == torch.float32 else space._arena.empty(*x.shape)  # what torch's head sees
-        self._head_gradient = space._arena.empty(*x.shape) if space.keep else x
+        self._hidden = (
+            x if x.dtype == torch.float32 else torch.empty(x.shape, dtype=torch.float32)
+        )  # what torch's head sees
+        self._head_gradient = torch.empty(x.shape, dtype=torch.float32) if space.keep else x
 
     def products(self) -> Products | None:
         return self._own_products if torch.get_num_threads() == 1 else None

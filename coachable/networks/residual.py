@@ -13,8 +13,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from coachable.fast.fused import Layer, Plan, residual_network
-
 Side = Literal["end", "beginning"]
 Padding = Literal["alternate", "end", "beginning"]
 Narrowing = Literal["padded_side", "keep_first"]
@@ -152,44 +150,18 @@ class ResidualMLP(nn.Module):
             nn.init.xavier_uniform_(self.head.weight, gain=head_gain)
             nn.init.zeros_(self.head.bias)
 
-        self._plan: Plan | None = None
-
     def forward(self, *inputs: Tensor) -> Tensor:
         """Map inputs `(..., d_i)`, concatenated to `in_features`, to `(..., out_features)`.
 
         The head runs in float32 also under autocast: values and log-probabilities need more than bfloat16's 8 bits.
         Without a head this returns the last layer's features.
         """
-        if self._plan is not None:
-            return residual_network(self._plan, inputs)
         x = inputs[0] if len(inputs) == 1 else torch.cat(inputs, -1)
         hidden = self.blocks(x)
         if self.head is None:
             return hidden
         with torch.autocast(x.device.type, enabled=False):
             return self.head(hidden.to(self.head.weight.dtype))
-
-    def layers(self) -> tuple[Layer, ...]:
-        """Shapes of the layers, for :mod:`coachable.fast.fused`."""
-        return tuple(
-            Layer(
-                in_features=block.linear.in_features,
-                out_features=block.linear.out_features,
-                side=block.side,
-                narrowing=block.narrowing,
-                eps=block.norm.eps if block.norm is not None else 0.0,
-                norm=block.norm is not None,
-            )
-            for block in self.blocks
-            if isinstance(block, ResidualBlock)
-        )
-
-    def use_plan(self, plan: Plan | None) -> None:
-        """Evaluate with the hand-written passes from now on, or layer by layer again (`None`).
-
-        With a plan, gradients go where the plan says and not into the parameters' `.grad`.
-        """
-        self._plan = plan
 
 
 def with_new_inputs(weights: Mapping[str, Tensor], seen: int, new: int) -> dict[str, Tensor]:

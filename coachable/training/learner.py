@@ -1,30 +1,23 @@
-"""One gradient update of an actor-critic loss: update order, optimisers, target networks, precision."""
+"""Gradient updates of an actor-critic loss: update order, optimisers, target networks, precision."""
 
 from __future__ import annotations
 
 import copy
-import logging
 import math
-import os
-import shutil
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
-from typing import Any, Literal, NamedTuple, cast, get_args
+from typing import Any, Literal, cast, get_args
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import LossModule, SoftUpdate
 
-from coachable.fast.accelerate import Acceleration
-from coachable.fast.flat_adam import FlatAdam, place_moments
 from coachable.finite import NonFiniteError
-from coachable.ranges import AMOUNT, NOT_NEGATIVE, POSITIVE, SHARE, Range
-from coachable.training.lean_sac import LeanSAC
+from coachable.ranges import AMOUNT, NOT_NEGATIVE, POSITIVE, Range
+from coachable.training.backend import Backend
+from coachable.training.loss_functions import check_loss, compiled, loss_functions
 from coachable.training.parameters import Watch, adopt_actor, follow, loaded, share_actor, trained_parameters
 from coachable.training.precision import Precision, resolve_precision
-
-_LOG = logging.getLogger(__name__)
 
 _ADVICE = "Look for extreme rewards or observations, lower the learning rates, or set max_grad_norm."
 
@@ -35,19 +28,13 @@ class NonFiniteLossError(NonFiniteError):
     """A loss or a gradient became infinite or NaN."""
 
 
-class _Losses(NamedTuple):
-    both: Callable[..., Any]
-    actor: Callable[..., Any]
-    critic: Callable[..., Any]
-
-
 class Learner:
     """Update a TorchRL actor-critic loss module from batches.
 
     Works with `SACLoss` and its relatives (QR-SAC, RAC, Cat-RAC): any `LossModule` with `actor_network_params`,
     `qvalue_network_params`, their targets, and `loss_actor` and `loss_qvalue` among its outputs.
 
-    Update orders (algorithms.md, sections 1 and 2):
+    Update orders:
 
     - `"simultaneous"` (the paper's humanoid): both losses from the parameters before the update, then both
       optimisers step, then the target networks move.
@@ -55,29 +42,30 @@ class Learner:
       target whose next actions come from the updated policy.
     - `"critic_first"` (common elsewhere): the critics step, then the policy on the updated critics.
 
-    Losses or gradients that are infinite or NaN reach no weight: such an update raises on a CPU, and is left out on a
-    GPU until the next check raises (see `check_every`).
+    Losses or gradients that are infinite or NaN reach no weight. On a CPU such an update raises. A GPU skips it, and
+    the next check raises (see `check_every`).
 
     Args:
         loss_module: The loss.
         actor_lr: Learning rate of the policy.
-        critic_lr: Learning rate of everything else that is trained, the temperature excepted.
+        critic_lr: Learning rate of all other trained parameters, except the temperature.
         alpha_lr: Learning rate of a learned temperature; unused with `fixed_alpha=True`.
-        adam_eps: Adam's epsilon (1e-7 as in TensorFlow, not torch's 1e-8).
+        adam_eps: Adam's epsilon. The default is TensorFlow's 1e-7, not torch's 1e-8.
         tau: Polyak rate of the target networks per update.
         max_grad_norm: Clip the norm of the policy's and of the critics' gradient, each on its own, to this value.
         update_order: See above.
-        precision: `"bf16"` multiplies in bfloat16 with float32 master weights, layer-norm statistics, heads, targets
-            and losses; `"auto"` takes it where the device has it in hardware.
-        fused: Evaluate residual networks through their hand-written passes (`coachable.fast.fused`) where possible:
-            on a CPU, when policy and critics consist of nothing else. The numbers are the same, the update is faster.
-        compile: Compile the loss functions with `torch.compile` where `fused` does not apply (on a GPU, or with
-            networks of other kinds). On a CPU that takes a C++ compiler; without one the log says that it was left.
-        check_every: On a GPU, ask every so many updates whether one was left out, which waits for the device; 0 leaves
-            that to calls of :meth:`check_finite`. On a CPU every update is checked.
+        precision: `"bf16"` multiplies in bfloat16 and keeps weights, layer-norm statistics, heads, targets and losses
+            in float32; `"auto"` chooses it where the device has it in hardware.
+        compile: Compile the loss functions with `torch.compile`. On a CPU this needs a C++ compiler; without one it has
+            no effect and logs a warning.
+        check_every: On a GPU, number of updates between checks for skipped ones, which wait for the device. With 0 only
+            calls of :meth:`check_finite` check. On a CPU every update is checked.
 
-    Between updates the loss and its policy may be moved to shared memory, cast to another dtype, loaded with
-    `assign=True` or given other `.data`; an update trains the parameters that they have then.
+    Attributes:
+        backend: How networks are evaluated and parameters stepped, see :meth:`use_backend`.
+
+    Between updates you may move the loss or its policy to shared memory, cast them to another dtype, load them with
+    `assign=True` or give them other `.data`. The next update trains the parameters that they have then.
 
     Raises:
         ValueError: If an option is unknown or a number out of range.
@@ -95,7 +83,6 @@ class Learner:
         max_grad_norm: float | None = None,
         update_order: UpdateOrder = "simultaneous",
         precision: Precision = "auto",
-        fused: bool = True,
         compile: bool = False,
         check_every: int = 100,
     ) -> None:
@@ -109,13 +96,12 @@ class Learner:
         Range("(0, 1]").check("tau", tau)
         Range("(0, inf)", optional=True).check("max_grad_norm", max_grad_norm)
         AMOUNT.check("check_every", check_every)
-        _check_loss(loss_module)
+        check_loss(loss_module)
         self.loss_module = loss_module
         self.update_order: UpdateOrder = update_order
         self.max_grad_norm = max_grad_norm
         self.check_every = check_every
         self.updates = 0
-        self.tau = tau
         share_actor(loss_module)
         self._watch = Watch(loss_module)
         self._watch.forget_copies()
@@ -126,23 +112,34 @@ class Learner:
         self.precision = resolve_precision(precision, device)
         self._device_type = device.type
         self.target_updater = SoftUpdate(loss_module, tau=tau)
-        self._acceleration: Acceleration | None = None
-        self._lean: LeanSAC | None = None
-        if fused and Acceleration.supports(loss_module):
-            self._acceleration = Acceleration(loss_module, torch.bfloat16 if self.precision == "bf16" else None)
-            if LeanSAC.supports(loss_module):
-                self._lean = LeanSAC(loss_module, self._acceleration)
-        self.optimizers: dict[str, torch.optim.Adam] = {
-            name: self._adam(name, group, rates[name], adam_eps) for name, group in params.items() if group
-        }
         self._rates = rates
         loss: Any = loss_module
         fixed = hasattr(loss, "log_alpha") and not params["alpha"]
         self._log_alpha = float(loss.log_alpha) if fixed else None
-        self._losses = _Losses(loss.forward, loss.actor_loss, _critic_loss_of(loss))
-        if compile and self._acceleration is None and _can_compile(device):
-            self._losses = _Losses(*map(torch.compile, self._losses))
-        self._left_out = torch.zeros((), device=device)
+        self._skipped = torch.zeros((), device=device)
+        self.optimizers: dict[str, torch.optim.Adam] = {}
+        self._watch.look()
+        self.use_backend(Backend)
+
+    def use_backend(self, make_backend: Callable[..., Backend]) -> None:
+        """Evaluate networks and step parameters with another backend from now on; the optimisers keep their state.
+
+        Args:
+            make_backend: A subclass of `Backend`, or a function with the same arguments.
+        """
+        self._follow()
+        states = {name: optimizer.state_dict() for name, optimizer in self.optimizers.items()}
+        self._make_backend = make_backend
+        self.backend = make_backend(self.loss_module, self.precision, self.target_updater)
+        self.optimizers = {
+            name: self.backend.make_optimizer(name, group, self._rates[name], self._options["adam_eps"])
+            for name, group in self._params.items()
+            if group
+        }
+        for name, state in states.items():
+            self.optimizers[name].load_state_dict(state)
+        self._losses = loss_functions(self.loss_module)
+        self._to_compile = self._options["compile"] and self.backend.compiles
         self._watch.look()
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -162,14 +159,12 @@ class Learner:
                 has been changed by it.
         """
         self._follow()
-        losses = self._losses
-        if self._lean is not None and self._lean.serves(batch):
-            losses = _Losses(self._lean.forward, self._lean.actor_loss, self._lean.critic_loss)
+        if self._to_compile:
+            self._losses, self._to_compile = compiled(self._losses, self._device_type), False
         update = self._simultaneous if self.update_order == "simultaneous" else self._sequential
-        with self._networks():
-            metrics = update(batch, losses)
-        if self._acceleration is None:
-            self.target_updater.step()
+        with self.backend.updating():
+            metrics = update(batch)
+        self.backend.move_targets()
         self.updates += 1
         if self.check_every and self.updates % self.check_every == 0:
             self.check_finite()
@@ -195,22 +190,22 @@ class Learner:
             raise ValueError("this loss has no fixed entropy weight to scale: leave train.anneal_entropy at 1")
 
     def check_finite(self) -> None:
-        """Raise if an update since the last check was left out on a GPU (this reads one number from the device)."""
-        found = float(self._left_out)
-        self._left_out.zero_()
+        """Raise if a GPU skipped an update since the last check; this reads one number from the device."""
+        found = float(self._skipped)
+        self._skipped.zero_()
         if not math.isfinite(found):
             raise NonFiniteLossError(
                 f"a loss or a gradient was not finite at or before update {self.updates}. {_ADVICE}"
             )
 
     def check_weights(self) -> None:
-        """Raise if a trained parameter is not finite; updates keep those finite that are."""
+        """Raise if a trained parameter is not finite. Updates keep finite parameters finite."""
         for name, value in self.loss_module.named_parameters():
             if not torch.isfinite(value).all():
                 raise NonFiniteError(f"{name} contains NaN or infinity: start from other weights.")
 
     def state_dict(self) -> dict[str, Any]:
-        """Parameters, targets, optimiser moments and the update counter."""
+        """Return parameters, targets, optimiser moments and the update counter; the backend makes no difference."""
         return {
             "loss_module": self.loss_module.state_dict(),
             "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.items()},
@@ -218,31 +213,30 @@ class Learner:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned; rates and a fixed entropy weight stay those of the constructor."""
+        """Restore what :meth:`state_dict` returned. Rates and a fixed entropy weight stay those of the constructor."""
         self._follow()
         self.loss_module.load_state_dict(state["loss_module"])
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
-            if self._device_type == "cpu" and not isinstance(optimizer, FlatAdam):
-                place_moments(optimizer)
         self.scale_learning_rates(1.0)
         self.scale_entropy_weight(1.0)
         self.updates = int(state["updates"])
-        self._left_out.zero_()
+        self._skipped.zero_()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Learner:
-        """A learner of a copy of the loss, with a copy of the state."""
+        """Return a learner of a copy of the loss, with a copy of the state."""
         twin = type(self)(copy.deepcopy(self.loss_module, memo), **self._options)
+        twin.use_backend(self._make_backend)
         twin.load_state_dict(copy.deepcopy(self.state_dict(), memo))
         return twin
 
     def _present_parameters(self) -> dict[str, list[nn.Parameter]]:
-        """The trained parameters that the loss has now."""
+        """Return the trained parameters that the loss has now."""
         every = dict(self.loss_module.named_parameters())
         return {kind: [every[name] for name in names] for kind, names in self._names.items()}
 
     def _follow(self) -> None:
-        """Go on with the loss's parameters as they are now: others may be in their place, or other memory in theirs."""
+        """Continue with the parameters that the loss has now, in case they or their memory were replaced."""
         if not self._watch.changed():
             return
         adopt_actor(self.loss_module)
@@ -254,29 +248,10 @@ class Learner:
                 f"the loss was moved to {device} after its learner was made for {self._device_type}: make a learner of "
                 "the moved loss, and load this one's state_dict() into it"
             )
-        if self._acceleration is not None:
-            self._acceleration.bind()
+        self.backend.follow()
         for name, optimizer in self.optimizers.items():
             follow(optimizer, self._params[name])
         self._watch.look()
-
-    def _adam(self, name: str, params: list[nn.Parameter], lr: float, eps: float) -> torch.optim.Adam:
-        acceleration = self._acceleration
-        if acceleration is not None and name != "alpha":
-            flat, target = acceleration.buffers(name)
-            return FlatAdam(params, flat, target, self.tau, lr=lr, eps=eps)
-        optimizer = torch.optim.Adam(params, lr=lr, eps=eps, fused=self._device_type in ("cpu", "cuda"))
-        if self._device_type == "cpu":
-            place_moments(optimizer)
-        return optimizer
-
-    def _networks(self) -> AbstractContextManager[None]:
-        return nullcontext() if self._acceleration is None else self._acceleration.active()
-
-    def _autocast(self) -> AbstractContextManager[Any]:
-        if self.precision == "fp32" or self._acceleration is not None:
-            return nullcontext()
-        return torch.autocast(self._device_type, dtype=torch.bfloat16)
 
     def _step(self, losses: dict[str, Tensor], *names: str) -> dict[str, Tensor]:
         """Clip and step, unless a number is not finite; return the norms of the gradients before clipping.
@@ -285,45 +260,38 @@ class Learner:
             losses: What the gradients are of, by name.
             names: Groups of parameters to step on their gradients.
         """
-        norms = {f"grad_norm_{name}": self._gradient_norm(name) for name in names}
+        norms = {f"grad_norm_{name}": self.backend.gradient_norm(name, self._params[name]) for name in names}
         self._require_finite({**losses, **norms}, names)
         for name, norm in zip(names, norms.values(), strict=True):
             optimizer = self.optimizers[name]
             if self.max_grad_norm is not None and name != "alpha":
                 torch.nn.utils.clip_grads_with_norm_(self._params[name], self.max_grad_norm, norm)
             optimizer.step()
-            if not isinstance(optimizer, FlatAdam):
-                optimizer.zero_grad(set_to_none=True)
+            optimizer.zero_grad(set_to_none=True)
         return norms
 
-    def _gradient_norm(self, name: str) -> Tensor:
-        if isinstance(self.optimizers[name], FlatAdam):
-            return torch.linalg.vector_norm(cast(Acceleration, self._acceleration).gradient(name))
-        return torch.nn.utils.get_total_norm([p.grad for p in self._params[name] if p.grad is not None])
-
     def _require_finite(self, values: dict[str, Tensor], names: tuple[str, ...]) -> None:
-        """Raise on a CPU, or let a GPU leave the step out, if a loss or the norm of a gradient is not finite.
+        """Raise on a CPU, or let a GPU skip the step, if a loss or the norm of a gradient is not finite.
 
-        The norms are in it because a NaN parameter can hide behind a rectifier in the losses, but not in the gradients.
+        The norms are checked because a rectifier can hide a NaN parameter from the losses, but not from the gradients.
         """
         if self._device_type != "cuda":
             found = {name: value.item() for name, value in values.items()}
             if bad := [f"{name} is {value}" for name, value in found.items() if not math.isfinite(value)]:
                 for optimizer in self.optimizers.values():
-                    if not isinstance(optimizer, FlatAdam):  # whose gradients are written anew, not added to
-                        optimizer.zero_grad(set_to_none=True)
+                    optimizer.zero_grad(set_to_none=True)
                 raise NonFiniteLossError(
                     f"{', '.join(bad)} at update {self.updates + 1}: no weight was changed by it. {_ADVICE}"
                 )
             return
         total = torch.stack([value.detach().float() for value in values.values()]).sum()
-        self._left_out.add_(total)  # a sum stays NaN or infinite once a part was
+        self._skipped.add_(total)  # a sum stays NaN or infinite once a part was
         for name in names:  # the fused Adam of a GPU then changes nothing, without waiting for the device
             cast(Any, self.optimizers[name]).found_inf = (~total.isfinite()).float()
 
-    def _simultaneous(self, batch: TensorDictBase, functions: _Losses) -> dict[str, Tensor]:
-        with self._autocast():
-            outputs = functions.both(batch)
+    def _simultaneous(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        with self.backend.evaluating():
+            outputs = self._losses.both(batch)
         trained = ["loss_actor", "loss_qvalue", *(["loss_alpha"] if self._params["alpha"] else [])]
         losses = {name: outputs[name] for name in trained}
         cast(Tensor, sum(losses.values())).backward()
@@ -333,23 +301,23 @@ class Learner:
         metrics["td_error"] = batch.get("td_error").mean()
         return metrics | _critic_health(outputs)
 
-    def _sequential(self, batch: TensorDictBase, functions: _Losses) -> dict[str, Tensor]:
+    def _sequential(self, batch: TensorDictBase) -> dict[str, Tensor]:
         policy_first = self.update_order == "policy_first"
-        metrics = self._update_actor(batch, functions) if policy_first else {}
-        with self._autocast():
-            loss_qvalue, extra = functions.critic(batch)
+        metrics = self._update_actor(batch) if policy_first else {}
+        with self.backend.evaluating():
+            loss_qvalue, extra = self._losses.critic(batch)
         loss_qvalue.backward()
         metrics["loss_qvalue"] = loss_qvalue.detach()
         metrics |= self._step({"loss_qvalue": loss_qvalue}, "critic")
         batch.set("td_error", extra["td_error"])
         metrics["td_error"] = extra["td_error"].mean()
         if not policy_first:
-            metrics |= self._update_actor(batch, functions)
+            metrics |= self._update_actor(batch)
         return metrics | _critic_health(extra)
 
-    def _update_actor(self, batch: TensorDictBase, functions: _Losses) -> dict[str, Tensor]:
-        with self._autocast():
-            loss_actor, extra = functions.actor(batch)
+    def _update_actor(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        with self.backend.evaluating():
+            loss_actor, extra = self._losses.actor(batch)
         loss_actor.backward()
         metrics = {"loss_actor": loss_actor.detach(), **self._step({"loss_actor": loss_actor}, "actor")}
         loss: Any = self.loss_module
@@ -365,33 +333,6 @@ class Learner:
 
 
 def _critic_health(outputs: Any) -> dict[str, Tensor]:
-    """Share of targets outside a categorical critic's support; empty for other critics."""
+    """Return the share of targets outside a categorical critic's support; nothing for other critics."""
     clipped = outputs.get("clipped_fraction", None)
     return {} if clipped is None else {"clipped_fraction": clipped.mean()}
-
-
-def _check_loss(loss_module: LossModule) -> None:
-    """Refuse what TorchRL's losses let pass: a discount outside [0, 1], the logarithm of a negative entropy weight."""
-    gamma = getattr(getattr(loss_module, "_value_estimator", None), "gamma", None)
-    if gamma is not None:
-        SHARE.check("gamma of the loss", float(gamma))
-    log_alpha = getattr(loss_module, "log_alpha", None)
-    if log_alpha is not None and bool(torch.isnan(log_alpha)):
-        raise ValueError("alpha of the loss is below 0: expected a number of at least 0")
-
-
-def _can_compile(device: torch.device) -> bool:
-    if device.type != "cpu" or any(shutil.which(c) for c in (os.environ.get("CXX"), "g++", "clang++") if c):
-        return True
-    _LOG.warning("compile=True has no effect: torch.compile needs a C++ compiler on a CPU (g++ or clang++, or set CXX)")
-    return False
-
-
-def _critic_loss_of(loss_module: LossModule) -> Callable[..., Any]:
-    for name in ("qvalue_loss", "qvalue_v2_loss"):
-        method = getattr(loss_module, name, None)
-        if method is not None:
-            return method
-    raise ValueError(
-        f"{type(loss_module).__name__} has neither qvalue_loss(td) nor qvalue_v2_loss(td) returning (loss, metadata)"
-    )

@@ -51,7 +51,6 @@ def test_steps_are_those_of_adam(low, compiled, monkeypatch):
         optimizer.step()
         theirs.step()
         assert params[0]._version > version  # autograd and other learners see the change
-        torch.testing.assert_close(optimizer.grad_norm, torch.cat([p.grad.flatten() for p in params]).norm())
         torch._foreach_lerp_(expected, [p.detach() for p in reference[::-1]], 0.1)
     for got, want in ((params, reference), (target, expected)):
         torch.testing.assert_close([t.detach() for t in got], [t.detach() for t in want])

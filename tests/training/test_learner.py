@@ -1,4 +1,5 @@
 import copy
+import functools
 import math
 
 import pytest
@@ -6,7 +7,14 @@ import torch
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from coachable.training import Learner, NonFiniteLossError, resolve_precision
+from tests import sac_problem
 from tests.sac_problem import ACT, make_batch, make_loss
+
+
+@pytest.fixture(params=["plain", "fast"])
+def make_learner(request):
+    """Every property of an update holds in plain torch and with the hand-written passes."""
+    return functools.partial(sac_problem.make_learner, fast=request.param == "fast")
 
 
 def params_of(loss):
@@ -15,8 +23,8 @@ def params_of(loss):
 
 @pytest.mark.parametrize("shape", [(16,), (8, 3)])
 @pytest.mark.parametrize("order", ["simultaneous", "policy_first", "critic_first"])
-def test_update_returns_detached_scalars_and_moves_everything(order, shape):
-    learner = Learner(make_loss(), update_order=order, precision="fp32", actor_lr=1e-3, critic_lr=1e-3)
+def test_update_returns_detached_scalars_and_moves_everything(make_learner, order, shape):
+    learner = make_learner(make_loss(), update_order=order, precision="fp32", actor_lr=1e-3, critic_lr=1e-3)
     before = params_of(learner.loss_module)
     targets = learner.loss_module.target_qvalue_network_params.clone()
     batch = make_batch(*shape)
@@ -32,8 +40,8 @@ def test_update_returns_detached_scalars_and_moves_everything(order, shape):
     assert learner.updates == 1
 
 
-def test_target_networks_follow_by_polyak_averaging():
-    learner = Learner(make_loss(), precision="fp32", critic_lr=1e-2, tau=0.25)
+def test_target_networks_follow_by_polyak_averaging(make_learner):
+    learner = make_learner(make_loss(), precision="fp32", critic_lr=1e-2, tau=0.25)
     old = learner.loss_module.target_qvalue_network_params.clone().flatten_keys()
     learner.update(make_batch(16))
     new = learner.loss_module.target_qvalue_network_params.flatten_keys()
@@ -75,9 +83,9 @@ def reference_update(loss, batch, lr, eps, order):
 
 
 @pytest.mark.parametrize("order", ["simultaneous", "policy_first", "critic_first"])
-def test_update_equals_the_written_out_update(order):
+def test_update_equals_the_written_out_update(make_learner, order):
     ours, theirs = make_loss(), make_loss()
-    learner = Learner(ours, update_order=order, precision="fp32", actor_lr=1e-3, critic_lr=1e-3)
+    learner = make_learner(ours, update_order=order, precision="fp32", actor_lr=1e-3, critic_lr=1e-3)
     torch.manual_seed(5)
     learner.update(make_batch(32))
     torch.manual_seed(5)
@@ -86,9 +94,8 @@ def test_update_equals_the_written_out_update(order):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5, msg=lambda m, name=name: f"{name}: {m}")
 
 
-@pytest.mark.parametrize("fused", [True, False])
 @pytest.mark.parametrize("order", ["simultaneous", "policy_first"])
-def test_the_logged_entropy_is_that_of_the_policy(order, fused):
+def test_the_logged_entropy_is_that_of_the_policy(make_learner, order):
     """A squashed normal of location 0 has log(2 pi e s^2) / 2 + E[log(1 - tanh(s z)^2)] per axis."""
     loss = make_loss(width=4)
     with torch.no_grad():
@@ -97,7 +104,7 @@ def test_the_logged_entropy_is_that_of_the_policy(order, fused):
     batch = make_batch(4096)
     with torch.no_grad(), loss.actor_network_params.to_module(loss.actor_network):
         scale = loss.actor_network.get_dist(batch[:1].clone()).scale[0, 0].double()
-    metrics = Learner(loss, update_order=order, precision="fp32", fused=fused).update(batch)
+    metrics = make_learner(loss, update_order=order, precision="fp32").update(batch)
     z = torch.linspace(-12.0, 12.0, 20_001, dtype=torch.float64)
     density = torch.exp(-z.square() / 2) / (2 * torch.pi) ** 0.5
     shrunk = 2.0 * (math.log(2.0) - scale * z - torch.nn.functional.softplus(-2.0 * scale * z))
@@ -105,7 +112,7 @@ def test_the_logged_entropy_is_that_of_the_policy(order, fused):
     assert metrics["entropy"].item() == pytest.approx(ACT * per_axis.item(), abs=5 * 1.2 * (ACT / 4096) ** 0.5)
 
 
-def test_orders_see_different_parameters():
+def test_orders_see_different_parameters(make_learner):
     """policy_first draws the target's actions from the updated policy; simultaneous from the one before."""
 
     class Spy(SACLoss):
@@ -117,16 +124,16 @@ def test_orders_see_different_parameters():
         loss = make_loss()
         loss.__class__ = Spy
         before = [p.detach().clone() for p in loss.actor_network_params.values(True, True)]
-        Learner(loss, update_order=order, precision="fp32").update(make_batch(16))
+        make_learner(loss, update_order=order, precision="fp32").update(make_batch(16))
         assert any((a != b).any() for a, b in zip(before, loss.seen, strict=True)) is updated
 
 
-def test_gradients_are_clipped_separately_and_norms_are_those_before_clipping():
+def test_gradients_are_clipped_separately_and_norms_are_those_before_clipping(make_learner):
     batch = make_batch(16)
-    learner = Learner(make_loss(), precision="fp32")
+    learner = make_learner(make_loss(), precision="fp32")
     torch.manual_seed(3)
     free = learner.update(batch.clone())
-    clipped = Learner(make_loss(), precision="fp32", max_grad_norm=1e-3)
+    clipped = make_learner(make_loss(), precision="fp32", max_grad_norm=1e-3)
     seen = {}
     for name, optimizer in clipped.optimizers.items():
         optimizer.register_step_pre_hook(
@@ -144,9 +151,8 @@ def test_gradients_are_clipped_separately_and_norms_are_those_before_clipping():
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), 1e30])
 @pytest.mark.parametrize("order", ["simultaneous", "policy_first", "critic_first"])
-@pytest.mark.parametrize("fused", [True, False])
-def test_a_loss_that_is_not_finite_reaches_no_weight(fused, order, bad):
-    learner = Learner(make_loss(), precision="fp32", update_order=order, fused=fused)
+def test_a_loss_that_is_not_finite_reaches_no_weight(make_learner, order, bad):
+    learner = make_learner(make_loss(), precision="fp32", update_order=order)
     before = copy.deepcopy(learner.state_dict())
     data = make_batch(16)
     data["next", "reward"][3] = bad
@@ -162,17 +168,17 @@ def test_a_loss_that_is_not_finite_reaches_no_weight(fused, order, bad):
     assert all(torch.isfinite(value) for value in metrics.values())
 
 
-def test_weights_that_are_not_finite_are_noticed_at_the_first_update():
+def test_weights_that_are_not_finite_are_noticed_at_the_first_update(make_learner):
     """Also behind a rectifier, which turns NaN into nothing in the loss but not in the gradients."""
     loss = make_loss()
     next(iter(loss.actor_network_params.values(True, True))).data.view(-1)[0] = float("nan")
     with pytest.raises(NonFiniteLossError, match="at update 1"):
-        Learner(loss, precision="fp32").update(make_batch(16))
+        make_learner(loss, precision="fp32").update(make_batch(16))
 
 
-def test_a_temperature_that_is_not_finite_does_not_move():
+def test_a_temperature_that_is_not_finite_does_not_move(make_learner):
     loss = make_loss(fixed_alpha=False, target_entropy=-3.0)
-    learner = Learner(loss, precision="fp32", update_order="policy_first")
+    learner = make_learner(loss, precision="fp32", update_order="policy_first")
     before = loss.log_alpha.item()
     learner._params["alpha"][0].register_hook(lambda grad: grad * float("nan"))
     with pytest.raises(NonFiniteLossError, match="grad_norm_alpha is nan"):
@@ -180,9 +186,9 @@ def test_a_temperature_that_is_not_finite_does_not_move():
     assert loss.log_alpha.item() == before
 
 
-def test_on_a_gpu_the_step_is_left_out_and_reported_at_the_next_check():
-    """The device's part, tried on a CPU: its fused Adam leaves a step out, too, where `found_inf` is set."""
-    learner = Learner(make_loss(), precision="fp32", fused=False, check_every=2)
+def test_a_gpu_skips_the_step_and_the_next_check_raises():
+    """The part of the device, on a CPU, whose fused Adam also skips a step where `found_inf` is set."""
+    learner = Learner(make_loss(), precision="fp32", check_every=2)
     learner._device_type = "cuda"
     before = copy.deepcopy(learner.state_dict())
     data = make_batch(16)
@@ -200,18 +206,18 @@ def test_on_a_gpu_the_step_is_left_out_and_reported_at_the_next_check():
 
 
 @pytest.mark.parametrize("order", ["simultaneous", "policy_first"])
-def test_resumed_equals_uninterrupted(order):
+def test_resumed_equals_uninterrupted(make_learner, order):
     def run(learner, seeds):
         for seed in seeds:
             torch.manual_seed(seed)
             learner.update(make_batch(16, seed=seed))
 
-    one = Learner(make_loss(), update_order=order)
+    one = make_learner(make_loss(), update_order=order)
     run(one, range(6))
-    two = Learner(make_loss(), update_order=order)
+    two = make_learner(make_loss(), update_order=order)
     run(two, range(3))
     state = copy.deepcopy(two.state_dict())
-    three = Learner(make_loss(seed=9), update_order=order)
+    three = make_learner(make_loss(seed=9), update_order=order)
     three.load_state_dict(state)
     assert three.updates == 3
     run(three, range(3, 6))
@@ -221,20 +227,20 @@ def test_resumed_equals_uninterrupted(order):
         torch.testing.assert_close(a, b, rtol=0, atol=0, msg=lambda m, name=name: f"{name}: {m}")
 
 
-def test_learned_temperature_moves():
+def test_learned_temperature_moves(make_learner):
     loss = make_loss(fixed_alpha=False, target_entropy=-3.0)
     before = loss.log_alpha.item()
     for order in ("simultaneous", "policy_first"):
-        Learner(loss, update_order=order, precision="fp32", alpha_lr=1e-2).update(make_batch(16))
+        make_learner(loss, update_order=order, precision="fp32", alpha_lr=1e-2).update(make_batch(16))
         assert loss.log_alpha.item() != before
         before = loss.log_alpha.item()
 
 
-def test_bf16_gradients_point_where_fp32_gradients_point():
+def test_bf16_gradients_point_where_fp32_gradients_point(make_learner):
     grads = {}
     for precision in ("fp32", "bf16"):
         loss = make_loss(width=128)
-        learner = Learner(loss, precision=precision)
+        learner = make_learner(loss, precision=precision)
         for name, optimizer in learner.optimizers.items():
             optimizer.register_step_pre_hook(
                 lambda opt, args, kwargs, key=(precision, name): grads.__setitem__(
@@ -268,27 +274,9 @@ def test_bad_options_raise():
     assert resolve_precision("bf16") == "bf16"
 
 
-@pytest.mark.parametrize("order", ["simultaneous", "policy_first", "critic_first"])
-def test_accelerated_and_plain_learner_agree(order):
-    """Ten updates with hand-written passes end where TorchRL's own evaluation ends."""
-    ends = []
-    for fused in (True, False):
-        loss = make_loss()
-        learner = Learner(loss, precision="fp32", update_order=order, fused=fused, actor_lr=1e-3, critic_lr=1e-3)
-        assert (learner._acceleration is not None) is fused
-        for seed in range(10):
-            torch.manual_seed(seed)
-            learner.update(make_batch(32, seed=seed))
-        ends.append(params_of(loss))
-    for name in ends[0]:
-        torch.testing.assert_close(
-            ends[0][name], ends[1][name], rtol=2e-3, atol=2e-4, msg=lambda m, n=name: f"{n}: {m}"
-        )
-
-
-def test_loss_is_as_it_was_outside_of_updates():
+def test_loss_is_as_it_was_outside_of_updates(make_learner):
     loss = make_loss()
-    learner = Learner(loss, precision="bf16")
+    learner = make_learner(loss, precision="bf16")
     learner.update(make_batch(16))
     torch.manual_seed(3)
     with_learner = loss(make_batch(16))
@@ -301,47 +289,34 @@ def test_loss_is_as_it_was_outside_of_updates():
         torch.testing.assert_close(with_learner[key], without[key], rtol=0, atol=0)
 
 
-def test_loading_parameters_into_the_loss_takes_effect():
+def test_loading_parameters_into_the_loss_takes_effect(make_learner):
     """Rounded copies must not outlive the parameters they were made from."""
     loss, other = make_loss(), make_loss(seed=7)
-    learner = Learner(loss, precision="bf16", actor_lr=0.0, critic_lr=0.0)
+    learner = make_learner(loss, precision="bf16", actor_lr=0.0, critic_lr=0.0)
     learner.update(make_batch(16))
     loss.load_state_dict(other.state_dict())
     torch.manual_seed(3)
     got = learner.update(make_batch(16))
     torch.manual_seed(3)
-    expected = Learner(other, precision="bf16").update(make_batch(16))
+    expected = make_learner(other, precision="bf16").update(make_batch(16))
     torch.testing.assert_close(got["loss_qvalue"], expected["loss_qvalue"])
     torch.testing.assert_close(got["loss_actor"], expected["loss_actor"])
 
 
-def test_state_moves_between_accelerated_and_plain_learners():
-    one = Learner(make_loss(), precision="fp32")
-    one.update(make_batch(16))
-    two = Learner(make_loss(seed=3), precision="fp32", fused=False)
-    two.load_state_dict(copy.deepcopy(one.state_dict()))
-    for learner in (one, two):
-        torch.manual_seed(3)
-        learner.update(make_batch(16, seed=8))
-    theirs = params_of(two.loss_module)
-    for name, value in params_of(one.loss_module).items():
-        torch.testing.assert_close(value, theirs[name], rtol=1e-4, atol=1e-6)
-
-
-def test_two_learners_may_share_a_loss_one_after_the_other():
+def test_two_learners_may_share_a_loss_one_after_the_other(make_learner):
     loss = make_loss()
     for order in ("simultaneous", "policy_first"):
-        learner = Learner(loss, update_order=order, precision="bf16")
+        learner = make_learner(loss, update_order=order, precision="bf16")
         before = params_of(loss)
         learner.update(make_batch(16))
         assert all((params_of(loss)[k] != before[k]).any() for k in before)
 
 
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
-def test_both_precisions_learn_to_follow_the_style(precision):
+def test_both_precisions_learn_to_follow_the_style(make_learner, precision):
     """A bandit, reward -|a - style / 2|: after 200 updates the policy's action follows the style."""
     loss = make_loss(width=64)
-    learner = Learner(loss, precision=precision, actor_lr=2e-3, critic_lr=4e-3)
+    learner = make_learner(loss, precision=precision, actor_lr=2e-3, critic_lr=4e-3)
     gen = torch.Generator().manual_seed(0)
     for _ in range(200):
         batch = make_batch(128, seed=int(torch.randint(1 << 30, (), generator=gen)))
@@ -362,9 +337,8 @@ def test_both_precisions_learn_to_follow_the_style(precision):
 def test_compile_without_a_compiler_is_logged_and_left(monkeypatch, caplog):
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("CXX", raising=False)
-    learner = Learner(make_loss(), precision="fp32", fused=False, compile=True)
+    Learner(make_loss(), precision="fp32", compile=True).update(make_batch(16))
     assert "needs a C++ compiler" in caplog.text
-    learner.update(make_batch(16))
 
 
 def test_compile_takes_the_losses_where_there_is_a_compiler(monkeypatch, tmp_path):
@@ -373,12 +347,7 @@ def test_compile_takes_the_losses_where_there_is_a_compiler(monkeypatch, tmp_pat
     monkeypatch.setenv("CXX", str(compiler))
     monkeypatch.setattr(torch, "compile", lambda function: compiled.append(function) or function)
     loss = make_loss()
-    Learner(loss, precision="fp32", fused=False, compile=True)
+    learner = Learner(loss, precision="fp32", compile=True)
+    learner.update(make_batch(16))
+    learner.update(make_batch(16))
     assert compiled == [loss.forward, loss.actor_loss, loss.qvalue_v2_loss]
-
-
-def test_compile_leaves_hand_written_passes_alone(caplog):
-    """They are the faster of the two."""
-    learner = Learner(make_loss(), compile=True)
-    assert learner._acceleration is not None
-    assert learner._losses.both == learner.loss_module.forward

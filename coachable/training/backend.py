@@ -1,0 +1,69 @@
+"""How a learner evaluates networks and steps parameters, in plain torch."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+from torchrl.objectives import LossModule, SoftUpdate
+
+__all__ = ["Backend"]
+
+
+class Backend:
+    """Everything in an update that can be done in another way with the same result.
+
+    This one evaluates the networks layer by layer, under autocast at bfloat16, steps with `torch.optim.Adam`, and moves
+    the target networks with TorchRL's `SoftUpdate`. To replace it, pass a subclass to
+    :meth:`coachable.training.Learner.use_backend`, as `coachable.fast.accelerate` does.
+
+    Args:
+        loss_module: The loss.
+        precision: Precision of the matrix products.
+        target_updater: What moves the target networks.
+
+    Attributes:
+        compiles: Whether `torch.compile` may be applied to the loss functions.
+    """
+
+    compiles = True
+
+    def __init__(self, loss_module: LossModule, precision: Literal["fp32", "bf16"], target_updater: SoftUpdate) -> None:
+        self.loss_module = loss_module
+        self.precision = precision
+        self.target_updater = target_updater
+        self._device_type = next(loss_module.parameters()).device.type
+
+    def updating(self) -> AbstractContextManager[Any]:
+        """Return the context of an update: evaluations, backward passes and steps of the optimisers."""
+        return nullcontext()
+
+    def evaluating(self) -> AbstractContextManager[Any]:
+        """Return the context in which a loss is evaluated, without its backward pass."""
+        if self.precision == "fp32":
+            return nullcontext()
+        return torch.autocast(self._device_type, dtype=torch.bfloat16)
+
+    def make_optimizer(self, name: str, params: list[nn.Parameter], lr: float, eps: float) -> torch.optim.Adam:
+        """Return an optimiser whose state dict has the format of `torch.optim.Adam`.
+
+        Args:
+            name: `"actor"`, `"critic"` or `"alpha"`.
+            params: The trained parameters of that name.
+            lr: Learning rate.
+            eps: Adam's epsilon.
+        """
+        return torch.optim.Adam(params, lr=lr, eps=eps, fused=self._device_type in ("cpu", "cuda"))
+
+    def gradient_norm(self, name: str, params: list[nn.Parameter]) -> Tensor:
+        """Return the norm of the gradient of `params`, see :meth:`make_optimizer`, after the backward pass."""
+        return torch.nn.utils.get_total_norm([p.grad for p in params if p.grad is not None])
+
+    def move_targets(self) -> None:
+        """Move the target networks after an update."""
+        self.target_updater.step()
+
+    def follow(self) -> None:
+        """Continue with the parameters that the loss has now, after they were replaced, cast or moved in memory."""
