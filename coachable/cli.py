@@ -81,7 +81,7 @@ def _parser() -> argparse.ArgumentParser:
         type=_style,
         dest="styles",
         metavar="NAME=VALUE,...",
-        help="one request, such as pose=t_pose,step_length=0.5; repeat it to switch (default: a tour of the styles)",
+        help="one request, NAME=VALUE,NAME=VALUE; repeat it to switch (default: a tour of the styles)",
     )
     render.add_argument(
         "--seconds", type=_seconds, default=4.0, dest="seconds_per_style", help="per style (%(default)s)"
@@ -104,7 +104,7 @@ def _parser() -> argparse.ArgumentParser:
 
     weights = commands.add_parser("weights", help="write the small weights file of a checkpoint")
     weights.add_argument("source", help="a run's folder or a checkpoint")
-    weights.add_argument("out", type=Path, help="the file, such as coachable/pretrained/humanoid/weights.pt")
+    weights.add_argument("out", type=Path, help="the file, such as weights.pt")
     weights.set_defaults(run=_weights)
 
     report = commands.add_parser("report", help="everything that can be measured of an agent, on one page")

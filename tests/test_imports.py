@@ -1,4 +1,4 @@
-"""Imports point one way, domains do not know each other, and the core stays light (architecture, section 4)."""
+"""What imports load: the core stays light, and what belongs to recipes stays there."""
 
 import ast
 import functools
@@ -12,35 +12,6 @@ PACKAGE = Path(__file__).resolve().parent.parent / "coachable"
 MODULES = {
     ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): path
     for path in sorted(PACKAGE.rglob("*.py"))
-}
-
-# Layer of each part of the package; a module may import from its own layer and from those before it.
-LAYERS = {
-    "extras": 0,
-    "files": 0,
-    "finite": 0,
-    "gl": 0,
-    "keys": 0,
-    "ranges": 0,
-    "third_party": 0,
-    "styles": 0,
-    "distributions": 0,
-    "domain": 1,
-    "envs": 1,
-    "networks": 1,
-    "losses": 2,
-    "replay": 2,
-    "transforms": 2,
-    "gym": 3,
-    "training": 3,
-    "export": 4,
-    "evaluation": 4,
-    "pretrained": 4,
-    "coach": 5,
-    "doctor": 5,
-    "domains": 6,
-    "cli": 7,
-    "fast": 8,  # optional: nothing but recipes imports it
 }
 
 # Numerics that need nothing but torch (and the standard library).
@@ -68,51 +39,6 @@ def imported(path: Path, type_checking: bool = False) -> set[str]:
 
     visit(ast.parse(path.read_text()))
     return found
-
-
-def part(module: str) -> str:
-    """Second component of a dotted name: `styles` of `coachable.styles.space`."""
-    return module.split(".")[1] if "." in module else ""
-
-
-def domain(module: str) -> str | None:
-    """Name of the domain that a module belongs to."""
-    pieces = module.split(".")
-    return pieces[2] if pieces[1:2] in (["envs"], ["domains"]) and len(pieces) > 2 else None
-
-
-INTERNAL = {
-    module: {name for name in imported(path) if name.split(".")[0] == "coachable"} for module, path in MODULES.items()
-}
-
-
-def test_every_part_has_a_layer():
-    parts = {part(module) for module in MODULES} - {""}
-    assert parts <= set(LAYERS), f"give {sorted(parts - set(LAYERS))} a layer in LAYERS of {__file__}"
-
-
-@pytest.mark.parametrize("module", [m for m in MODULES if part(m)])
-def test_imports_point_one_way(module):
-    own = LAYERS[part(module)]
-    for name in INTERNAL[module] - {"coachable.__version__"}:
-        other = part(name)
-        assert other in LAYERS, f"{module} imports {name}: import from the module that defines it"
-        assert LAYERS[other] <= own, f"{module} (layer {own}) imports {name} (layer {LAYERS[other]})"
-
-
-def test_a_domain_never_imports_another():
-    for module, names in INTERNAL.items():
-        own = domain(module)
-        others = {domain(name) for name in names if domain(name)} - {own}
-        if own is not None:
-            assert not others, f"{module} imports from the domains {sorted(others)}"
-
-
-def test_only_declared_places_name_a_domain():
-    """Losses, replay, networks, styles and transforms serve every domain: none of them may import one."""
-    for module, names in INTERNAL.items():
-        if LAYERS.get(part(module), 99) <= 1 and part(module) not in ("envs", "domain"):
-            assert not any(domain(name) for name in names), f"{module} imports a domain: {sorted(names)}"
 
 
 def test_the_library_never_imports_hydra():

@@ -8,14 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from coachable.domain import Domain
+from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import draw_style_grid
-from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.style_grid import (
     StyleGrid,
     evaluate_grid,
     markdown_table,
     mean_of,
     policy_sentence,
+    published,
     write_csv,
 )
 from coachable.evaluation.switching import SwitchReport, evaluate_switching
@@ -65,9 +66,8 @@ def evaluate(
     write_csv(rows, out / "grid.csv")
     if response:
         write_csv(response, out / "response.csv")
-    panels = [name for name in ("survived", "pose_held", "forward_speed") if name in grid.episodes]
     title = f"{domain.name}: {episodes} episodes of {grid.steps} steps per style, 95 % intervals"
-    draw_style_grid(grid, agent.space, out / "grid.png", title, panels)
+    draw_style_grid(grid, domain, agent.space, out / "grid.png", title)
     report = _report(domain, agent, grid, rows, response, switching, switch_episodes)
     (out / "report.md").write_text(report)
     (out / "summary.json").write_text(json.dumps(_summary(grid, rows, switching), indent=2) + "\n")
@@ -99,7 +99,8 @@ def _report(
     switching: SwitchReport,
     switch_episodes: int,
 ) -> str:
-    columns = {name: "" for name in grid.cells[0]} | dict(domain.columns)
+    columns = {name: ".6g" if isinstance(value, float) else "" for name, value in grid.cells[0].items()}
+    columns |= published(domain, grid.episodes)
     text = f"# {domain.name}: requested and measured style\n\n"
     text += f"{policy_sentence(agent)}; {rows[0]['episodes']} episodes of "
     text += f"{grid.steps} steps per style, seed {grid.seed}.\n\n![style grid](grid.png)\n\n"

@@ -23,7 +23,6 @@ from coachable.evaluation.style_grid import markdown_table, write_csv
 from coachable.networks.plain import ActionOutputs
 from coachable.styles import StyleSpace
 from coachable.training.weights import domain_of, load_policy
-from coachable.transforms import coachable_env
 
 __all__ = ["explain", "record_states"]
 
@@ -122,8 +121,7 @@ def record_states(
     steps = steps or domain.episode_steps
     theta = space.sample((episodes,), torch.Generator().manual_seed(seed))
     recorder = _Observations(max(1, steps // _RECORDED))
-    simulation = domain.make_env(num_envs=episodes, num_threads=num_threads)
-    env = coachable_env(simulation, space, domain.make_reward(space), seed=seed)
+    env = domain.styled_env(space, episodes, seed=seed, num_threads=num_threads)
     label = f"{episodes} episodes" if progress else None
     record = record_episodes(env, policy, theta, recorder, steps=steps, seed=seed, progress=label)
     env.close()

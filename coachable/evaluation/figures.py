@@ -12,55 +12,82 @@ import numpy as np
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
-from coachable.evaluation.style_grid import StyleGrid, mean_of, measured_column
-from coachable.styles import Choice, Setpoint, StyleSpace, Weight
+from coachable.domain import Domain
+from coachable.evaluation.runs import describe
+from coachable.evaluation.style_grid import StyleGrid, mean_of, measured_column, published
+from coachable.styles import Choice, StyleSpace
 
-_LABELS = {"survived": "episodes without a fall", "pose_held": "steps in pose", "forward_speed": "forward speed [m/s]"}
-_SHARES = ("survived", "pose_held")
-# Distinguishable without colour as well.
-_MARKERS = "osD^vP*X"
+MARKERS = "osD^vP*X"  # distinguishable without colour as well
 
 
-def draw_style_grid(grid: StyleGrid, space: StyleSpace, path: Path, title: str, panels: Sequence[str]) -> None:
-    """Requested against measured style, and what it costs, one line per option of the space's choice.
+def draw_style_grid(grid: StyleGrid, domain: Domain, space: StyleSpace, path: Path, title: str) -> None:
+    """Draw measured against requested style, and the domain's published metrics over the same axis.
 
     Args:
         grid: the evaluation.
-        space: its style space, with one set-point or weight on the horizontal axis.
+        domain: its columns and units.
+        space: its style space.
         path: PNG file to write.
         title: above the figure.
-        panels: further metrics to draw over the same axis.
     """
-    axis = next(p for p in space.parameters if isinstance(p, Setpoint | Weight))
-    choice = next((p for p in space.parameters if isinstance(p, Choice)), None)
-    groups: list[Any] = list(choice.options) if choice else [None]
-    rows = grid.rows()
-    names = [name for name in (axis.name, *panels) if name in grid.episodes]
+    axis, lines = grid_lines(grid.cells, space)
+    rows, formats = grid.rows(), published(domain, grid.episodes)
+    columns = {measured_column(name, grid.cells[0]): name for name in grid.episodes}
+    names = [columns[column] for column in formats if column in columns and columns[column] not in space]
+    names = [name for name in ((axis,) if axis in grid.episodes else ()) + tuple(names) if name != f"{axis}_error"]
     figure, axes = plt.subplots(1, len(names), figsize=(4.2 * len(names), 3.8), squeeze=False, layout="constrained")
-    unit = f" [{axis.unit}]" if axis.unit else ""
     for panel, name in zip(axes[0], names, strict=True):
-        for index, group in enumerate(groups):
-            cells = [i for i, cell in enumerate(grid.cells) if choice is None or cell[choice.name] == group]
-            x = np.array([grid.cells[i][axis.name] for i in cells])
-            column = measured_column(name, grid.cells[0])
+        column = measured_column(name, grid.cells[0])
+        for index, (label, cells) in enumerate((lines or {"": list(range(len(grid.cells)))}).items()):
+            x = np.array([grid.cells[i][axis] for i in cells] if axis else cells, dtype=float)
             values = np.array([mean_of(grid.episodes[name][i]) for i in cells])
             spread = np.array([[rows[i][f"{column}_low"], rows[i][f"{column}_high"]] for i in cells])
-            offset = (index - (len(groups) - 1) / 2) * 0.004 * (axis.high - axis.low) / 0.35
+            offset = (index - (len(lines) - 1) / 2) * 0.012 * np.ptp(x)  # so that intervals do not cover each other
             error = np.abs(spread - values[:, None]).T
-            panel.errorbar(x + offset, values, error, marker=_MARKERS[index], label=readable(group), capsize=2, ms=5)
-        if name == axis.name:
-            panel.plot([axis.low, axis.high], [axis.low, axis.high], color="0.6", ls="--", lw=1, label="as requested")
-            panel.set_ylabel(f"measured {readable(name)}{unit}")
+            style: dict[str, Any] = {"marker": MARKERS[index], "ls": "-" if axis else "", "label": label or None}
+            panel.errorbar(x + offset, values, error, capsize=2, ms=5, **style)
+        if name == axis:
+            low, high = space[name].low, space[name].high
+            panel.plot([low, high], [low, high], color="0.6", ls="--", lw=1, label="as requested")
+            panel.set_ylabel(f"measured {_with_unit(name, space[name].unit)}")
         else:
-            panel.set_ylabel(_LABELS.get(name, readable(name)))
-            if name in _SHARES:
+            panel.set_ylabel(_with_unit(name, domain.units.get(name, "")))
+            if formats.get(column, "").endswith("%"):
                 panel.set_ylim(-0.03, 1.05)
-        panel.set_xlabel(f"requested {readable(axis.name)}{unit}")
+        panel.set_xlabel(f"requested {_with_unit(axis, space[axis].unit)}" if axis else "style, by row of the table")
         panel.grid(alpha=0.3)
-    axes[0, 0].legend(fontsize=8)
+    if axes[0, 0].get_legend_handles_labels()[1]:
+        axes[0, 0].legend(fontsize=8)
     figure.suptitle(title, fontsize=10)
     figure.savefig(path, dpi=130)
     plt.close(figure)
+
+
+def grid_lines(cells: Sequence[dict[str, Any]], space: StyleSpace) -> tuple[str | None, dict[str, list[int]]]:
+    """Choose what a figure of a style grid shows over its horizontal axis.
+
+    Args:
+        cells: styles by parameter name.
+        space: their style space.
+
+    Returns:
+        The numeric parameter with most values, and the cells of each combination of the others, two or more, by label;
+        None and nothing where there is no such parameter or there are too many combinations.
+    """
+    counts = {name: len({c[name] for c in cells}) for name in cells[0] if not isinstance(space[name], Choice)}
+    axis = max(counts, key=lambda name: counts[name], default=None)
+    if axis is None or counts[axis] < 3:
+        return None, {}
+    lines: dict[str, list[int]] = {}
+    for i, cell in sorted(enumerate(cells), key=lambda pair: pair[1][axis]):
+        others = {k: v for k, v in cell.items() if k != axis}
+        lines.setdefault(describe(others) if others else "", []).append(i)
+    drawable = len(lines) <= len(MARKERS) and all(len(line) > 1 for line in lines.values())
+    return (axis, lines) if drawable else (None, {})
+
+
+def _with_unit(name: str, unit: str) -> str:
+    return f"{readable(name)} [{unit}]" if unit else readable(name)
 
 
 def readable(name: Any) -> str:

@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from coachable import __version__
 from coachable.domain import Domain
+from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import readable
 from coachable.evaluation.outputs import complete_folder
 from coachable.evaluation.report_figures import draw_metrics, draw_requests, draw_switches, draw_tradeoffs
@@ -25,7 +26,6 @@ from coachable.evaluation.runs import (
     flat_row,
     response_rows,
 )
-from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.style_grid import acting, mean_of, training_counts, write_csv
 from coachable.styles import Setpoint
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy, widths_of

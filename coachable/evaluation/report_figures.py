@@ -16,8 +16,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from coachable.evaluation.figures import readable
-from coachable.evaluation.runs import Estimate, Run, StyleTable, describe, estimate
+from coachable.evaluation.figures import MARKERS, grid_lines, readable
+from coachable.evaluation.runs import Estimate, Run, StyleTable, estimate
 from coachable.evaluation.style_grid import mean_of
 from coachable.evaluation.sweep import UNIT_REWARD
 from coachable.styles import Choice, StyleSpace
@@ -25,8 +25,6 @@ from coachable.styles import Choice, StyleSpace
 __all__ = ["draw_metrics", "draw_requests", "draw_switches", "draw_tradeoffs"]
 
 _COLUMNS = 3
-_MARKERS = "osD^vP*X"  # distinguishable without colour as well
-_MOST_LINES = len(_MARKERS)
 _GROWTH_POINTS = 200
 
 
@@ -34,7 +32,7 @@ def draw_metrics(
     table: StyleTable, space: StyleSpace, metrics: Sequence[str], formats: Mapping[str, str], path: Path
 ) -> None:
     """Each metric in every style: lines over a numeric parameter where the grid has one, else one point per style."""
-    axis, lines = _lines(table.cells, space)
+    axis, lines = grid_lines(table.cells, space)
     if axis is None:
         _draw_points(table, metrics, formats, path)
         return
@@ -138,20 +136,6 @@ def _draw_points(table: StyleTable, metrics: Sequence[str], formats: Mapping[str
     _save(figure, path)
 
 
-def _lines(cells: Sequence[dict[str, Any]], space: StyleSpace) -> tuple[str | None, dict[str, list[int]]]:
-    """The numeric parameter with most values, and the cells of each combination of the others, two or more."""
-    counts = {name: len({c[name] for c in cells}) for name in cells[0] if not isinstance(space[name], Choice)}
-    axis = max(counts, key=lambda name: counts[name], default=None)
-    if axis is None or counts[axis] < 3:
-        return None, {}
-    lines: dict[str, list[int]] = {}
-    for i, cell in sorted(enumerate(cells), key=lambda pair: pair[1][axis]):
-        others = {k: v for k, v in cell.items() if k != axis}
-        lines.setdefault(describe(others) if others else "", []).append(i)
-    drawable = len(lines) <= _MOST_LINES and all(len(line) > 1 for line in lines.values())
-    return (axis, lines) if drawable else (None, {})
-
-
 def _line(panel: Axes, x: Sequence[float], estimates: Sequence[Estimate], index: int, label: str, lines: int) -> None:
     span = max(x) - min(x) if len(x) > 1 else 1.0
     offset = (index - (lines - 1) / 2) * 0.012 * span  # so that intervals do not cover each other
@@ -160,7 +144,7 @@ def _line(panel: Axes, x: Sequence[float], estimates: Sequence[Estimate], index:
         np.array(x) + offset,
         y,
         _reach(estimates),
-        marker=_MARKERS[index % len(_MARKERS)],
+        marker=MARKERS[index % len(MARKERS)],
         color=f"C{index}",
         label=label,
         capsize=2,

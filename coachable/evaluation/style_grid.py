@@ -17,7 +17,6 @@ from coachable.evaluation.rollouts import record_episodes
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
 from coachable.styles import Setpoint, StyleSpace
 from coachable.training.weights import LoadedPolicy
-from coachable.transforms import coachable_env
 
 
 @dataclass(frozen=True)
@@ -112,8 +111,7 @@ def evaluate_grid(
     steps = steps or domain.episode_steps
     cells = domain.cells() if cells is None else [dict(cell) for cell in cells]
     theta = torch.stack([space.make(strict=True, **cell) for cell in cells]).repeat_interleave(episodes, 0)
-    simulation = domain.make_env(num_envs=len(theta), num_threads=num_threads, **(env_options or {}))
-    env = coachable_env(simulation, space, domain.make_reward(space), seed=seed)
+    env = domain.styled_env(space, len(theta), seed=seed, num_threads=num_threads, **(env_options or {}))
     label = f"{len(cells)} styles x {episodes} episodes" if progress else None
     record = record_episodes(env, policy, theta, domain.measures, steps=steps, seed=seed, progress=label)
     env.close()
@@ -159,14 +157,26 @@ def training_counts(agent: LoadedPolicy) -> str:
     return ", ".join(f"{count:,} {name}" for name, count in counts.items() if count)
 
 
+def published(domain: Domain, episodes: Mapping[str, Any]) -> dict[str, str]:
+    """Return the columns of a domain's table with their formats: those that it declares, otherwise every metric.
+
+    Args:
+        domain: whose table it is.
+        episodes: metrics by name, as in `StyleGrid.episodes`.
+    """
+    parameters = domain.make_space().names
+    everything = {f"measured_{name}" if name in parameters else name: ".3g" for name in episodes}
+    return dict(domain.columns) or everything | {"survived": ".0%"}
+
+
 def policy_sentence(agent: LoadedPolicy) -> str:
-    """Who acts, such as "Deterministic policy after 800,000 frames, 36,798 updates", for the start of a report."""
+    """Return a one-line description of the evaluated policy for the report's heading."""
     trained = training_counts(agent)
     return acting(agent) + (f" after {trained}" if trained else "")
 
 
 def acting(agent: LoadedPolicy) -> str:
-    """How the policy acts, unless told otherwise."""
+    """Return how the policy acts by default: with the mean, or with a sample."""
     samples = getattr(agent.actor, "default_interaction_type", None) is InteractionType.RANDOM
     return "Policy that samples its actions" if samples else "Deterministic policy"
 

@@ -15,7 +15,6 @@ from coachable.domain import Domain, StyleMeasures
 from coachable.evaluation.rollouts import record_episodes
 from coachable.keys import STYLE_FEATURES
 from coachable.styles import StyleReward, StyleSpace, Weight
-from coachable.transforms import coachable_env
 
 __all__ = ["UNIT_REWARD", "WeightSweep", "sweep_weights"]
 
@@ -83,7 +82,7 @@ def sweep_weights(
     for row, (name, _) in enumerate(rows):
         unit[row, space.slices[name]] = 1.0
     measures = _WithUnitReward(domain.measures, reward, unit.repeat_interleave(episodes, 0))
-    env = coachable_env(domain.make_env(num_envs=len(theta), num_threads=num_threads), space, reward, seed=seed)
+    env = domain.styled_env(space, len(theta), seed=seed, num_threads=num_threads, reward=reward)
     record = record_episodes(
         env,
         policy,

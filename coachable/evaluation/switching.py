@@ -1,4 +1,4 @@
-"""Styles that change while the agent acts: does it stay on its feet, and how soon does it comply?"""
+"""Styles that change while the agent acts: does its episode go on, and how soon does it comply?"""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from torch import Tensor
 from coachable.domain import Domain
 from coachable.evaluation.rollouts import record_episodes
 from coachable.styles import StyleSpace
-from coachable.transforms import coachable_env
 
 
 @dataclass(frozen=True)
@@ -61,9 +60,7 @@ def evaluate_switching(
     steps = steps or domain.episode_steps
     generator = torch.Generator().manual_seed(seed)
     styles = space.sample((-(-steps // period), episodes), generator)
-    env = coachable_env(
-        domain.make_env(num_envs=episodes, num_threads=num_threads), space, domain.make_reward(space), seed=seed
-    )
+    env = domain.styled_env(space, episodes, seed=seed, num_threads=num_threads)
     record = record_episodes(
         env,
         policy,
@@ -79,9 +76,9 @@ def evaluate_switching(
     complies = domain.measures.complies(record.measures) & record.alive
     waits, switches = [], 0
     for start in range(period, len(complies), period):
-        walking = record.alive[start]
+        running = record.alive[start]
         done, first = complies[start : start + period].max(0)
-        switches += int(walking.sum())
-        waits.append((first[walking & done] + 1) * domain.control_step)
+        switches += int(running.sum())
+        waits.append((first[running & done] + 1) * domain.control_step)
     times = torch.cat(waits) if waits else torch.empty(0)
     return SwitchReport(metrics, times, len(times) / switches if switches else float("nan"), switches)

@@ -23,7 +23,6 @@ from coachable.keys import STYLE
 from coachable.styles import Choice, StyleRangeWarning, StyleSpace, Weight
 from coachable.training.rng import RandomStream
 from coachable.training.weights import domain_of, load_policy
-from coachable.transforms import coachable_env
 
 VIDEO_SUFFIXES = (".mp4", ".gif", ".png")
 _GIF_FPS = 20
@@ -134,8 +133,7 @@ def _film(
     every: int,
 ) -> Iterator[np.ndarray]:
     """Frames of each request's `period` steps, of every `every`-th step."""
-    simulation = domain.make_env(num_envs=1, num_threads=1, **domain.coached)
-    env = coachable_env(simulation, space, domain.make_reward(space), seed=seed)
+    env = domain.styled_env(space, 1, seed=seed, num_threads=1, **domain.coached)
     renderer = domain.make_renderer(size[0], size[1] - CAPTION)
     chance = RandomStream(seed)
     env.set_seed(seed)

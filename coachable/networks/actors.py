@@ -86,7 +86,7 @@ def make_gaussian_actor(
     action_spec: Bounded | None = None,
     **trunk: Any,
 ) -> ProbabilisticActor:
-    """Build the policy of the humanoid and racing recipes: a tanh-Gaussian over actions in [-1, 1].
+    """Build a tanh-Gaussian policy over actions in [-1, 1].
 
     Args:
         obs_dim: Width of the observation.

@@ -1,10 +1,9 @@
-"""Readable differences between two style spaces, for checkpoints that were trained on another one."""
+"""Differences between the parameters of two style spaces, for checkpoints that were trained on another one."""
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
-if TYPE_CHECKING:
-    from coachable.styles.parameters import Parameter
-    from coachable.styles.space import StyleSpace
+from coachable.styles.parameters import Parameter
 
 _WORDS = {
     "default": "defaults to",
@@ -16,25 +15,21 @@ _WORDS = {
 }
 
 
-def differences(here: "StyleSpace", there: "StyleSpace") -> list[str]:
-    """Sentences on how `there` differs from `here`; empty if the spaces are equal."""
-    found = []
-    if here.name != there.name:
-        found.append(f"The space is called {here.name!r} here, {there.name!r} there.")
-    found += [f"{name} exists only here." for name in here.names if name not in there]
-    found += [f"{name} exists only there." for name in there.names if name not in here]
-    shared = [name for name in here.names if name in there]
-    order = [name for name in there.names if name in here]
+def differences(here: Sequence[Parameter], there: Sequence[Parameter]) -> list[str]:
+    """List how parameters `there` differ from those `here`, as sentences; the list is empty if they are equal."""
+    ours, theirs = {p.name: p for p in here}, {p.name: p for p in there}
+    found = [f"{name} exists only here." for name in ours if name not in theirs]
+    found += [f"{name} exists only there." for name in theirs if name not in ours]
+    shared = [name for name in ours if name in theirs]
+    order = [name for name in theirs if name in ours]
     if shared != order:
         found.append(f"The parameters are ordered {', '.join(shared)} here, {', '.join(order)} there.")
     for name in shared:
-        found += _between(here[name], there[name])
-    if here.sampler != there.sampler:
-        found.append(f"Styles are drawn from {here.sampler} here, from {there.sampler} there.")
+        found += _between(ours[name], theirs[name])
     return found
 
 
-def _between(here: "Parameter", there: "Parameter") -> list[str]:
+def _between(here: Parameter, there: Parameter) -> list[str]:
     if here.kind != there.kind:
         return [f"{here.name} is a {here.kind} here, a {there.kind} there."]
     found = []
@@ -47,7 +42,7 @@ def _between(here: "Parameter", there: "Parameter") -> list[str]:
     return found
 
 
-def _range(parameter: "Parameter") -> str:
+def _range(parameter: Parameter) -> str:
     return f"[{parameter.low:g}, {parameter.high:g}]{' ' + parameter.unit if parameter.unit else ''}"
 
 

@@ -77,6 +77,11 @@ class StyleReward(nn.Module):
         return tuple(self.scales)
 
     @property
+    def terms(self) -> dict[str, StyleTerm]:
+        """The terms by name, in the order in which they are added."""
+        return {name: term for name, term, _ in self._terms}
+
+    @property
     def is_linear(self) -> bool:
         """Whether the reward is known to be linear in the features, so that those of several steps may be summed."""
         return all(isinstance(term, WeightedFeature | WeightedSum) for _, term, _ in self._terms)

@@ -196,7 +196,7 @@ class StyleSpace:
         Raises:
             ValueError: If the shape is wrong, a value is NaN, or `strict` and something would be changed.
         """
-        clauses = violations(self, theta)
+        clauses = violations(self.parameters, self.low, self.high, theta)
         if not clauses:
             return theta.to(torch.float32, copy=True)
         message = f"style {'; '.join(clauses)}."
@@ -213,7 +213,7 @@ class StyleSpace:
 
     def validate(self, theta: Tensor) -> None:
         """Raises a ValueError that lists what is wrong with theta: shape, NaN, range or one-hot."""
-        clauses = violations(self, theta)
+        clauses = violations(self.parameters, self.low, self.high, theta)
         if clauses:
             raise ValueError(f"style {'; '.join(clauses)}.")
 
@@ -223,7 +223,7 @@ class StyleSpace:
 
     def lazy_view(self, theta: Tensor) -> StyleView:
         """Like `view`, but each block is sliced only when read."""
-        return StyleView(self, theta)
+        return StyleView(self.columns, self.columns_of, theta)
 
     def columns_of(self, names: tuple[str, ...]) -> slice | list[int] | None:
         """Columns of several parameters, in that order: a slice where they are adjacent, None if all of theta."""
@@ -285,8 +285,13 @@ class StyleSpace:
         return cls.from_dict(json.loads(text))
 
     def difference(self, other: "StyleSpace") -> list[str]:
-        """Readable sentences on how `other` ("there") differs from this space ("here"); empty if equal."""
-        return differences(self, other)
+        """List how `other` ("there") differs from this space ("here"), as sentences; the list is empty if equal."""
+        found = differences(self.parameters, other.parameters)
+        if self.name != other.name:
+            found.insert(0, f"The space is called {self.name!r} here, {other.name!r} there.")
+        if self.sampler != other.sampler:
+            found.append(f"Styles are drawn from {self.sampler} here, from {other.sampler} there.")
+        return found
 
     def encodes_like(self, other: "StyleSpace") -> bool:
         """Whether a network trained on `other` reads this space's styles unchanged: same entries, same encoding."""

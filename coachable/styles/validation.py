@@ -1,25 +1,24 @@
 """What can be wrong with a style: shape, NaN, range, one-hot."""
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from coachable.styles.parameters import Choice, Parameter
 
-if TYPE_CHECKING:
-    from coachable.styles.space import StyleSpace
-
 
 class StyleRangeWarning(UserWarning):
     """A requested style lies outside the range that the agent was trained on."""
 
 
-def violations(space: "StyleSpace", theta: Tensor) -> list[str]:
-    """Range and one-hot violations of theta, one clause per parameter; empty if theta is a valid style.
+def violations(parameters: Sequence[Parameter], low: Tensor, high: Tensor, theta: Tensor) -> list[str]:
+    """List range and one-hot violations of theta, one clause per parameter; the list is empty for a valid style.
 
     Args:
-        space: What theta means.
+        parameters: In the order of theta's entries.
+        low: `(dim,)` lower bounds.
+        high: `(dim,)` upper bounds.
         theta: `(..., dim)`.
 
     Returns:
@@ -28,25 +27,25 @@ def violations(space: "StyleSpace", theta: Tensor) -> list[str]:
     Raises:
         ValueError: If the shape or type is wrong or a value is NaN, which no clamping repairs.
     """
-    if theta.ndim < 1 or theta.shape[-1] != space.dim or not theta.is_floating_point():
+    dim = len(low)
+    if theta.ndim < 1 or theta.shape[-1] != dim or not theta.is_floating_point():
         raise ValueError(
             f"style has shape {tuple(theta.shape)} and type {theta.dtype}: "
-            f"expected (..., {space.dim}) floating point, for {list(space.names)}."
+            f"expected (..., {dim}) floating point, for {[p.name for p in parameters]}."
         )
-    flat = theta.detach().to(torch.float32).reshape(-1, space.dim)
-    nan = flat.isnan().any(0).tolist()
-    if any(nan):
-        raise ValueError(f"style is NaN in {[n for n, s in space.slices.items() if any(nan[s])]}: expected numbers.")
-    outside = ((flat < space.low.to(flat.device)) | (flat > space.high.to(flat.device))).any(0).tolist()
-    clauses = []
-    for p in space.parameters:
-        columns = space.slices[p.name]
-        block = flat[:, columns]
+    flat = theta.detach().to(torch.float32).reshape(-1, dim)
+    blocks = list(zip(parameters, flat.split([p.width for p in parameters], -1), strict=True))
+    if nan := [p.name for p, block in blocks if bool(block.isnan().any())]:
+        raise ValueError(f"style is NaN in {nan}: expected numbers.")
+    outside = ((flat < low.to(flat.device)) | (flat > high.to(flat.device))).any(0).tolist()
+    clauses, first = [], 0
+    for p, block in blocks:
         if isinstance(p, Choice):
             if not bool(_is_one_hot(block).all()):
                 clauses.append(f"{p.name} is no one-hot of its {p.width} options {list(p.options)}")
-        elif outside[columns.start]:
+        elif outside[first]:
             clauses.append(f"{p.name} = {_span(block)}{_unit(p)} lies outside [{p.low:g}, {p.high:g}]{_unit(p)}")
+        first += p.width
     return clauses
 
 

@@ -117,11 +117,12 @@ class MetricsLog:
     """Sends every row of metrics to the CSV file and, where there is one, to a TorchRL logger.
 
     Args:
-        run_dir: `metrics.csv` is written here.
+        run_dir: `metrics.csv` is written here; created if missing.
         logger: a TorchRL logger with `log_metrics`, or None.
     """
 
     def __init__(self, run_dir: Path, logger: Any | None = None) -> None:
+        Path(run_dir).mkdir(parents=True, exist_ok=True)
         self.csv = CsvLog(Path(run_dir) / "metrics.csv")
         self.logger = logger
 

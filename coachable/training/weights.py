@@ -3,6 +3,7 @@
 import os
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import wraps
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -70,7 +71,7 @@ def agent_state(
     """Gathers what identifies an agent, for a checkpoint or a weights file.
 
     Args:
-        domain: "humanoid", "racing", "combat" or the user's own.
+        domain: name under which it is registered.
         space: its styles.
         actor: its policy.
         loss_module: holds the critics' weights.
@@ -119,7 +120,7 @@ def load_policy(path_or_domain: Path | str, device: torch.device | str = "cpu") 
 
 
 def domain_of(agent: LoadedPolicy) -> Domain:
-    """The built-in domain of an agent, as it was in its training; its environments are checked against the agent.
+    """Return the registered domain of an agent as its training had it; its environments are checked against the agent.
 
     Args:
         agent: from `load_policy`.
@@ -140,6 +141,7 @@ def domain_of(agent: LoadedPolicy) -> Domain:
     if groups:
         _check_widths(source, reads, (groups, reads[1]), name)
 
+    @wraps(domain.make_env)
     def make_env(*arguments: Any, **options: Any) -> Any:
         with refusing(source, "a configuration of its environment"):
             env = domain.make_env(*arguments, **options)
@@ -169,7 +171,7 @@ def export_weights(checkpoint: Path | str, out: Path | str) -> Path:
 
     Args:
         checkpoint: a run's folder or a checkpoint.
-        out: the file, for example `coachable/pretrained/humanoid/weights.pt`.
+        out: the file, for example `weights.pt`.
 
     Returns:
         The file.

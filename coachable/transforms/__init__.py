@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from coachable.transforms.mirror import MirrorMap, MirrorSymmetry
+    from coachable.transforms.style_features import StyleFeatures
     from coachable.transforms.style_reward import StyleRewardTransform
     from coachable.transforms.style_sampler import CoachableEnv, StyleSampler, coachable_env
     from coachable.transforms.task_impersonation import TaskImpersonation
@@ -14,6 +15,7 @@ _MODULE_OF = {
     "CoachableEnv": "coachable.transforms.style_sampler",
     "MirrorMap": "coachable.transforms.mirror",
     "MirrorSymmetry": "coachable.transforms.mirror",
+    "StyleFeatures": "coachable.transforms.style_features",
     "StyleRewardTransform": "coachable.transforms.style_reward",
     "StyleSampler": "coachable.transforms.style_sampler",
     "TaskImpersonation": "coachable.transforms.task_impersonation",
@@ -24,6 +26,7 @@ __all__ = [
     "CoachableEnv",
     "MirrorMap",
     "MirrorSymmetry",
+    "StyleFeatures",
     "StyleRewardTransform",
     "StyleSampler",
     "TaskImpersonation",

@@ -14,10 +14,10 @@ from torchrl.envs import EnvBase
 
 from coachable.cli import main
 from coachable.domain import Domain
+from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.report import report, write_report
 from coachable.evaluation.report_page import shown, table
 from coachable.evaluation.runs import Estimate, Run, StyleTable, describe, estimate
-from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.style_grid import StyleGrid
 from coachable.evaluation.sweep import sweep_weights
 from coachable.evaluation.switching import SwitchReport

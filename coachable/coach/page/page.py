@@ -89,9 +89,9 @@ class CoachPage:
                 self._add_widget(parameter, self.session.style[parameter.name], self._set)
                 self.measured[parameter.name] = MeasuredText(self.server, parameter)
             self.others = self.server.gui.add_markdown("")
-        if self.session.coaching.controls:
+        if self.session.domain.controls:
             with self.server.gui.add_folder("Steering"):
-                for control in self.session.coaching.controls:
+                for control in self.session.domain.controls:
                     name = control.parameter.name
                     self._add_widget(control.parameter, self.session.controls[name], self._steer)
         folder = self.server.gui.add_folder("Requested and measured")

@@ -39,6 +39,7 @@ class PictureView:
     def __init__(self, server: viser.ViserServer, session: CoachSession) -> None:
         self._server, self._session = server, session
         self._renderer = session.domain.make_renderer(*_PICTURE_SIZE)
+        self._renderer.draw(session.env)  # one that cannot draw says so now
         self._due = 0.0
 
     def update(self) -> None:

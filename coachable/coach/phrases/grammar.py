@@ -111,12 +111,11 @@ class StyleGrammar:
         self.parameters: dict[str, Parameter] = {p.name: p for p in declared}
         self.lexicon: dict[tuple[str, ...], Mention] = {}
         self._context = {p.name: {stem(w) for w in tokenise(f"{p.help} {p.name}")} for p in declared}
+        self._ignored = frozenset((vocabulary or {}).get("", ()))
         self._add_help()
         self._add_names()
-        self._ignored: set[str] = set()
         for meaning, phrases in (vocabulary or {}).items():
             if not meaning:
-                self._ignored.update(phrases)
                 continue
             mention = self._mention(meaning)
             for phrase in phrases:
@@ -139,11 +138,10 @@ class StyleGrammar:
         if len(phrase) > MAX_PHRASE:
             problem = f"the phrase has {len(phrase):,} characters, at most {MAX_PHRASE:,} are read"
             return Understanding(phrase[:MAX_PHRASE], {}, (), (problem,), reading.last)
-        split = segments.split(tokenise(phrase), self.lexicon)
+        split = segments.split(tokenise(phrase), self.lexicon, self._ignored)
         if not split:
             reading.failed.append(f"'{phrase.strip()}'" if phrase.strip() else "an empty phrase")
         for segment in split:
-            segment.unknown = [word for word in segment.unknown if word not in self._ignored]
             if segment.default and not segment.unknown and not segment.mentions:
                 self._reset(reading)
             else:
@@ -184,10 +182,10 @@ class StyleGrammar:
                 if counts[word] == 1:
                     self._add(word, Mention((name,)))
 
-    @staticmethod
-    def _is_free(word: str) -> bool:
+    def _is_free(self, word: str) -> bool:
         """Whether a word has no other meaning, so that alone it may stand for a parameter."""
         taken = (DIRECTIONS, LEVELS, FACTORS, NEGATIONS, PREFERENCES, DEFAULTS, FILLERS, SEPARATORS, UNITS, PERCENT)
+        taken += (self._ignored,)
         return word.isalpha() and len(word) > 1 and not any(word in table for table in taken)
 
     def _mention(self, meaning: str) -> Mention:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from coachable.coach.phrases.vocabulary import (
@@ -114,7 +114,9 @@ class Segment:
         return valued or bool(self.mentions and head)
 
 
-def split(tokens: Sequence[str], lexicon: Mapping[tuple[str, ...], Mention]) -> list[Segment]:
+def split(
+    tokens: Sequence[str], lexicon: Mapping[tuple[str, ...], Mention], ignored: Collection[str] = ()
+) -> list[Segment]:
     """Cuts a phrase at punctuation, conjunctions, and where a request is complete and another begins.
 
     The work grows in proportion to the number of tokens.
@@ -122,6 +124,7 @@ def split(tokens: Sequence[str], lexicon: Mapping[tuple[str, ...], Mention]) -> 
     Args:
         tokens: from `tokenise`.
         lexicon: what stemmed words name.
+        ignored: words that ask for nothing, beside those of the vocabulary.
     """
     sizes, named_ahead = _look_up(tokens, lexicon)
     stems = [stem(token) for token in tokens]
@@ -142,7 +145,7 @@ def split(tokens: Sequence[str], lexicon: Mapping[tuple[str, ...], Mention]) -> 
                 segment.mentions.append(mention)
             i += size
         else:
-            i += _take(segment, tokens, i)
+            i += _take(segment, tokens, i, ignored)
     found.append(segment)
     return _tidy(found)
 
@@ -185,7 +188,7 @@ def _begins_another(segment: Segment, rest: Sequence[str], mention: Mention | No
     return word in DEGREES and len(rest) > 1 and (rest[1] in DIRECTIONS or rest[1] in LEVELS)
 
 
-def _take(segment: Segment, tokens: Sequence[str], i: int) -> int:
+def _take(segment: Segment, tokens: Sequence[str], i: int, ignored: Collection[str]) -> int:
     """Notes what a word means; returns how many tokens were used."""
     word = tokens[i]
     segment.words.append(word)
@@ -213,12 +216,12 @@ def _take(segment: Segment, tokens: Sequence[str], i: int) -> int:
     elif word == "possible" and segment.level is not None:
         segment.level = float(round(segment.level))
     else:
-        _take_modifier(segment, word)
+        _take_modifier(segment, word, ignored)
     return 1
 
 
-def _take_modifier(segment: Segment, word: str) -> None:
-    known = word in FILLERS
+def _take_modifier(segment: Segment, word: str, ignored: Collection[str]) -> None:
+    known = word in FILLERS or word in ignored
     if word in DEGREES:
         segment.degree = max(segment.degree, DEGREES[word])
         known = True

@@ -89,10 +89,10 @@ FILLERS = _words(
     """a an the of by in on at to for from as be is are was were am being been it its this that these those there so
     too just now please can could would should will shall may might must do does did i you he she we they me him us
     them my your his her our their want wants like let lets make makes making take takes taking go going get gets
-    getting give set put have has having try walk walking walks move moving style than rather quite some any possible
+    getting give set put have has having try move moving style than rather quite some any possible
     ok okay hey well thanks thank instead back exactly about roughly around by into or if when keep hold stay leave
     holding keeping bit lot lots touch tad one such kind sort how what which where when between during after before
-    over under per both each maybe drive driving fight fighting"""
+    over under per both each maybe"""
 )
 
 _ARTICLES = _words("the your my his her its their")  # "raise your arms" reads as "raise arms"

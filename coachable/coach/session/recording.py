@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from coachable.coach.session.coaching import Control
+from coachable.domain import Control
 from coachable.styles import Choice, Parameter, StyleSpace
 
 SCHEMA_VERSION = 1

@@ -14,9 +14,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from coachable.coach.phrases.fitting import fitting
 from coachable.coach.phrases.grammar import StyleGrammar, Understanding
-from coachable.coach.session.coaching import Coaching, coaching_of
-from coachable.coach.session.episodes import LiveEpisodes
+from coachable.coach.session.live_episodes import LiveEpisodes
 from coachable.coach.session.readout import MeasuredWindow, StyleReport
 from coachable.coach.session.recording import Recording, check_seed
 from coachable.coach.session.timeline import Timeline
@@ -42,7 +42,6 @@ class CoachSession:
         strict: raise for a request outside the trained range instead of clamping it with a warning.
         endless: go on when the domain's time limit is reached.
         window: length of the measured window [s].
-        coaching: live controls, words and presets; by default those of the domain.
 
     Attributes:
         policy: see above; may be exchanged between steps.
@@ -71,21 +70,17 @@ class CoachSession:
         strict: bool = False,
         endless: bool = True,
         window: float = 2.0,
-        coaching: Coaching | None = None,
     ) -> None:
         self.policy, self.space, self.domain, self.source = policy, space, domain, source
-        self.coaching = (coaching_of(domain.name) if coaching is None else coaching).fitting(space)
+        parameters = [*space.parameters, *(control.parameter for control in domain.controls)]
+        words = fitting(domain.words, parameters)
         self.strict, self.hold, self.window = strict, True, window
-        self._episodes = LiveEpisodes(domain, space, endless=endless, terminated=self.coaching.terminated)
+        self._episodes = LiveEpisodes(domain, space, endless=endless, terminated=words.terminated)
         self.presets: dict[str, dict[str, Any]] = {"default": space.describe(space.default)}
-        self.presets |= {name: dict(style) for name, style in self.coaching.presets.items()}
-        self._controls = {control.parameter.name: control for control in self.coaching.controls}
+        self.presets |= {name: dict(style) for name, style in words.presets.items()}
+        self._controls = {control.parameter.name: control for control in domain.controls}
         self._control_values = {name: cast(float, c.parameter.default) for name, c in self._controls.items()}
-        self.grammar = StyleGrammar(
-            [*space.parameters, *(control.parameter for control in self.coaching.controls)],
-            self.coaching.vocabulary,
-            self.coaching.examples,
-        )
+        self.grammar = StyleGrammar(parameters, words.vocabulary, words.examples)
         self._understood: Understanding | None = None
         self._recent = MeasuredWindow(domain.measures, round(window / domain.control_step))
         self._outside: dict[str, float] = {}
@@ -116,7 +111,7 @@ class CoachSession:
 
     @property
     def controls(self) -> dict[str, float]:
-        """The live controls, such as the humanoid's course [deg]."""
+        """Values of the live controls, in their units."""
         return dict(self._control_values)
 
     def set(self, **values: float | str) -> None:
@@ -314,9 +309,7 @@ class CoachSession:
 
     def replica(self) -> CoachSession:
         """Another session of the same agent, in an environment of its own."""
-        return CoachSession(
-            self.policy, self.space, self.domain, source=self.source, window=self.window, coaching=self.coaching
-        )
+        return CoachSession(self.policy, self.space, self.domain, source=self.source, window=self.window)
 
     def close(self) -> None:
         """Releases the environment."""

@@ -12,6 +12,7 @@ from coachable.domains.combat.fights import evaluate_fights
 from coachable.domains.combat.metrics import CombatMeasures
 from coachable.domains.combat.render import CombatRenderer
 from coachable.domains.combat.styles import combat_style_reward, combat_style_space, single_styles
+from coachable.domains.combat.words import WORDS
 from coachable.envs.combat.constants import CONTROL_STEP, EPISODE_STEPS
 from coachable.envs.combat.env import CombatEnv
 from coachable.envs.combat.features import observation_groups
@@ -52,6 +53,7 @@ DOMAIN = Domain(
     episode_steps=EPISODE_STEPS,
     columns={"won": ".0%", "damage": ".0f", "style_score": ".2f"},
     observation_groups=observation_groups("full"),
+    words=WORDS,
     as_trained=_as_trained,
     evaluation=evaluate_fights,
 )

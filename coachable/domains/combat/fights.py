@@ -21,9 +21,9 @@ from coachable.domains.combat.coached_fight import (
 )
 from coachable.domains.combat.styles import single_styles
 from coachable.envs.combat.tables import MACHINES, SITES, STYLES, UNSEEN_MACHINES
+from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import readable
 from coachable.evaluation.rollouts import record_episodes
-from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.statistics import rank_correlation
 from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_csv
 from coachable.evaluation.sweep import WeightSweep, sweep_weights

@@ -12,6 +12,7 @@ from coachable.domains.humanoid.metrics import HumanoidMeasures
 from coachable.domains.humanoid.render import HumanoidRenderer
 from coachable.domains.humanoid.scene import HumanoidScene
 from coachable.domains.humanoid.styles import POSES, humanoid_style_reward, humanoid_style_space
+from coachable.domains.humanoid.words import COURSE, WORDS
 from coachable.envs.humanoid.env import EPISODE_STEPS, HumanoidEnv
 from coachable.envs.humanoid.model import CONTROL_STEP
 from coachable.envs.humanoid.observation import OBSERVATION_GROUPS
@@ -52,5 +53,8 @@ DOMAIN = Domain(
         "measured_step_length": ".3f",
         "step_length_error": ".3f",
     },
+    units={"forward_speed": "m/s", "step_length_error": "m"},
+    controls=(COURSE,),
+    words=WORDS,
     observation_groups=tuple((name, width) for name, width, _ in OBSERVATION_GROUPS),
 )

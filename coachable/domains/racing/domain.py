@@ -11,6 +11,7 @@ from coachable.domain import Domain
 from coachable.domains.racing.families import racing_family
 from coachable.domains.racing.metrics import RacingMeasures
 from coachable.domains.racing.render import RacingRenderer
+from coachable.domains.racing.words import WORDS
 from coachable.envs.racing.env import EPISODE_STEPS
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
 from coachable.envs.racing.race.observation import COURSE_POINTS, observation_groups
@@ -70,6 +71,7 @@ def racing_domain(
         episode_steps=EPISODE_STEPS,
         columns={"survived": ".0%", "pace": ".1f", "off": ".1%", "steering_change": ".2f"} | dict(columns),
         observation_groups=observation_groups(cars > 1, pool=False),
+        words=WORDS[family],
         as_trained=as_trained,
         evaluation=evaluation,
     )

@@ -13,7 +13,7 @@ import numpy as np
 from coachable.domains.racing.metrics import DRIFT_ANGLE_DEG, GRIP_ANGLE_DEG
 from coachable.envs.racing.race.features import DRIFT_NAMES
 from coachable.envs.racing.race.scenarios import Scenario
-from coachable.evaluation.settings import EvaluationSettings
+from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
 from coachable.evaluation.style_grid import evaluate_grid, markdown_table, policy_sentence, write_csv
 

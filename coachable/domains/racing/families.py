@@ -1,4 +1,4 @@
-"""The environments that the three families of style are trained in (racing.md, sections 1 and 5.3)."""
+"""The environments that the three families of style are trained in."""
 
 from __future__ import annotations
 
@@ -75,10 +75,11 @@ def rival_env(num_envs: int = AGENTS * 21, **options: Any) -> RacingEnv:
     One agent among four rivals where `num_envs` is no multiple of three.
     """
     course, driver = _line_follower(options, "endurance", "gt3")
+    space = aggressiveness_style_space()
     defaults: dict[str, Any] = {
         "cars": CARS,
         "controlled": AGENTS if num_envs % AGENTS == 0 else 1,
-        "driver": Rivals(driver, aggressiveness_style_space(), slowest=0.8 / RIVALS_GRIP),
+        "driver": Rivals(driver, (space.low, space.high), slowest=0.8 / RIVALS_GRIP),
         "car": "gt3",
         "scenarios": race_scenarios(CARS),
     }

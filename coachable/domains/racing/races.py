@@ -23,12 +23,11 @@ from coachable.envs.racing.physics.simulation import CONTROL_STEP
 from coachable.envs.racing.race.features import anyone_beside
 from coachable.envs.racing.race.run import Run
 from coachable.envs.racing.race.scenarios import rolling_start
+from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.rollouts import record_episodes
-from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation, wilson_interval
 from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_csv
 from coachable.keys import STYLE_FEATURES
-from coachable.transforms import coachable_env
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -171,8 +170,10 @@ def race_alike(
         What is measured, (T, A, B) each, and the length of the track [m].
     """
     cars, races, _ = theta.shape
-    simulation: Any = domain.make_env(
-        num_envs=cars * races,
+    env = domain.styled_env(
+        agent.space,
+        cars * races,
+        settings.seed,
         cars=cars,
         controlled=cars,
         driver=None,
@@ -181,7 +182,7 @@ def race_alike(
         copies=copies,
         **options,
     )
-    env = coachable_env(simulation, agent.space, domain.make_reward(agent.space), seed=settings.seed)
+    simulation: Any = env.base_env
     # Who starts where is drawn with the start: look, then start again with the same seed.
     env.set_seed(settings.seed)
     env.reset()

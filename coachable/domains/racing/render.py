@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 from torchrl.envs import EnvBase
 
+from coachable.envs.racing.env import RacingEnv
 from coachable.envs.racing.physics.state import ROW, WEARS
-
-if TYPE_CHECKING:
-    from coachable.envs.racing.env import RacingEnv
 
 VIEW = 60.0  # [m] from the car to the left and right border of the picture
 _GRASS = "#7ba05b"
@@ -36,8 +34,6 @@ class RacingRenderer:
     def draw(self, env: EnvBase, row: int = 0) -> np.ndarray:
         """(height, width, 3) uint8: the car of a row in the middle, others of its group around it."""
         from matplotlib.patches import Polygon
-
-        from coachable.envs.racing.env import RacingEnv
 
         while not isinstance(env, RacingEnv):
             env = cast(EnvBase, env.base_env)

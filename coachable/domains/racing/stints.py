@@ -19,11 +19,10 @@ from coachable.envs.racing.circuit.circuits import load_track
 from coachable.envs.racing.physics.parameters import Resources
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
 from coachable.envs.racing.race.scenarios import Conditions, Scenario
+from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.rollouts import record_episodes
-from coachable.evaluation.settings import EvaluationSettings
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
 from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_csv
-from coachable.transforms import coachable_env
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -165,10 +164,10 @@ def _drive(
     """Stints of each cell, each from its own place on the track."""
     space, count = agent.space, len(cells) * episodes
     theta = torch.stack([space.make(strict=True, **cell) for cell in cells]).repeat_interleave(episodes, 0)
-    simulation: Any = domain.make_env(
-        num_envs=count, scenarios=_SOLO, conditions=conditions, resources=rates, episode_steps=steps + 1
+    env = domain.styled_env(
+        space, count, seed, scenarios=_SOLO, conditions=conditions, resources=rates, episode_steps=steps + 1
     )
-    env = coachable_env(simulation, space, domain.make_reward(space), seed=seed)
+    simulation: Any = env.base_env
     bar = f"{label}: {count} stints" if progress else None
     record = record_episodes(
         env,

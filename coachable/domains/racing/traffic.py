@@ -16,7 +16,7 @@ from coachable.domains.racing.metrics import TelemetryMeasures
 from coachable.domains.racing.races import race_alike
 from coachable.envs.racing.race.features import DEFEND, OVERTAKE
 from coachable.envs.racing.race.scenarios import Conditions, Scenario
-from coachable.evaluation.settings import EvaluationSettings
+from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
 from coachable.evaluation.style_grid import markdown_table
 from coachable.keys import STYLE_FEATURES

@@ -23,7 +23,7 @@ from coachable.envs.racing.race.observation import COURSE_POINTS, observation_gr
 from coachable.envs.racing.race.referee import TELEMETRY, WRONG_WAY_TIME, Referee, Verdict
 from coachable.envs.racing.race.rescue import back_on_track, way_clear
 from coachable.envs.racing.race.rivals import Rivals
-from coachable.envs.racing.race.run import RUN_ROWS, Run
+from coachable.envs.racing.race.run import RUN_ROWS, Field, Run
 from coachable.envs.racing.race.scenarios import Conditions, Scenario, Starter, race_scenarios
 from coachable.envs.racing.race.task import TaskWeights
 from coachable.finite import require_finite_action
@@ -34,8 +34,8 @@ EPISODE_STEPS = 1500  # 150 s
 SCENARIO = "scenario"
 TELEMETRY_KEY = "telemetry"
 
-Driver = Callable[["RacingEnv", Tensor], Tensor]
-"""Drives cars that the agent does not: (env, observations (M, D)) to actions (M, 2), of the last M cars of the env."""
+Driver = Callable[[Field, Tensor], Tensor]
+"""Drives cars that the agent does not: (field, observations (M, D)) to actions (M, 2) of the last M cars."""
 
 
 class RacingEnv(EnvBase):
@@ -244,7 +244,7 @@ class RacingEnv(EnvBase):
         require_finite_action(action)
         action = action.clamp(-1.0, 1.0).to(torch.float32)
         if self.driver is not None and self.controlled < self.cars:
-            driven = self.driver(self, self._observation[self.num_envs :])
+            driven = self.driver(self.field, self._observation[self.num_envs :])
             action = torch.cat([action, driven.detach().clamp(-1.0, 1.0).to(action)])
         old, inputs = self._command(self.state, self.run, action, self.compound)
         new, impact = self.simulation.step(old, inputs, self.group)
@@ -302,9 +302,16 @@ class RacingEnv(EnvBase):
             self.driver.load_state(state["rivals"])
 
     def follow(self, policy: nn.Module) -> None:
-        """Lets rivals that are copies of the agent know its policy."""
+        """Set the policy that rivals copy."""
         if isinstance(self.driver, Rivals):
             self.driver.follow(policy)
+
+    @property
+    def field(self) -> Field:
+        """All cars as they are now, for those that drive some of them."""
+        wheels, grip = self.simulation.wheels, self.compound[0]
+        cars = (self.state, self.run, self.garage.car, wheels, grip)
+        return Field(*cars, self.course, self.group, self.seeds, self.episode)
 
     @property
     def telemetry_names(self) -> tuple[str, ...]:
@@ -328,7 +335,7 @@ class RacingEnv(EnvBase):
         return self.scenario.repeat(self.controlled)[:, None]
 
     def _rescue(self, verdict: Verdict) -> Verdict:
-        """The verdict with stranded cars back on the track where the way is clear; nobody's episode terminates."""
+        """Put stranded cars back on a clear stretch of the track instead of ending their episodes."""
         stranded, course, car = verdict.terminated, self.course, self.garage.car
         verdict = verdict._replace(terminated=torch.zeros_like(stranded))
         if not stranded.any():

@@ -5,7 +5,7 @@ import pytest
 from coachable.coach.phrases import segments
 from coachable.coach.phrases.grammar import MAX_PHRASE, StyleGrammar
 from coachable.coach.phrases.vocabulary import tokenise
-from coachable.coach.session.coaching import coaching_of
+from coachable.domain import load_domain
 from coachable.domains.humanoid import humanoid_style_space
 from coachable.styles import Choice, Setpoint, Weight
 from tests.coach.phrases.requests import REQUESTS
@@ -15,9 +15,9 @@ NOW = {"pose": "arms_in_front", "step_length": 0.475, "course": 0.0}
 
 @pytest.fixture(scope="module")
 def grammar():
-    coaching = coaching_of("humanoid")
-    controls = [control.parameter for control in coaching.controls]
-    return StyleGrammar([*humanoid_style_space().parameters, *controls], coaching.vocabulary, coaching.examples)
+    domain = load_domain("humanoid")
+    parameters = [*humanoid_style_space().parameters, *(control.parameter for control in domain.controls)]
+    return StyleGrammar(parameters, domain.words.vocabulary, domain.words.examples)
 
 
 # Steps of the range 0.35 m: a bit 0.035, plain 0.07, much 0.14.

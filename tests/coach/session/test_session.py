@@ -8,10 +8,11 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 
-from coachable.coach.session.coaching import coaching_of
-from coachable.coach.session.episodes import TIME_IS_UP
+from coachable.coach.phrases.fitting import fitting
+from coachable.coach.session.live_episodes import TIME_IS_UP
 from coachable.coach.session.recording import Recording, ReplayMismatch
 from coachable.coach.session.session import CoachSession
+from coachable.domain import load_domain
 from coachable.domains.humanoid import humanoid_style_space
 from coachable.keys import STYLE
 from coachable.styles import Choice, StyleRangeWarning, StyleReward, StyleSpace, Term, Weight
@@ -357,13 +358,14 @@ def humanoid():
 
 def test_words_and_presets_of_what_the_style_space_lacks_are_left_out():
     """An agent may have been trained on fewer styles than its domain has now."""
-    whole = coaching_of("humanoid")
-    fewer = whole.fitting(StyleSpace([Choice("pose", ("arms_up", "t_pose"))]))
+    humanoid = load_domain("humanoid")
+    course = humanoid.controls[0].parameter
+    fewer = fitting(humanoid.words, [Choice("pose", ("arms_up", "t_pose")), course])
     assert not any(meaning.startswith("step_length") for meaning in fewer.vocabulary)
     assert "pose=arms_in_front" not in fewer.vocabulary and "pose=t_pose" in fewer.vocabulary
     assert "course" in fewer.vocabulary
     assert fewer.presets == {}
-    assert whole.fitting(humanoid_style_space()) == whole
+    assert fitting(humanoid.words, [*humanoid_style_space().parameters, course]) == humanoid.words
 
 
 class TestHumanoid:

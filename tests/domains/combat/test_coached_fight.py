@@ -19,7 +19,7 @@ from coachable.domains.combat.coached_fight import (
 from coachable.domains.combat.fights import evaluate_fights
 from coachable.envs.combat.bots import Bot
 from coachable.envs.combat.tables import MACHINES
-from coachable.evaluation.settings import EvaluationSettings
+from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.sweep import WeightSweep
 from coachable.training.weights import LoadedPolicy
 

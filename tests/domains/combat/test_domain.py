@@ -10,7 +10,7 @@ from coachable.domain import load_domain
 from coachable.domains.combat.domain import DOMAIN
 from coachable.domains.combat.fights import evaluate_fights, style_label
 from coachable.envs.combat.tables import STYLES
-from coachable.evaluation.settings import EvaluationSettings
+from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.transforms import coachable_env
 
 

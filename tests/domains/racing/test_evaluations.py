@@ -20,7 +20,7 @@ from coachable.domains.racing.traffic import race_in_traffic, traffic_report, tr
 from coachable.envs.racing.circuit.circuits import load_track
 from coachable.envs.racing.physics.parameters import load_car
 from coachable.envs.racing.race.driver import LineFollower
-from coachable.evaluation.settings import EvaluationSettings
+from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.statistics import wilson_interval
 from coachable.training.weights import LoadedPolicy
 
@@ -41,7 +41,7 @@ def scripted(family, car, **settings):
 
     class Policy(torch.nn.Module):
         def forward(self, data):
-            return data.set("action", driver(envs[-1], data["observation"]))
+            return data.set("action", driver(envs[-1].field, data["observation"]))
 
     agent = LoadedPolicy(Policy(), family_style(family)[0], {"env": {"track": "ring", "car": car}}, {})
     return replace(domain, make_env=make_env), agent

@@ -17,7 +17,7 @@ def drive(env, driver, steps):
     """Telemetry (steps, N, 11)."""
     current, seen = env.reset(), []
     for _ in range(steps):
-        current = env.step(current.set("action", driver(env, current["observation"])))["next"]
+        current = env.step(current.set("action", driver(env.field, current["observation"])))["next"]
         seen.append(current["telemetry"].clone())
     return torch.stack(seen)
 

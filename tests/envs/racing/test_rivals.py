@@ -13,6 +13,9 @@ from coachable.envs.racing.race.rivals import Rivals
 from coachable.envs.racing.race.scenarios import rolling_start
 from coachable.training.collection import SelfPlayEnv
 
+SPACE = aggressiveness_style_space()
+STYLES = (SPACE.low, SPACE.high)
+
 
 class Constant(nn.Module):
     """Steers by a number that training changes."""
@@ -31,7 +34,7 @@ class Constant(nn.Module):
 def races(rivals_options=None, races=6, seed=0):
     env = RacingEnv(num_envs=1, track="ring", cars=1)
     driver = LineFollower(env.track, env.garage.typical)
-    rivals = Rivals(driver, aggressiveness_style_space(), **(rivals_options or {}))
+    rivals = Rivals(driver, STYLES, **(rivals_options or {}))
     return RacingEnv(
         2 * races, track="ring", cars=4, controlled=2, driver=rivals, scenarios=rolling_start(4), seed=seed
     ), rivals
@@ -47,7 +50,7 @@ def test_without_a_policy_all_are_scripted():
     env.reset()
     step(env, 3)
     assert not rivals.copies
-    action = rivals(env, env._observation[env.num_envs :])
+    action = rivals(env.field, env._observation[env.num_envs :])
     assert action.shape == (12, 2)
 
 
@@ -62,10 +65,10 @@ def test_copies_are_of_the_past_and_drive_their_share():
         policy.steer.fill_(-0.75)
     assert [copy.steer.item() for copy in rivals.copies] == [0.25]
     observation = env._observation[env.num_envs :]
-    action = rivals(env, observation)
+    action = rivals(env.field, observation)
     by_copy = action[:, 0] == 0.25
     assert 0.4 < by_copy.float().mean() < 0.6
-    again = rivals(env, observation)  # who is scripted stays; which copy of two is drawn anew
+    again = rivals(env.field, observation)  # who is scripted stays; which copy of two is drawn anew
     assert torch.equal((again[:, 0] == 0.25) | (again[:, 0] == -0.75), by_copy)
     step(env, 8)
     assert [copy.steer.item() for copy in rivals.copies][-1] == -0.75 and len(rivals.copies) == 3
@@ -77,7 +80,7 @@ def test_copies_have_styles_of_the_space():
     env.follow(policy)
     env.reset()
     step(env)
-    rivals(env, env._observation[env.num_envs :])
+    rivals(env.field, env._observation[env.num_envs :])
     style = rivals.copies[0].styles[-1]
     assert style.min() >= 0.0 and style[:, 0].max() > 1.5 and style[:, 1].max() <= 1.0
     assert style.std(0).min() > 0.2
@@ -93,15 +96,15 @@ def test_scripted_drivers_differ_in_pace():
 
 def test_a_rivals_grip_lies_between_the_slowest_share_and_one():
     class Recorder:
-        def __call__(self, env, observation, grip):
+        def __call__(self, field, observation, grip):
             self.grip = grip
             return torch.zeros(len(observation), 2)
 
     env, _ = races(races=100)
     recorder = Recorder()
-    rivals = Rivals(recorder, aggressiveness_style_space(), slowest=0.6)
+    rivals = Rivals(recorder, STYLES, slowest=0.6)
     env.reset()
-    rivals(env, env._observation[env.num_envs :])
+    rivals(env.field, env._observation[env.num_envs :])
     grip = recorder.grip.reshape(env.cars, -1)
     assert grip.min() >= 0.6 and grip.max() <= 1.0
     assert abs(grip.mean() - 0.8) < 5 * 0.4 / 12**0.5 / grip.numel() ** 0.5  # uniform

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -15,10 +14,7 @@ from coachable.envs.racing.physics.dynamics import total_mass
 from coachable.envs.racing.physics.parameters import Car
 from coachable.envs.racing.physics.state import CarState
 from coachable.envs.racing.physics.tyres import tangent
-from coachable.envs.racing.race.run import Run, TyreView, look_around, tyre_view
-
-if TYPE_CHECKING:
-    from coachable.envs.racing.env import RacingEnv
+from coachable.envs.racing.race.run import Field, Run, TyreView, look_around, tyre_view
 
 _PREVIEW = (5.0, 0.4)  # [m] and [s], distance at which it aims
 _LAG = 0.1  # [s], until a steering command is carried out
@@ -51,7 +47,8 @@ class LineFollower:
         >>> from coachable.envs.racing import RacingEnv
         >>> env = RacingEnv(num_envs=2, track="ring", seed=0)
         >>> driver = LineFollower(env.track, env.garage.typical)
-        >>> driver(env, env.reset()["observation"]).shape
+        >>> observation = env.reset()["observation"]
+        >>> driver(env.field, observation).shape
         torch.Size([2, 2])
     """
 
@@ -78,29 +75,29 @@ class LineFollower:
         self._stiffness = math.tan(math.pi / 2 / car.shape)
         self._peak = tangent(car.peak_slip_angle)
 
-    def __call__(self, env: RacingEnv, observation: Tensor, share: Tensor | float = 1.0) -> Tensor:
-        """Actions (M, 2) for the last M cars of an env.
+    def __call__(self, field: Field, observation: Tensor, share: Tensor | float = 1.0) -> Tensor:
+        """Return actions (M, 2) for the last M cars of a field.
 
         Args:
-            env: whose cars it drives.
+            field: whose cars it drives.
             observation: (M, D), not used: it looks at the state.
-            share: of its grip that each car of the env uses, (N,).
+            share: of its grip that each car of the field uses, (N,).
         """
         m = len(observation)
         if self.speeds.device != observation.device:
             for name in ("speeds", "gains", "line"):
                 setattr(self, name, getattr(self, name).to(observation.device))
-        state, run = CarState(*env.state.unbind(0)), Run(*env.run.unbind(0))
-        tyres = tyre_view(env.garage.car, env.simulation.wheels, env.state, env.compound[0])
+        state, run = CarState(*field.state.unbind(0)), Run(*field.run.unbind(0))
+        tyres = tyre_view(field.car, field.wheels, field.state, field.compound_grip)
         speed = torch.sqrt(state.vx**2 + state.vy**2)
-        steer = self._steer(env, state, run, tyres, speed)
-        pedal = self._pedal(env, state, run, tyres, speed, share)
+        steer = self._steer(field, state, run, tyres, speed)
+        pedal = self._pedal(field, state, run, tyres, speed, share)
         return torch.stack([steer, pedal], dim=-1)[len(speed) - m :]
 
-    def _steer(self, env: RacingEnv, state: CarState, run: Run, tyres: TyreView, speed: Tensor) -> Tensor:
+    def _steer(self, field: Field, state: CarState, run: Run, tyres: TyreView, speed: Tensor) -> Tensor:
         """Steering in [-1, 1] towards a point ahead on the line."""
-        car, course = self.car, env.course
-        number = torch.arange(len(speed), device=speed.device) // env.races
+        car, course = self.car, field.course
+        number = torch.arange(len(speed), device=speed.device) // field.races
         lanes = torch.tensor(self.lanes, device=speed.device)[number % len(self.lanes)]
         distance = _PREVIEW[0] + _PREVIEW[1] * speed
         ahead = run.s + distance
@@ -124,17 +121,17 @@ class LineFollower:
         return (steer / car.steer_max).clamp(-1.0, 1.0)
 
     def _pedal(
-        self, env: RacingEnv, state: CarState, run: Run, tyres: TyreView, speed: Tensor, share: Tensor | float
+        self, field: Field, state: CarState, run: Run, tyres: TyreView, speed: Tensor, share: Tensor | float
     ) -> Tensor:
         """Throttle (positive) or brake (negative) in [-1, 1]."""
         car = self.car
-        node = env.course.node(run.s + _REACTION * speed)
+        node = field.course.node(run.s + _REACTION * speed)
         expected = car.grip + car.grip_per_load * 1e-3 * (tyres.load.mean(0) - car.reference_load)
         grip = share * (tyres.grip.mean(0) / expected).clamp(max=1.0)  # of cold, worn or hard tyres
         wanted = self.speeds[node] * torch.sqrt(grip)
         wanted = torch.where((run.off > 0.5) | (run.along < 0.7), wanted.clamp(max=_LOST_SPEED), wanted)
-        if env.cars > 1:
-            wanted = torch.minimum(wanted, self._behind(env, run, speed))
+        if field.cars > 1:
+            wanted = torch.minimum(wanted, self._behind(field, run, speed))
         force = total_mass(car, state.fuel) * (self.gains[node] * grip + (wanted - speed) / _PEDAL_TIME)
         slip = torch.sqrt((tyres.ratio / car.peak_slip_ratio) ** 2 + (tyres.side / self._peak) ** 2)
         throttle = (force * speed.clamp(min=10.0) / (car.efficiency * car.power)).clamp(0.0, 1.0)
@@ -145,13 +142,13 @@ class LineFollower:
         return throttle - brake
 
     @staticmethod
-    def _behind(env: RacingEnv, run: Run, speed: Tensor) -> Tensor:
+    def _behind(field: Field, run: Run, speed: Tensor) -> Tensor:
         """Speed that keeps the time gap to the next car in the same lane."""
-        split = (env.cars, env.races)
-        others = look_around(run.s.reshape(split), run.offset.reshape(split), env.group, env.course.length)
+        split = (field.cars, field.races)
+        others = look_around(run.s.reshape(split), run.offset.reshape(split), field.group, field.course.length)
         in_lane = (others.gap > 0.0) & (others.aside.abs() < _LANE)
         gap = torch.where(in_lane, others.gap, 1e4)
-        theirs = torch.stack([speed.reshape(split).roll(-k, 0) for k in range(1, env.cars)])
+        theirs = torch.stack([speed.reshape(split).roll(-k, 0) for k in range(1, field.cars)])
         nearest = gap.argmin(0, keepdim=True)
         room = gap.gather(0, nearest)[0] - 5.5 - _GAP_TIME * speed.reshape(split)
         return (theirs.gather(0, nearest)[0] + 0.8 * room).clamp(min=3.0).reshape(-1)

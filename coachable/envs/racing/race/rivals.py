@@ -1,10 +1,10 @@
-"""`Rivals`: who the agent races against: scripted drivers and its own past (racing.md, section 5.3)."""
+"""`Rivals`: whom the agent races against, scripted drivers and copies of its own past."""
 
 from __future__ import annotations
 
 import copy
 from collections import deque
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -12,11 +12,8 @@ from torch import Tensor, nn
 
 from coachable.envs.racing.race.counter_rng import uniforms
 from coachable.envs.racing.race.driver import LineFollower
+from coachable.envs.racing.race.run import Field
 from coachable.keys import STYLE
-
-if TYPE_CHECKING:
-    from coachable.envs.racing.env import RacingEnv
-    from coachable.styles import StyleSpace
 
 _STREAM = 7919  # keeps the draws apart from those of the starts
 
@@ -29,7 +26,7 @@ class Rivals:
 
     Args:
         driver: the scripted driver.
-        space: styles of the copies.
+        styles: lowest and highest value of each entry of theta, (d,) each; copies draw theirs between them.
         scripted: share of scripted cars.
         slowest: smallest share of the driver's grip; the largest is 1.
         keep: number of copies, the newest ones.
@@ -42,7 +39,7 @@ class Rivals:
     def __init__(
         self,
         driver: LineFollower,
-        space: StyleSpace,
+        styles: tuple[Tensor, Tensor],
         *,
         scripted: float = 0.5,
         slowest: float = 0.82,
@@ -53,7 +50,13 @@ class Rivals:
             raise ValueError(f"scripted is {scripted} and slowest {slowest}: expected shares of the cars and of grip")
         if keep < 1 or interval < 1:
             raise ValueError(f"keep is {keep} and interval {interval}: expected at least one copy and one step")
-        self.driver, self.space, self.scripted, self.slowest, self.interval = driver, space, scripted, slowest, interval
+        self.driver, self.styles, self.scripted, self.slowest, self.interval = (
+            driver,
+            styles,
+            scripted,
+            slowest,
+            interval,
+        )
         self.copies: deque[nn.Module] = deque(maxlen=keep)
         self.policy: nn.Module | None = None
         self._steps = 0
@@ -63,17 +66,17 @@ class Rivals:
         self.policy = policy
 
     @torch.no_grad()
-    def __call__(self, env: RacingEnv, observation: Tensor) -> Tensor:
-        """Actions (M, 2) for the last M cars of an env."""
+    def __call__(self, field: Field, observation: Tensor) -> Tensor:
+        """Return actions (M, 2) for the last M cars of a field."""
         m = len(observation)
         # Of each car: whether it is scripted, its share of the grip, which copy it is.
-        who, grip, which = uniforms(env.seeds + _STREAM, env.episode, 3, env.cars).reshape(3, -1)
-        action = self.driver(env, observation, self.slowest + (1.0 - self.slowest) * grip)
+        who, grip, which = uniforms(field.seeds + _STREAM, field.episode, 3, field.cars).reshape(3, -1)
+        action = self.driver(field, observation, self.slowest + (1.0 - self.slowest) * grip)
         self._copy_if_due()
         if not self.copies:
             return action
         which = torch.where(who < self.scripted, -1.0, torch.floor(which * len(self.copies)))[-m:]
-        style = self._styles(env)[-m:]
+        style = self._styles(field)[-m:]
         for number, policy in enumerate(self.copies):
             cars = (which == number).nonzero()[:, 0]
             if len(cars):
@@ -107,10 +110,10 @@ class Rivals:
         if self._steps % self.interval == 0:
             self.copies.append(_frozen(self.policy))
 
-    def _styles(self, env: RacingEnv) -> Tensor:
+    def _styles(self, field: Field) -> Tensor:
         """A style for each car (N, d), the same throughout a race."""
-        low, high = self.space.low, self.space.high
-        u = uniforms(env.seeds + 2 * _STREAM, env.episode, len(low), env.cars).reshape(len(low), -1)
+        low, high = self.styles
+        u = uniforms(field.seeds + 2 * _STREAM, field.episode, len(low), field.cars).reshape(len(low), -1)
         return (low[:, None] + (high - low)[:, None] * u).T
 
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from coachable.envs.racing.circuit.track import Course
 from coachable.envs.racing.physics.body import rotate, wheel_velocity
 from coachable.envs.racing.physics.dynamics import WheelSet, steering, wheel_grip, wheel_loads
 from coachable.envs.racing.physics.parameters import Car
@@ -48,6 +49,30 @@ class Run(NamedTuple):
     left: Tensor
     right: Tensor
     margin: Tensor
+
+
+class Field(NamedTuple):
+    """All cars of an environment as drivers see them: B races of A cars, car k of race b in column k * B + b."""
+
+    state: Tensor  # (STATE_ROWS, A * B), packed `CarState`
+    run: Tensor  # (RUN_ROWS, A * B), packed `Run`
+    car: Car  # parameters
+    wheels: WheelSet
+    compound_grip: Tensor  # (A * B,)
+    course: Course
+    group: Tensor  # (A, B), cars of one group meet each other
+    seeds: Tensor  # (B,)
+    episode: Tensor  # (B,), number of the episode
+
+    @property
+    def cars(self) -> int:
+        """A, in each race."""
+        return self.group.shape[0]
+
+    @property
+    def races(self) -> int:
+        """B."""
+        return self.group.shape[1]
 
 
 RUN_ROWS = len(Run._fields)

@@ -14,7 +14,6 @@ from coachable.domain import Domain
 from coachable.keys import STYLE
 from coachable.styles import StyleSpace
 from coachable.training.rng import RandomStream
-from coachable.transforms import coachable_env
 
 TIME_IS_UP = "time is up"
 
@@ -37,8 +36,7 @@ class LiveEpisodes:
     """
 
     def __init__(self, domain: Domain, space: StyleSpace, *, endless: bool, terminated: str) -> None:
-        simulation = domain.make_env(num_envs=1, num_threads=1, **domain.coached)
-        self.env = coachable_env(simulation, space, domain.make_reward(space))
+        self.env = domain.styled_env(space, 1, num_threads=1, **domain.coached)
         self.endless, self._terminated = endless, terminated
         self.ended: str | None = None
         self.number = self.steps = 0

@@ -2,8 +2,9 @@
 
 import pytest
 
+from coachable.coach.phrases.fitting import fitting
 from coachable.coach.phrases.grammar import StyleGrammar
-from coachable.coach.session.coaching import coaching_of
+from coachable.domain import load_domain
 from coachable.domains.combat.styles import combat_style_space
 from coachable.domains.humanoid import humanoid_style_space
 from coachable.domains.racing.styles import aggressiveness_style_space, drift_style_space, resource_style_space
@@ -19,17 +20,18 @@ SPACES = {
 
 @pytest.mark.parametrize("domain", SPACES)
 def test_words_and_presets_fit_the_styles(domain):
-    space, coaching = SPACES[domain](), coaching_of(domain)
-    assert coaching.fitting(space) == coaching, "nothing is left out"
-    for preset in coaching.presets.values():
+    space, declared = SPACES[domain](), load_domain(domain)
+    parameters = [*space.parameters, *(control.parameter for control in declared.controls)]
+    assert fitting(declared.words, parameters) == declared.words, "nothing is left out"
+    for preset in declared.words.presets.values():
         space.make(strict=True, **preset)
 
 
 def grammar_of(domain):
-    space, coaching = SPACES[domain](), coaching_of(domain)
-    parameters = [*space.parameters, *(control.parameter for control in coaching.controls)]
+    declared = load_domain(domain)
+    parameters = [*SPACES[domain]().parameters, *(control.parameter for control in declared.controls)]
     now = {parameter.name: parameter.default for parameter in parameters}
-    return StyleGrammar(parameters, coaching.vocabulary, coaching.examples), now
+    return StyleGrammar(parameters, declared.words.vocabulary, declared.words.examples), now
 
 
 # By default longitudinal is 1 m of 0 to 2 m, lateral 0.5 m of 0 to 1 m, and weights are 0.
@@ -119,8 +121,8 @@ def test_the_hint_names_phrases_that_work_in_the_domain(domain):
 
 def test_words_and_examples_fit_an_agent_with_fewer_styles():
     space = combat_style_space(("melee", "carjas_bane"))
-    coaching = coaching_of("combat").fitting(space)
-    grammar = StyleGrammar(space, coaching.vocabulary, coaching.examples)
+    words = fitting(load_domain("combat").words, space.parameters)
+    grammar = StyleGrammar(space, words.vocabulary, words.examples)
     assert grammar.examples == ("more melee", "use the warrior bow")
     assert grammar.read("use the bow", space.describe(space.default)).changes == {"carjas_bane": 1.0}
 

@@ -1,0 +1,32 @@
+"""The words of a domain that fit an agent's styles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from coachable.coach.phrases.grammar import read_meaning
+from coachable.domain import Words
+from coachable.styles import Choice, Parameter
+
+
+def fitting(words: Words, parameters: Sequence[Parameter]) -> Words:
+    """Leave out words and presets for what does not exist: an agent may have been trained on fewer styles.
+
+    Args:
+        words: of the domain.
+        parameters: of the agent's style space, and of the live controls.
+    """
+    options = {p.name: p.options if isinstance(p, Choice) else None for p in parameters}
+
+    def known(name: str, value: Any) -> bool:
+        return name in options and (options[name] is None or value in ("", *(options[name] or ())))
+
+    def means(meaning: str) -> bool:
+        named, _, value = read_meaning(meaning)
+        return all(known(name, value) for name in named)
+
+    vocabulary = {meaning: phrases for meaning, phrases in words.vocabulary.items() if means(meaning)}
+    presets = {name: style for name, style in words.presets.items() if all(known(*item) for item in style.items())}
+    return replace(words, vocabulary=vocabulary, presets=presets)

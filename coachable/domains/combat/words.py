@@ -1,0 +1,30 @@
+"""What a coach says to the fighter."""
+
+from coachable.domain import Words
+
+WORDS = Words(
+    vocabulary={
+        "": ("fight", "fighting"),
+        "melee": ("spear", "close combat", "hand to hand"),
+        "traps": ("tripwire", "ambush"),
+        "part_weapon": ("break weapon", "destroy weapon", "tear off weapon", "disarm"),
+        "part_canister": ("break canister", "destroy canister", "tear off canister"),
+        "part_shield": ("break shield", "destroy shield", "tear off shield", "armour", "armor"),
+        "acid": ("corrode", "corrosion"),
+        "purgewater": ("drench", "water"),
+        "frost": ("freeze", "ice"),
+        "shock": ("stun", "electrify"),
+        "fire": ("burn", "ignite", "set on fire"),
+        "adhesive": ("glue", "slow it", "slow down"),
+        "carjas_bane sunscourge": ("bow",),
+    },
+    presets={
+        "spear fighter": {"melee": 1.1},
+        "archer": {"sunscourge": 1.6, "carjas_bane": 1.0},
+        "trapper": {"traps": 0.15},
+        "arsonist": {"fire": 0.9},
+        "scavenger": {"part_weapon": 1.0, "part_canister": 1.0, "part_shield": 1.0},
+    },
+    examples=("use acid", "no traps", "more melee", "use the warrior bow"),
+    terminated="ended the fight",
+)

@@ -1,0 +1,47 @@
+"""`StyleFeatures` adds what a coachable environment emits to an environment that knows nothing of styles."""
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, Unbounded
+from torchrl.envs import Transform
+
+from coachable.keys import STYLE_FEATURES, TASK_REWARD
+
+
+class StyleFeatures(Transform):
+    """Copies the reward to `task_reward` and writes `style_features`, the raw quantities that styles judge.
+
+    Args:
+        features: From the TensorDict after a step, of batch shape `(...)`, to `(..., size)`.
+        size: Number of features.
+
+    Example:
+        >>> from torchrl.envs import PendulumEnv, TransformedEnv
+        >>> env = TransformedEnv(PendulumEnv(), StyleFeatures(lambda after: after["th"].unsqueeze(-1), 1))
+        >>> env.rollout(3)["next", "style_features"].shape
+        torch.Size([3, 1])
+    """
+
+    def __init__(self, features: Callable[[TensorDictBase], Tensor], size: int) -> None:
+        super().__init__()
+        self.features, self.size = features, size
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        next_tensordict[TASK_REWARD] = next_tensordict["reward"].float()
+        next_tensordict[STYLE_FEATURES] = self.features(next_tensordict).float()
+        return next_tensordict
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        for key, width in ((TASK_REWARD, 1), (STYLE_FEATURES, self.size)):
+            tensordict_reset[key] = torch.zeros(*tensordict_reset.batch_size, width, device=tensordict_reset.device)
+        return tensordict_reset
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Adds both keys."""
+        for key, width in ((TASK_REWARD, 1), (STYLE_FEATURES, self.size)):
+            shape = torch.Size((*observation_spec.shape, width))
+            observation_spec[key] = Unbounded(shape=shape, device=observation_spec.device)
+        return observation_spec

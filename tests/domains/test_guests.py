@@ -1,0 +1,131 @@
+"""Domains that live outside of the library: trained, evaluated, reported, coached and exported like our own."""
+
+import importlib
+import json
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from coachable.cli import main
+from coachable.coach.session.session import CoachSession
+from coachable.domain import domain_names, load_domain
+
+pytest.importorskip("gymnasium")
+
+GUESTS = {"leaning_pendulum": "lean", "placed_cartpole": "place"}  # by name: the parameter of its style
+SOURCES = Path(__file__).parent / "guests"
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+
+
+@pytest.fixture(scope="module", params=GUESTS)
+def guest(request, tmp_path_factory):
+    """Name of a domain of a package that is installed in a temporary folder."""
+    name, site = request.param, tmp_path_factory.mktemp("site")
+    metadata = site / f"{name}-1.0.dist-info"
+    metadata.mkdir()
+    (site / f"{name}.py").write_text((SOURCES / f"{name}.py").read_text())
+    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (metadata / "entry_points.txt").write_text(f"[coachable.domains]\n{name} = {name}:DOMAIN\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(site)
+        yield name
+
+
+@pytest.fixture(scope="module")
+def run(guest, tmp_path_factory):
+    """Folder of a short training."""
+    folder = tmp_path_factory.mktemp("runs") / guest
+    importlib.import_module(guest).train(folder, frames=240)
+    return str(folder)
+
+
+def test_it_is_registered(guest):
+    assert guest in domain_names()
+    domain = load_domain(guest)
+    assert domain.name == guest and domain.make_space().names == (GUESTS[guest],)
+
+
+def test_what_it_leaves_out_has_a_default(guest):
+    domain, parameter = load_domain(guest), GUESTS[guest]
+    timing = {"leaning_pendulum": (0.05, 200), "placed_cartpole": (0.01, 1000)}
+    assert (domain.control_step, domain.episode_steps) == pytest.approx(timing[guest])
+    highest = domain.make_space()[parameter].high
+    assert [cell[parameter] for cell in domain.cells()] == pytest.approx([highest * i / 2 for i in range(-2, 3)])
+
+
+def test_evaluate(run, guest, tmp_path, capsys):
+    options = ["--episodes", "1", "--switch-episodes", "1", "--steps", "8", "--out", str(tmp_path)]
+    assert main(["evaluate", run, *options]) == 0
+    assert f"measured_{GUESTS[guest]}" in capsys.readouterr().out
+    assert {"grid.csv", "response.csv", "grid.png", "report.md"} <= {file.name for file in tmp_path.iterdir()}
+    assert GUESTS[guest] in json.loads((tmp_path / "summary.json").read_text())["grid"]
+
+
+def test_report(run, guest, tmp_path):
+    options = ["--seeds", "1", "--episodes", "1", "--switch-episodes", "1", "--steps", "8"]
+    assert main(["report", run, *options, "--out", str(tmp_path / "report")]) == 0
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert guest in page and "Requested and measured" in page
+
+
+def test_export(run, guest, tmp_path):
+    onnx = pytest.importorskip("onnx")
+    pytest.importorskip("onnxruntime")
+    file = tmp_path / "policy.onnx"
+    assert main(["export", run, "--out", str(file)]) == 0
+    metadata = {entry.key: entry.value for entry in onnx.load(str(file)).metadata_props}
+    assert metadata["domain"] == guest and float(metadata["control_step"]) in (0.05, 0.01)
+
+
+def test_explain(run, guest, tmp_path):
+    pytest.importorskip("captum")
+    options = ["--episodes", "2", "--states", "4", "--steps", "8", "--out", str(tmp_path / "explained")]
+    assert main(["explain", run, *options]) == 0
+    assert f"style: {GUESTS[guest]}" in (tmp_path / "explained" / "explain.md").read_text()
+
+
+def test_render(run, guest, tmp_path, capsys):
+    code = main(["render", run, "--out", str(tmp_path / "sheet.png"), "--seconds", "0.1", "--size", "96x80"])
+    assert code == 0 or "PendulumEnv draws no pictures: pygame is not installed" in capsys.readouterr().err
+
+
+def test_coach(run, guest):
+    pytest.importorskip("viser")
+    from coachable.coach.page.page import CoachPage
+    from coachable.coach.page.server import make_server
+
+    parameter = GUESTS[guest]
+    server, session = make_server(port=18480), CoachSession.open(run, seed=1)
+    page = CoachPage(server, session)
+    page.loop.paused = True
+    page.start()
+    try:
+        page.widgets[parameter].handle.value = 0.25
+        page._press("Step")
+        for _ in range(2):  # after the second, the read-outs of the step have been written
+            done = threading.Event()
+            page.loop.submit(lambda _, done=done: done.set())
+            assert done.wait(20.0)
+        assert session.style[parameter] == pytest.approx(0.25) and session.step_count == 1
+        assert not page.loop.problem
+        assert "measured" in page.measured[parameter].handle.content
+        assert session.say(f"more {parameter}").changes
+    finally:
+        page.stop()
+        session.close()
+        server.stop()
+
+
+def test_without_its_package_the_domain_is_named(run, guest, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "path", [folder for folder in sys.path if not (Path(folder) / f"{guest}.py").is_file()])
+    assert main(["evaluate", run, "--out", str(tmp_path)]) == 2
+    assert f"unknown domain '{guest}': expected one of ['combat'," in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", GUESTS)
+def test_the_documentation_shows_the_files_as_they_are(name):
+    source = (SOURCES / f"{name}.py").read_text()
+    assert any(f"```python\n{source}```" in page.read_text() for page in DOCS.rglob("*.md"))
+    assert source.count("\n") < 60
