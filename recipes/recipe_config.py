@@ -64,6 +64,7 @@ _VALUED = (
 def config_groups(config_name: str) -> dict[str, list[str]]:
     """Groups of a recipe and the choices of each; presets are the recipe's own, the other groups are shared."""
     folders = {folder.name: folder for folder in sorted(CONFIGS.iterdir()) if folder.is_dir()}
+    folders.pop("__pycache__", None)  # of schema.py
     folders["preset"] /= config_name
     return {group: sorted(file.stem for file in folder.glob("*.yaml")) for group, folder in folders.items()}
 
