@@ -1,16 +1,13 @@
 """Train a racing driver whose style is chosen at run time (QR-SAC).
 
-python recipes/racing_qr_sac.py                                        tyre and fuel saving, cpu or gpu
-python recipes/racing_qr_sac.py family=drift sampler=with_requests     drifting on request
-python recipes/racing_qr_sac.py family=aggressiveness                  margins to two agents and two rivals
-python recipes/racing_qr_sac.py preset=smoke                           every part once, within a minute
+python recipes/racing_qr_sac.py                                tyre and fuel saving, cpu or gpu
+python recipes/racing_qr_sac.py preset=resources               the same, then overtaking and defending in traffic
+python recipes/racing_qr_sac.py preset=drift                   drifting on request
+python recipes/racing_qr_sac.py preset=aggressiveness          margins to two agents and two rivals, in four stages
+python recipes/racing_qr_sac.py preset=paper                   the paper's settings
+python recipes/racing_qr_sac.py preset=smoke                   every part once, within a minute
 
-Margins are kept better after four stages: alone, keeping away from others, overtaking them, and all of it as asked.
-
-python recipes/racing_qr_sac.py preset=cpu_alone run_dir=runs/alone
-python recipes/racing_qr_sac.py preset=cpu_races init_from=runs/alone run_dir=runs/races
-python recipes/racing_qr_sac.py preset=cpu_passing init_from=runs/races run_dir=runs/passing
-python recipes/racing_qr_sac.py preset=cpu_late_races init_from=runs/passing
+A preset's stages are trained one after the other; `stage=NAME init_from=RUN` trains one of them.
 """
 
 from functools import partial

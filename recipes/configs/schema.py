@@ -133,6 +133,8 @@ class Settings:
     wandb: Wandb
     threads: Threads
     family: str | None = None  # of racing
+    stage: str | None = None
+    stages: list[dict[str, Any]] = field(default_factory=list)
     preset_for: dict[str, str] | None = None
     extra: dict[str, Any] = field(default_factory=dict)  # entries that the command line adds with +KEY=VALUE
 

@@ -79,29 +79,30 @@ def test_every_choice_composes(recipe):
 
 
 @pytest.mark.parametrize(
-    "preset, style_reward, new", [("cpu_traffic", {}, 33), ("cpu_late_traffic", {"gained": 2.0, "defended": 8.0}, 0)]
+    "stage, style_reward, new", [("traffic", {}, 33), ("late_traffic", {"gained": 2.0, "defended": 8.0}, 0)]
 )
-def test_the_presets_of_traffic_are_of_the_tyre_and_fuel_family(preset, style_reward, new):
-    config = compose_config("racing_qr_sac", [f"preset={preset}"])
+def test_the_stages_in_traffic_are_of_the_tyre_and_fuel_family(stage, style_reward, new):
+    config = compose_config("racing_qr_sac", ["preset=resources", f"stage={stage}"])
     assert config["domain"] == "racing_resources" and config["style_reward"] == style_reward
     assert config["sampler"]["only"] == ["overtake", "defend"] and config["init_new_observations"] == new
     assert sum(config["env"]["scenarios"]["shares"].values()) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(
-    "preset, margins",
+    "stage, margins",
     [
-        ("cpu_races", {"weight": 2.0}),
-        ("cpu_passing", {"weight": 1.0}),
-        ("cpu_late_races", {"weight": 16.0, "apart": 0.1}),
+        ("races", {"weight": 2.0}),
+        ("passing", {"weight": 1.0}),
+        ("late_races", {"weight": 16.0, "apart": 0.1}),
     ],
 )
-def test_the_presets_of_races_are_of_their_family(preset, margins, tmp_path):
-    config = compose_config("racing_qr_sac", [f"preset={preset}"])
+def test_the_stages_of_races_are_of_their_family(stage, margins, tmp_path):
+    config = compose_config("racing_qr_sac", ["preset=aggressiveness", f"stage={stage}"])
     assert config["domain"] == "racing_aggressiveness" and config["style_reward"] == margins
     assert config["sampler"]["shared"] is True
     assert sum(config["env"]["scenarios"]["shares"].values()) == pytest.approx(1.0)
-    config = compose_config("racing_qr_sac", [f"preset={preset}", "family=drift", f"run_dir={tmp_path}"])
+    arguments = ["preset=aggressiveness", f"stage={stage}", "family=drift", f"run_dir={tmp_path}"]
+    config = compose_config("racing_qr_sac", arguments)
     with pytest.raises(ValueError, match=f"style_reward has {', '.join(sorted(margins))}: racing_drift takes none"):
         import_module("racing_qr_sac").build(config)
 
