@@ -130,7 +130,7 @@ def build(config: dict[str, Any]) -> Train:
     relabelled = []
     if cfg.impersonation.n:
         relabelled.append(TaskImpersonation(style_reward, n=cfg.impersonation.n, seed=cfg.seed))
-    replay = make_replay(run, *relabelled)
+    replay = make_replay(run, example, *relabelled)
     run_dir = open_run_dir(run, example, replay)
 
     # Who collects, and the loop

@@ -22,7 +22,7 @@ from coachable.replay import EventTableBuffer
 from coachable.replay.replay_files import replay_bytes
 from coachable.styles import StyleReward, StyleSpace
 from coachable.training.checkpoint import CheckpointStore, check_unused, check_writable
-from coachable.training.collection import evaluate_policy
+from coachable.training.collection import evaluate_policy, simulation_env
 from coachable.training.hardware import pick_device, share_threads
 from coachable.training.logging import MetricsLog, Progress, wandb_logger
 from coachable.training.loop import Train, replay_keys
@@ -133,11 +133,12 @@ def make_loss(run: Run, actor: nn.Module, critics: list[nn.Module], env: EnvBase
     return loss.to(run.device)
 
 
-def make_replay(run: Run, *transforms: Transform) -> ReplayBuffer:
+def make_replay(run: Run, env: EnvBase, *transforms: Transform) -> ReplayBuffer:
     """Make the replay buffer; it sums rewards over `n_steps` and takes memory when it is first written to.
 
     Args:
         run: The training.
+        env: One environment; its scenarios are the tables of `replay=multi_tables`.
         *transforms: What sampled batches go through, such as `MirrorSymmetry` and `TaskImpersonation`.
 
     Raises:
@@ -147,7 +148,12 @@ def make_replay(run: Run, *transforms: Transform) -> ReplayBuffer:
     if settings.mirror and not any(isinstance(transform, MirrorSymmetry) for transform in transforms):
         raise ValueError(f"mirror={settings.mirror}: {settings.domain} has no mirror images, expected mirror=0")
     relabelled_sums = settings.impersonation.n and settings.n_steps > 1
-    options = {"discounted_keys": [("next", STYLE_FEATURES)]} if relabelled_sums else {}
+    options: dict[str, Any] = {"discounted_keys": [("next", STYLE_FEATURES)]} if relabelled_sums else {}
+    if _has_scenario_tables(settings):
+        scenarios = getattr(simulation_env(env), "scenario_names", None)
+        if scenarios is None:
+            raise ValueError(f"replay=multi_tables: {settings.domain} has no scenarios; expected replay=uniform")
+        options["scenarios"] = scenarios
     replay = make(settings.replay)(**options)
     tables = len(replay.names) if isinstance(replay, EventTableBuffer) else 0
     if settings.train.batch_size < tables:
@@ -203,15 +209,20 @@ def open_run_dir(run: Run, env: EnvBase, replay: ReplayBuffer) -> Path:
         check_unused(run_dir)
     check_writable(run_dir)
     if settings.checkpoint.replay:  # two at a time: the old one is removed when the new one is complete
-        size = replay_bytes(env, stored_keys(env, replay), settings.replay_capacity)
+        size = replay_bytes(env, stored_keys(run, env, replay), settings.replay_capacity)
         check_writable(run_dir, required_bytes=2 * size)
     save_config(run.config, run_dir)
     return run_dir
 
 
-def stored_keys(env: EnvBase, replay: ReplayBuffer) -> tuple[NestedKey, ...]:
+def stored_keys(run: Run, env: EnvBase, replay: ReplayBuffer) -> tuple[NestedKey, ...]:
     """Return which entries of a transition the replay buffer stores."""
-    return replay_keys(env, tables=isinstance(replay, EventTableBuffer))
+    tables = isinstance(replay, EventTableBuffer)
+    return replay_keys(env, tables=tables, scenarios=_has_scenario_tables(run.settings))
+
+
+def _has_scenario_tables(settings: Settings) -> bool:
+    return settings.replay["_target_"].endswith(".for_scenarios")
 
 
 def make_trainer(run: Run, run_dir: Path, env: EnvBase, **parts: Any) -> Train:
@@ -229,7 +240,7 @@ def make_trainer(run: Run, run_dir: Path, env: EnvBase, **parts: Any) -> Train:
         log=MetricsLog(run_dir, wandb_logger(settings.domain, run_dir, **run.config["wandb"])),
         progress=Progress(settings.train.total_frames),
         checkpoints=CheckpointStore(run_dir / "checkpoints", **run.config["checkpoint"]),
-        replay_keys=stored_keys(env, parts["replay"]),
+        replay_keys=stored_keys(run, env, parts["replay"]),
         **parts,
     )
     env.close()  # now, not whenever it is collected: TorchRL raises the number of threads when it closes a SerialEnv
