@@ -159,7 +159,7 @@ def _recipes() -> dict[str, Path]:
     """The recipes of this installation: in the package, or beside it in a clone."""
     here = Path(__file__).resolve().parent
     folder = here / "recipes" if (here / "recipes").is_dir() else here.parent / "recipes"
-    return {file.stem: file.with_name(f"{file.stem}.py") for file in (folder / "configs").glob("*_*.yaml")}
+    return {file.stem: folder / f"{file.stem}.py" for file in (folder / "configs").glob("*_*.yaml")}
 
 
 def _train(options: argparse.Namespace) -> int:

@@ -93,3 +93,17 @@ def test_the_name_of_a_stage_leads_nowhere_else(name, tmp_path):
     config = {"run_dir": str(tmp_path), "stages": [{"stage": name}], "init_from": None, "resume": None}
     with pytest.raises(CheckpointError, match="a stage is called"):
         Curriculum(config, build=None)
+
+
+@pytest.mark.parametrize("harm", [{"_target_": "builtins.print"}, "${oc.env:HOME}", 7])
+def test_a_saved_stage_names_nothing_that_the_recipe_does_not(harm, tmp_path):
+    start(*TINY, STAGES, f"run_dir={tmp_path / 'run'}").run()
+    file = find_checkpoint(tmp_path / "run") / "state.pt"
+    state = torch.load(file, weights_only=True)
+    if harm == 7:
+        state["config"]["stages"] = [7, 7]
+    else:
+        state["config"]["stages"][1]["env"]["nested"] = harm
+    torch.save(state, file)
+    with pytest.raises(CheckpointError):
+        start(f"resume={tmp_path / 'run'}")
