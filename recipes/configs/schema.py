@@ -133,6 +133,7 @@ class Settings:
     wandb: Wandb
     threads: Threads
     family: str | None = None  # of racing
+    fast: Any = "auto"  # hand-written passes of the learner
     stage: str | None = None
     stages: list[dict[str, Any]] = field(default_factory=list)
     preset_for: dict[str, str] | None = None

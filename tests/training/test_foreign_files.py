@@ -224,7 +224,7 @@ def test_groups_of_another_kind_are_refused(run):
 def test_what_the_yaml_files_name_is_known_at_its_place_only():
     known = known_targets("humanoid_sac")
     assert (("env", "_target_"), "coachable.envs.humanoid.HumanoidEnv") in known
-    assert (("replay", "events", "_target_"), "coachable.domains.humanoid.events.humanoid_events") in known, "filled in"
+    assert (("replay", "events", "_target_"), "coachable.domains.humanoid.humanoid_events") in known, "filled in"
     assert not any(place[0] == "env" and "HumanoidEnv" not in target for place, target in known)
     for file in CONFIGS.glob("*_*.yaml"):
         assert known_targets(file.stem), file
