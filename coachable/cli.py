@@ -3,6 +3,7 @@
 import argparse
 import glob
 import math
+import runpy
 import sys
 import zipfile
 from collections.abc import Callable, Sequence
@@ -57,6 +58,11 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="coachable", description="Train one agent, coach it while it acts.")
     parser.add_argument("--version", action="version", version=f"coachable {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    train = commands.add_parser("train", help="train an agent with a recipe, as python recipes/RECIPE.py does")
+    train.add_argument("recipe", choices=sorted(_recipes()), help="one of %(choices)s")
+    train.add_argument("arguments", nargs=argparse.REMAINDER, help="KEY=VALUE ..., or --help for what there is")
+    train.set_defaults(run=_train)
 
     evaluate = commands.add_parser("evaluate", help="measure every style of an agent: tables and a figure")
     evaluate.add_argument("source", help=_SOURCE_HELP)
@@ -147,6 +153,21 @@ def _parser() -> argparse.ArgumentParser:
     doctor = commands.add_parser("doctor", help="check this installation and say what it can do")
     doctor.set_defaults(run=_doctor)
     return parser
+
+
+def _recipes() -> dict[str, Path]:
+    """The recipes of this installation: in the package, or beside it in a clone."""
+    here = Path(__file__).resolve().parent
+    folder = here / "recipes" if (here / "recipes").is_dir() else here.parent / "recipes"
+    return {file.stem: folder / f"{file.stem}.py" for file in (folder / "configs").glob("*_*.yaml")}
+
+
+def _train(options: argparse.Namespace) -> int:
+    file = _recipes()[options.recipe]
+    sys.path.insert(0, str(file.parent))  # as python does for a script
+    sys.argv = [str(file), *options.arguments]
+    runpy.run_path(str(file), run_name="__main__")
+    return 0
 
 
 def _evaluate(options: argparse.Namespace) -> int:

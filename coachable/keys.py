@@ -19,5 +19,8 @@ STYLE_REWARD = "style_reward"
 EVENTS = "events"
 """Boolean `(..., n_events)`, what the event tables route by."""
 
+SCENARIO = "scenario"
+"""How the episode started, integer `(..., 1)`; what multi-tables route by, where an environment has scenarios."""
+
 TABLE = "table"
 """Which replay table a sample came from, integer `(...,)`."""

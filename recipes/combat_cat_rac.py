@@ -10,19 +10,88 @@ python recipes/combat_cat_rac.py impersonation.n=0
 python recipes/combat_cat_rac.py sampler=independent      or one_hot
 """
 
+from functools import partial
 from typing import Any
 
+from recipe_boxes import (
+    make,
+    make_collector,
+    make_evaluation,
+    make_loss,
+    make_replay,
+    make_style_reward,
+    make_trainer,
+    network_settings,
+    open_run_dir,
+    start_run,
+)
 from recipe_config import run_recipe
-from recipe_training import build_training
+from torchrl.envs import Compose, EnvBase
 
 from coachable.domains.combat import combat_style_reward, combat_style_space
+from coachable.fast import accelerate
+from coachable.training.episodes import EpisodeSums
 from coachable.training.loop import Train
+from coachable.training.weights import agent_state, initialise_from
+from coachable.transforms import CoachableEnv, StyleRewardTransform, StyleSampler, TaskImpersonation
 
 
 def build(config: dict[str, Any]) -> Train:
-    """Composes the training."""
-    env = config["env"]
-    return build_training(config, combat_style_space(env["styles"], env["reward_scale"]), combat_style_reward)
+    """Compose the training, one box after the other."""
+    run = start_run(config)
+    cfg = run.settings
+
+    # What can be coached, and how it is rewarded
+    space = combat_style_space(cfg.env["styles"], cfg.env["reward_scale"])
+    space = space.with_sampler(make(cfg.sampler)(space))
+    style_reward = make_style_reward(run, combat_style_reward, space)
+
+    # The fight: styles are drawn at reset, the reward is that of the task plus that of the style
+    def make_env(seed: int, **settings: Any) -> EnvBase:
+        fight = make(cfg.env)(seed=seed, **settings)
+        env = CoachableEnv(fight, Compose(StyleSampler(space), StyleRewardTransform(style_reward), EpisodeSums()))
+        env.set_seed(seed)
+        return env
+
+    example = make_env(cfg.seed, num_envs=1)
+
+    # Who acts, who judges, and what is minimised
+    network = network_settings(run, example)
+    actor = make(network["actor"])(space=space).to(run.device)
+    critics = [make(network["critic"])(space=space).to(run.device) for _ in range(cfg.network.num_critics)]
+    loss = make_loss(run, actor, critics, example)
+    if cfg.init_from:
+        initialise_from(cfg.init_from, actor, loss, space, cfg.init_new_observations)
+    learner = make(run.config["learner"])(loss)
+    accelerate(learner, cfg.fast)
+
+    # What is remembered, summed over n steps, and seen again under other styles
+    relabelled = []
+    if cfg.impersonation.n:
+        relabelled.append(TaskImpersonation(style_reward, n=cfg.impersonation.n, seed=cfg.seed))
+    replay = make_replay(run, example, *relabelled)
+    run_dir = open_run_dir(run, example, replay)
+
+    # Who collects, and the loop
+    return make_trainer(
+        run,
+        run_dir,
+        example,
+        collector=make_collector(run, make_env, actor),
+        replay=replay,
+        learner=learner,
+        evaluate=make_evaluation(run, make_env, actor),
+        describe=partial(
+            agent_state,
+            domain=cfg.domain,
+            space=space,
+            actor=actor,
+            loss_module=loss,
+            network=network,
+            config=run.config,
+        ),
+        style_terms=style_reward.terms_of,
+    )
 
 
 if __name__ == "__main__":

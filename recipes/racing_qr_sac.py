@@ -1,31 +1,97 @@
 """Train a racing driver whose style is chosen at run time (QR-SAC).
 
-python recipes/racing_qr_sac.py                                        tyre and fuel saving, cpu or gpu
-python recipes/racing_qr_sac.py family=drift sampler=with_requests     drifting on request
-python recipes/racing_qr_sac.py family=aggressiveness                  margins to two agents and two rivals
-python recipes/racing_qr_sac.py preset=smoke                           every part once, within a minute
+python recipes/racing_qr_sac.py                                tyre and fuel saving, cpu or gpu
+python recipes/racing_qr_sac.py preset=resources               the same, then overtaking and defending in traffic
+python recipes/racing_qr_sac.py preset=drift                   drifting on request
+python recipes/racing_qr_sac.py preset=aggressiveness          margins to two agents and two rivals, in four stages
+python recipes/racing_qr_sac.py preset=paper                   the paper's settings
+python recipes/racing_qr_sac.py preset=smoke                   every part once, within a minute
 
-Margins are kept better after four stages: alone, keeping away from others, overtaking them, and all of it as asked.
-
-python recipes/racing_qr_sac.py preset=cpu_alone run_dir=runs/alone
-python recipes/racing_qr_sac.py preset=cpu_races init_from=runs/alone run_dir=runs/races
-python recipes/racing_qr_sac.py preset=cpu_passing init_from=runs/races run_dir=runs/passing
-python recipes/racing_qr_sac.py preset=cpu_late_races init_from=runs/passing
+A preset's stages are trained one after the other; `stage=NAME init_from=RUN` trains one of them.
 """
 
+from functools import partial
 from typing import Any
 
+from recipe_boxes import (
+    make,
+    make_collector,
+    make_evaluation,
+    make_loss,
+    make_replay,
+    make_style_reward,
+    make_trainer,
+    network_settings,
+    open_run_dir,
+    start_run,
+)
 from recipe_config import run_recipe
-from recipe_training import build_training
+from torchrl.envs import Compose, EnvBase
 
 from coachable.domains.racing.families import family_style
+from coachable.fast import accelerate
+from coachable.training.episodes import EpisodeSums
 from coachable.training.loop import Train
+from coachable.training.weights import agent_state, initialise_from
+from coachable.transforms import CoachableEnv, StyleRewardTransform, StyleSampler, TaskImpersonation
 
 
 def build(config: dict[str, Any]) -> Train:
-    """Composes the training."""
-    space, make_reward = family_style(config["family"])
-    return build_training(config, space, make_reward)
+    """Compose the training, one box after the other."""
+    run = start_run(config)
+    cfg = run.settings
+
+    # What can be coached, and how it is rewarded
+    space, family_reward = family_style(cfg.family)
+    space = space.with_sampler(make(cfg.sampler)(space))
+    style_reward = make_style_reward(run, family_reward, space)
+
+    # The race: styles are drawn at reset, the reward is that of the task plus that of the style
+    def make_env(seed: int, **settings: Any) -> EnvBase:
+        race = make(cfg.env)(seed=seed, **settings)
+        env = CoachableEnv(race, Compose(StyleSampler(space), StyleRewardTransform(style_reward), EpisodeSums()))
+        env.set_seed(seed)
+        return env
+
+    example = make_env(cfg.seed, num_envs=1)
+
+    # Who acts, who judges, and what is minimised
+    network = network_settings(run, example)
+    actor = make(network["actor"])(space=space).to(run.device)
+    critics = [make(network["critic"])(space=space).to(run.device) for _ in range(cfg.network.num_critics)]
+    loss = make_loss(run, actor, critics, example)
+    if cfg.init_from:
+        initialise_from(cfg.init_from, actor, loss, space, cfg.init_new_observations)
+    learner = make(run.config["learner"])(loss)
+    accelerate(learner, cfg.fast)
+
+    # What is remembered, summed over n steps, and seen again under other styles
+    relabelled = []
+    if cfg.impersonation.n:
+        relabelled.append(TaskImpersonation(style_reward, n=cfg.impersonation.n, seed=cfg.seed))
+    replay = make_replay(run, example, *relabelled)
+    run_dir = open_run_dir(run, example, replay)
+
+    # Who collects, and the loop
+    return make_trainer(
+        run,
+        run_dir,
+        example,
+        collector=make_collector(run, make_env, actor),
+        replay=replay,
+        learner=learner,
+        evaluate=make_evaluation(run, make_env, actor),
+        describe=partial(
+            agent_state,
+            domain=cfg.domain,
+            space=space,
+            actor=actor,
+            loss_module=loss,
+            network=network,
+            config=run.config,
+        ),
+        style_terms=style_reward.terms_of,
+    )
 
 
 if __name__ == "__main__":

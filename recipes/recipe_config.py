@@ -22,10 +22,12 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from recipe_ranges import checked_numbers
 from recipe_saved import CONFIGS, check_saved_config
+from recipe_stages import composed_stages
 
 from coachable.files import CheckpointError, check_contained, refusing
 from coachable.finite import NonFiniteError
 from coachable.training.checkpoint import find_checkpoint, read_state
+from coachable.training.curriculum import Curriculum
 from coachable.training.hardware import choose_preset, detect, estimate_update_seconds, pick_device
 from coachable.training.loop import Train
 
@@ -41,6 +43,8 @@ _FIXED = (
     "replay_capacity",
     "init_from",
     "init_new_observations",
+    "stage",
+    "stages",
 )
 
 _PATHS = ("run_dir", "resume", "init_from")
@@ -64,6 +68,7 @@ _VALUED = (
 def config_groups(config_name: str) -> dict[str, list[str]]:
     """Groups of a recipe and the choices of each; presets are the recipe's own, the other groups are shared."""
     folders = {folder.name: folder for folder in sorted(CONFIGS.iterdir()) if folder.is_dir()}
+    folders.pop("__pycache__", None)  # of schema.py
     folders["preset"] /= config_name
     return {group: sorted(file.stem for file in folder.glob("*.yaml")) for group, folder in folders.items()}
 
@@ -87,13 +92,12 @@ def run_recipe(config_name: str, build: Callable[[dict[str, Any]], Train]) -> No
     def main(cfg: DictConfig) -> None:
         try:
             config = plain_config(cfg, list(HydraConfig.get().overrides.task), config_name)
-            train = build_checked(build, config)
+            train = start_training(build, config)
         except (CheckpointError, ValueError, ImportError) as error:
             if "HYDRA_FULL_ERROR" in os.environ:
                 raise
             # The user's to solve: the sentence says how, a traceback would hide it.
             raise SystemExit(f"error: {error}") from None
-        announce(config, train)
         try:
             train.run()
         except (NonFiniteError, CheckpointError) as error:
@@ -169,6 +173,15 @@ def _composed(config_name: str, *choices: str) -> DictConfig:
         return hydra.compose(config_name, list(choices))
 
 
+def start_training(build: Callable[[dict[str, Any]], Train], config: dict[str, Any]) -> Train | Curriculum:
+    """Make a training, or one in stages where the configuration lists any, and say what was chosen."""
+    if config.get("stages"):
+        return Curriculum(config, lambda stage: build_checked(build, stage), announce)
+    train = build_checked(build, config)
+    announce(config, train)
+    return train
+
+
 def build_checked(build: Callable[[dict[str, Any]], Train], config: dict[str, Any]) -> Train:
     """Builds a training; a saved configuration that makes none is refused with a sentence.
 
@@ -208,14 +221,20 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
             raise SystemExit(
                 f"error: {', '.join(fixed)} cannot change in a resumed run: start a new one with init_from={cfg.resume}"
             )
-        run = _run_of(checkpoint)
+        run = _run_of(checkpoint, staged=bool(saved.get("stages")))
         replaced = {"init_from": None, "run_dir": run, **said, "resume": str(checkpoint)}
         if run is not None and replaced["run_dir"] == run:
             check_contained(Path(run))  # the run's own files are written to
         with refusing(checkpoint, "a configuration"):
             for key, value in replaced.items():
                 OmegaConf.update(before, key, value, merge=False)
+            for stage in before.get("stages") or []:
+                for key, value in said.items():
+                    OmegaConf.update(stage, key, value, merge=False)
             cfg = OmegaConf.create(OmegaConf.to_container(before, resolve=True, throw_on_missing=True))
+    elif cfg.get("stages"):
+        stages = composed_stages(cfg, {key: OmegaConf.select(cfg, key) for key in _said(overrides)})
+        cfg = _chosen_stage(cfg, stages)
     config = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
     assert isinstance(config, dict)
     config.pop("hydra", None)
@@ -225,6 +244,15 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
         return checked_numbers(config)
     except (AttributeError, KeyError, TypeError) as error:  # of a saved one: what is composed here has the right kinds
         raise CheckpointError(f"{config['resume']} holds a configuration of another kind: {error}") from error
+
+
+def _chosen_stage(cfg: DictConfig, stages: list[dict[str, Any]]) -> DictConfig:
+    """The one stage that `stage=NAME` asks for, as a training of its own, or the first with the list of all."""
+    names = [stage["stage"] for stage in stages]
+    if cfg.stage is not None and cfg.stage not in names:
+        raise ValueError(f"stage={cfg.stage} does not exist.{_choices(cfg.stage, names)}")
+    chosen = stages[0 if cfg.stage is None else names.index(cfg.stage)]
+    return OmegaConf.create({**chosen, "stages": stages if cfg.stage is None else []})
 
 
 def announce(config: dict[str, Any], train: Train) -> None:
@@ -316,8 +344,10 @@ def _said(overrides: list[str]) -> list[str]:
     return [key for key in keys if key != "preset" and not key.startswith("hydra")]
 
 
-def _run_of(checkpoint: Path) -> str | None:
-    return str(checkpoint.parent.parent) if checkpoint.parent.name == "checkpoints" else None
+def _run_of(checkpoint: Path, *, staged: bool) -> str | None:
+    if checkpoint.parent.name != "checkpoints":
+        return None
+    return str(checkpoint.parents[3 if staged else 1])
 
 
 def _new_run_dir(domain: str) -> Path:

@@ -38,7 +38,7 @@ def check_saved_config(
     for place, value in _leaves(saved):
         if any(place[: len(key)] == key for key in replaced):
             continue
-        where, name = ".".join(place), place[-1]
+        where, name = ".".join(place), place[-1] if place else "stages"
         if name == "_target_" and (place, value) not in known:
             here = sorted(target for known_place, target in known if known_place == place)
             raise CheckpointError(
@@ -76,6 +76,7 @@ def _targets(leaves: Iterable[tuple[tuple[str, ...], Any]]) -> set[tuple[tuple[s
 def _leaves(value: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
     if isinstance(value, dict | list | tuple):
         for key, entry in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from _leaves(entry, (*place, str(key)))
+            # A stage may name what the recipe may name.
+            yield from _leaves(entry, () if place == ("stages",) else (*place, str(key)))
     else:
         yield place, value

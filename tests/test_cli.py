@@ -208,3 +208,18 @@ def test_the_readme_has_the_two_set_up_commands():
         ".venv/bin/python recipes/humanoid_sac.py",
         ".venv/bin/python -m pytest",
     ]
+
+
+def test_train_runs_the_recipe_of_that_name(tmp_path, monkeypatch):
+    """In another folder, in a process of its own, as after an installation."""
+    arguments = ["preset=smoke", "train.total_frames=200", "train.eval_interval=0", f"run_dir={tmp_path / 'run'}"]
+    command = [sys.executable, "-m", "coachable.cli", "train", "rare_targets", *arguments]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "run" / "metrics.csv").exists()
+
+
+def test_train_names_the_recipes(capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "humanoid"])
+    assert "cheetah_speed" in capsys.readouterr().err

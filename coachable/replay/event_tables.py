@@ -12,7 +12,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from coachable.files import load_state, save_state
 from coachable.ranges import NOT_NEGATIVE, Range
-from coachable.replay.events import EventPredicate, Route, StyleEvents
+from coachable.replay.events import EventPredicate, KeyRoute, Route, StyleEvents
 from coachable.replay.files import read_records, write_records
 from coachable.replay.n_step import NStep
 from coachable.replay.settings import checked_horizon, checked_minimum, checked_proportions, make_regions
@@ -155,6 +155,17 @@ class EventTableBuffer(TensorDictReplayBuffer):
         shares = {"default": 1.0 - event_share, **dict.fromkeys(events.names, event_share / len(events.names))}
         proportions = {"table_proportions": shares, **kwargs}
         return cls(capacities, events=events, event_horizon=event_horizon, **proportions)
+
+    @classmethod
+    def for_scenarios(cls, scenarios: Sequence[str], *, capacity: int, **kwargs: Any) -> "EventTableBuffer":
+        """Make one table per scenario, all of one size and with one share of each batch (multi-tables).
+
+        Args:
+            scenarios: Names of the scenarios, in the order of the numbers under `scenario` in the data.
+            capacity: Records of all tables together.
+            **kwargs: As for the class.
+        """
+        return cls(dict.fromkeys(scenarios, capacity // len(scenarios)), route=KeyRoute(scenarios), **kwargs)
 
     @classmethod
     def for_styles(

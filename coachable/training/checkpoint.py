@@ -170,7 +170,8 @@ def find_checkpoint(path: Path | str) -> Path:
     """Finds a checkpoint folder.
 
     Args:
-        path: a checkpoint, the `checkpoints` folder of a run, or the run's folder (then: its newest).
+        path: a checkpoint, the `checkpoints` folder of a run, or the run's folder (then: its newest, in the last stage
+            that has any).
 
     Raises:
         CheckpointError: if there is none, or it links to what lies elsewhere.
@@ -179,7 +180,7 @@ def find_checkpoint(path: Path | str) -> Path:
     if (path / _STATE).is_file():
         found = path
     else:
-        folder = path / "checkpoints" if (path / "checkpoints").is_dir() else path
+        folder = _checkpoint_folder(path)
         complete = _complete(folder) if folder.is_dir() else []
         if not complete:
             raise CheckpointError(
@@ -251,7 +252,7 @@ def check_unused(directory: Path | str) -> None:
     Raises:
         CheckpointError: if it holds checkpoints.
     """
-    if _complete(Path(directory) / "checkpoints"):
+    if _complete(_checkpoint_folder(Path(directory))):
         raise CheckpointError(
             f"{directory} holds a run already. Continue it with resume={directory}, or choose another folder with "
             "run_dir=PATH"
@@ -289,6 +290,14 @@ def check_writable(directory: Path | str, required_bytes: int = 0) -> None:
             f"{directory} has {free / 1e6:,.0f} MB free, checkpoints need about {required_bytes / 1e6:,.0f} MB. Choose "
             "another folder with run_dir=PATH, or leave the replay buffer out with checkpoint.replay=false"
         )
+
+
+def _checkpoint_folder(run: Path) -> Path:
+    """The `checkpoints` folder of a run or of its last stage that has checkpoints; the folder itself without any."""
+    if (run / "checkpoints").is_dir():
+        return run / "checkpoints"
+    stages = [folder for folder in run.glob("stages/[1-9]*_*/checkpoints") if _complete(folder)]
+    return max(stages, key=lambda folder: int(folder.parent.name.split("_")[0]), default=run)
 
 
 def _complete(directory: Path) -> list[Path]:

@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 
 from coachable.files import refusing
 from coachable.finite import NonFiniteError, require_finite
-from coachable.keys import EVENTS, STYLE, STYLE_FEATURES, TASK_REWARD
+from coachable.keys import EVENTS, SCENARIO, STYLE, STYLE_FEATURES, TASK_REWARD
 from coachable.replay import EventTableBuffer
 from coachable.replay.replay_files import read_replay
 from coachable.training.checkpoint import CheckpointStore, find_checkpoint, read_state
@@ -47,17 +47,20 @@ REPLAY_KEYS: tuple[NestedKey, ...] = (
 """What replay stores: what losses and relabelling read. `("next", "style")` equals `style` and is not stored."""
 
 
-def replay_keys(env: EnvBase, *, tables: bool = False) -> tuple[NestedKey, ...]:
+def replay_keys(env: EnvBase, *, tables: bool = False, scenarios: bool = False) -> tuple[NestedKey, ...]:
     """What replay stores of an env's transitions.
 
     Args:
         env: its observation spec tells whether there are events.
         tables: whether the buffer is an `EventTableBuffer`, which reads trajectory numbers and events.
+        scenarios: whether its tables are scenarios.
     """
     if not tables:
         return REPLAY_KEYS
-    events: tuple[NestedKey, ...] = (("next", EVENTS),) if EVENTS in env.observation_spec.keys() else ()  # noqa: SIM118
-    return (*REPLAY_KEYS, ("collector", "traj_ids"), *events)
+    emitted = env.observation_spec.keys()
+    events: tuple[NestedKey, ...] = (("next", EVENTS),) if EVENTS in emitted else ()
+    scenario: tuple[NestedKey, ...] = (SCENARIO,) if scenarios and SCENARIO in emitted else ()
+    return (*REPLAY_KEYS, ("collector", "traj_ids"), *events, *scenario)
 
 
 class Train:

@@ -137,7 +137,7 @@ def test_a_file_that_disagrees_is_noticed(traced, tmp_path):
 
 def test_a_full_disk_is_one_sentence_with_the_space_needed(traced, make_train, tmp_path, monkeypatch):
     make_train(total_frames=4).run()
-    monkeypatch.setattr("coachable.coach.export._trace", lambda _: traced[1])
+    monkeypatch.setattr("coachable.export.onnx._trace", lambda _: traced[1])
 
     def full(*_):
         raise OSError(28, "No space left on device")

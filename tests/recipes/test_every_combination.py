@@ -33,11 +33,15 @@ def _is_served(recipe, loss):
     return recipe != "combat_cat_rac" or loss not in ("sac", "qr_sac")
 
 
+def _has_tables(recipe, replay):
+    return recipe == "racing_qr_sac" or replay != "multi_tables"
+
+
 def _losses_and_buffers():
     """Every loss with one buffer, so that every recipe is trained with every loss and with every buffer."""
     for recipe in RECIPES:
         groups = config_groups(recipe)
-        buffers = itertools.cycle(groups["replay"])
+        buffers = itertools.cycle([name for name in groups["replay"] if _has_tables(recipe, name)])
         yield from ((recipe, loss, next(buffers)) for loss in groups["loss"] if _is_served(recipe, loss))
 
 
@@ -55,6 +59,9 @@ def test_every_loss_and_every_replay_buffer_train(recipe, loss, replay, tmp_path
         assert torch.isfinite(value).all(), name
     sample = train.replay.sample(8)
     assert set(REPLAY_KEYS) - {("next", "style_features")} <= set(sample.keys(True))
+    if replay == "multi_tables":
+        assert train.replay.names == ("solo", "recovery") and "scenario" in set(sample.keys())
+        return
     assert train.replay.names[:1] == ("default",) and (len(train.replay.names) > 1) == (replay == "event_tables")
 
 
@@ -80,29 +87,30 @@ def test_every_choice_composes(recipe):
 
 
 @pytest.mark.parametrize(
-    "preset, style_reward, new", [("cpu_traffic", {}, 33), ("cpu_late_traffic", {"gained": 2.0, "defended": 8.0}, 0)]
+    "stage, style_reward, new", [("traffic", {}, 33), ("late_traffic", {"gained": 2.0, "defended": 8.0}, 0)]
 )
-def test_the_presets_of_traffic_are_of_the_tyre_and_fuel_family(preset, style_reward, new):
-    config = compose_config("racing_qr_sac", [f"preset={preset}"])
+def test_the_stages_in_traffic_are_of_the_tyre_and_fuel_family(stage, style_reward, new):
+    config = compose_config("racing_qr_sac", ["preset=resources", f"stage={stage}"])
     assert config["domain"] == "racing_resources" and config["style_reward"] == style_reward
     assert config["sampler"]["only"] == ["overtake", "defend"] and config["init_new_observations"] == new
     assert sum(config["env"]["scenarios"]["shares"].values()) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(
-    "preset, margins",
+    "stage, margins",
     [
-        ("cpu_races", {"weight": 2.0}),
-        ("cpu_passing", {"weight": 1.0}),
-        ("cpu_late_races", {"weight": 16.0, "apart": 0.1}),
+        ("races", {"weight": 2.0}),
+        ("passing", {"weight": 1.0}),
+        ("late_races", {"weight": 16.0, "apart": 0.1}),
     ],
 )
-def test_the_presets_of_races_are_of_their_family(preset, margins, tmp_path):
-    config = compose_config("racing_qr_sac", [f"preset={preset}"])
+def test_the_stages_of_races_are_of_their_family(stage, margins, tmp_path):
+    config = compose_config("racing_qr_sac", ["preset=aggressiveness", f"stage={stage}"])
     assert config["domain"] == "racing_aggressiveness" and config["style_reward"] == margins
     assert config["sampler"]["shared"] is True
     assert sum(config["env"]["scenarios"]["shares"].values()) == pytest.approx(1.0)
-    config = compose_config("racing_qr_sac", [f"preset={preset}", "family=drift", f"run_dir={tmp_path}"])
+    arguments = ["preset=aggressiveness", f"stage={stage}", "family=drift", f"run_dir={tmp_path}"]
+    config = compose_config("racing_qr_sac", arguments)
     with pytest.raises(ValueError, match=f"style_reward has {', '.join(sorted(margins))}: racing_drift takes none"):
         import_module("racing_qr_sac").build(config)
 
@@ -179,6 +187,7 @@ def test_runs_with_tables_resume_bit_for_bit(loss, replay, tmp_path):
         ("combat_cat_rac", ["env.machines=[Thunderclaw]"], r"Thunderclaw"),
         ("combat_cat_rac", ["loss=sac"], r"continuous actions only"),
         ("combat_cat_rac", ["loss=qr_sac"], r"continuous actions only"),
+        ("cheetah_speed", ["replay=multi_tables"], r"replay=multi_tables: cheetah has no scenarios"),
         ("cheetah_speed", ["mirror=0.5"], r"cheetah has no mirror images, expected mirror=0"),
     ],
 )

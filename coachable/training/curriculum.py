@@ -1,0 +1,115 @@
+"""A training in stages: each stage starts from the actor and critics of the one before, in one run folder."""
+
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from coachable.training.checkpoint import CheckpointError, check_unused, find_checkpoint, read_state
+from coachable.training.hardware import share_threads
+from coachable.training.loop import Train
+
+__all__ = ["Curriculum"]
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+
+
+class Curriculum:
+    """Trains one stage after the other.
+
+    Stage i of the run is a run of its own in `stages/i_NAME`, with an empty replay buffer and new optimisers. Its
+    checkpoints hold the settings of all stages, so that the run can be resumed in any of them.
+
+    Args:
+        config: `stages` is the list of the stages' complete configurations, plain containers, each with its name under
+            `stage`. With `resume`, `config["stage"]` is the stage of that checkpoint.
+        build: Makes the training of one stage from its configuration.
+        announce: Called with the configuration and the training of each stage before it runs.
+
+    Raises:
+        CheckpointError: If the stages are not such a list, or the run's folder holds another run.
+    """
+
+    def __init__(
+        self,
+        config: Mapping[str, Any],
+        build: Callable[[dict[str, Any]], Train],
+        announce: Callable[[dict[str, Any], Train], None] = lambda config, train: None,
+    ) -> None:
+        self.run_dir = Path(config["run_dir"])
+        self.stages = _checked_stages(config["stages"])
+        self._build = build
+        self._announce = announce
+        self._init_from = config["init_from"]
+        resume = config["resume"]
+        if resume:
+            self.number = self._number_of(config.get("stage"), resume)
+            if _is_finished(resume, self.stages[self.number]) and self.number + 1 < len(self.stages):
+                self.number, resume = self.number + 1, None
+        else:
+            check_unused(self.run_dir)
+            self.number = 0
+        # Sums are rounded as the number of threads says: it is the same in all stages, and after a resumption.
+        learner = share_threads(**self.stages[0]["threads"]).learner
+        for stage in self.stages:
+            stage["threads"] = {**stage["threads"], "learner": stage["threads"]["learner"] or learner}
+        self.train = self._start(resume)
+
+    def run(self) -> dict[str, float]:
+        """Run the stages that are left, until the last one ends or a stop signal comes.
+
+        Returns:
+            The latest value of every metric of the last stage that ran.
+        """
+        while True:
+            latest = self.train.run()
+            if self.train.frames < self.train.settings.total_frames or self.number + 1 == len(self.stages):
+                return latest
+            self.number += 1
+            self.train = self._start(None)
+
+    def folder(self, number: int) -> Path:
+        """Return the folder of a stage, which are counted from 0 here and from 1 in names."""
+        return self.run_dir / "stages" / f"{number + 1}_{self.stages[number]['stage']}"
+
+    def _start(self, resume: str | None) -> Train:
+        first = self.number == 0
+        init_from = self._init_from if first else str(self.folder(self.number - 1))
+        config = {
+            **self.stages[self.number],
+            "stages": self.stages,
+            "run_dir": str(self.folder(self.number)),
+            "resume": resume,
+            "init_from": None if resume else init_from,
+        }
+        train = self._build(config)
+        self._announce(config, train)
+        return train
+
+    def _number_of(self, name: Any, checkpoint: str) -> int:
+        names = [stage["stage"] for stage in self.stages]
+        if name not in names:
+            raise CheckpointError(f"{checkpoint} names {name!r} as its stage: expected one of {', '.join(names)}")
+        return names.index(name)
+
+
+def _checked_stages(stages: Any) -> list[dict[str, Any]]:
+    """Copies of the stages; their names become folders, and may come from somebody else's checkpoint.
+
+    Raises:
+        CheckpointError: If a stage has no name of letters, digits, `_` and `-`, or names repeat.
+    """
+    if not isinstance(stages, list) or not all(isinstance(stage, dict) for stage in stages):
+        raise CheckpointError("the configuration holds stages of another kind: expected a list of settings")
+    names = [stage.get("stage") for stage in stages]
+    for name in names:
+        if not isinstance(name, str) or not _NAME.fullmatch(name) or names.count(name) > 1:
+            raise CheckpointError(
+                f"a stage is called {name!r}: expected a name of letters, digits, _ and -, different for each stage"
+            )
+    return [dict(stage) for stage in stages]
+
+
+def _is_finished(checkpoint: str, stage: Mapping[str, Any]) -> bool:
+    loop = read_state(find_checkpoint(checkpoint)).get("loop")
+    return isinstance(loop, dict) and int(loop.get("frames", 0)) >= stage["train"]["total_frames"]

@@ -1,0 +1,1 @@
+"""Configurations of the recipes: YAML files, and what they may contain."""

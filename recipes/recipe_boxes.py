@@ -1,0 +1,250 @@
+"""Boxes that recipes share; each function makes one, and recipes/humanoid_sac.py shows how they fit together."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from inspect import signature
+from pathlib import Path
+from typing import Any
+
+import torch
+from configs.schema import Settings, typed_settings
+from hydra.utils import instantiate
+from recipe_config import save_config
+from tensordict import NestedKey
+from torch import nn
+from torchrl.collectors import BaseCollector
+from torchrl.data import ReplayBuffer
+from torchrl.envs import EnvBase, Transform
+from torchrl.objectives import LossModule
+
+from coachable.keys import STYLE_FEATURES
+from coachable.replay import EventTableBuffer
+from coachable.replay.replay_files import replay_bytes
+from coachable.styles import StyleReward, StyleSpace
+from coachable.training.checkpoint import CheckpointStore, check_unused, check_writable
+from coachable.training.collection import evaluate_policy, simulation_env
+from coachable.training.hardware import pick_device, share_threads
+from coachable.training.logging import MetricsLog, Progress, wandb_logger
+from coachable.training.loop import Train, replay_keys
+from coachable.training.rng import seed_everything
+from coachable.training.settings import TrainSettings
+from coachable.transforms import MirrorSymmetry
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training: what was asked for, and what this machine gives to it.
+
+    Attributes:
+        config: The configuration as plain containers, as checkpoints hold it.
+        settings: The same, typed.
+        loop: When the training does what.
+        device: Device of the networks.
+        simulator_threads: Threads of one simulator.
+        learner_threads: Threads of the learner.
+    """
+
+    config: dict[str, Any]
+    settings: Settings
+    loop: TrainSettings
+    device: torch.device
+    simulator_threads: int
+    learner_threads: int
+
+
+def start_run(config: dict[str, Any]) -> Run:
+    """Check the settings, share the cores among simulator and learner, and seed all generators.
+
+    Args:
+        config: From `compose_config`.
+
+    Raises:
+        ValueError: If settings are of a wrong type or contradict each other.
+    """
+    settings = typed_settings(config)
+    if "events" in settings.replay and settings.replay["events"] is None:
+        raise ValueError(f"replay=event_tables: {settings.domain} names no events; expected replay=uniform")
+    loop = make(config["train"])()
+    threads = share_threads(**config["threads"])
+    # The learner's sums are rounded as their number of threads says: a resumed training takes as many.
+    config = {**config, "threads": {**config["threads"], "learner": threads.learner}}
+    torch.set_num_threads(threads.learner)
+    seed_everything(settings.seed)
+    device = pick_device(settings.device)
+    per_simulator = max(1, threads.simulator // settings.collector["num_collectors"])
+    return Run(config, typed_settings(config), loop, device, per_simulator, threads.learner)
+
+
+def make(target: dict[str, Any]) -> Callable[..., Any]:
+    """Return the function or class that `_target_` names, with the arguments that the YAML gives."""
+    return instantiate(target, _convert_="all", _partial_=True)
+
+
+def make_style_reward(run: Run, factory: Callable[..., StyleReward], space: StyleSpace) -> StyleReward:
+    """Make the style reward of a space with the numbers of `style_reward`.
+
+    Raises:
+        ValueError: If there are unknown numbers, or relabelling cannot sum this reward over steps.
+    """
+    settings = run.settings
+    known = set(signature(factory).parameters) - {"space"}
+    if unknown := set(settings.style_reward) - known:
+        expected = ", ".join(sorted(known)) or "none"
+        raise ValueError(f"style_reward has {', '.join(sorted(unknown))}: {settings.domain} takes {expected}")
+    style_reward = factory(space, **settings.style_reward)
+    n = settings.impersonation.n
+    if n and settings.n_steps > 1 and not style_reward.is_linear:
+        raise ValueError(
+            f"impersonation.n={n} with n_steps={settings.n_steps}: the style reward of {settings.domain} is not "
+            "linear in its features, which cannot be summed over steps; expected n_steps=1 or impersonation.n=0"
+        )
+    return style_reward
+
+
+def network_settings(run: Run, env: EnvBase) -> dict[str, dict[str, Any]]:
+    """Return the arguments of actor and critic, with the widths of the environment's observations and actions."""
+    network = run.settings.network
+    widths = {"obs_dim": env.observation_spec["observation"].shape[-1]}
+    filled = {"actor": {**network.actor, **widths}, "critic": {**network.critic, **widths}}
+    for part in filled.values():
+        if "heads" not in part:  # of a mixed action; they say how wide it is
+            part["action_dim"] = env.action_spec.shape[-1]
+    return filled
+
+
+def make_loss(run: Run, actor: nn.Module, critics: list[nn.Module], env: EnvBase) -> LossModule:
+    """Make the loss on the run's device.
+
+    Args:
+        run: The training.
+        actor: Its policy.
+        critics: A list, because a single critic would be re-initialised by the loss.
+        env: Its action specification bounds the policy.
+
+    Raises:
+        ValueError: If the loss does not serve the actions.
+    """
+    settings = run.settings
+    buttons = settings.network.actor.get("heads", {}).get("categorical")
+    if settings.loss["_target_"].endswith(".SACLoss") and buttons:
+        raise ValueError(f"loss=sac serves continuous actions only, {settings.domain} has buttons: expected cat_rac")
+    loss = make(settings.loss)(actor, critics, action_spec=env.action_spec, num_qvalue_nets=len(critics))
+    loss.make_value_estimator(gamma=settings.gamma)
+    return loss.to(run.device)
+
+
+def make_replay(run: Run, env: EnvBase, *transforms: Transform) -> ReplayBuffer:
+    """Make the replay buffer; it sums rewards over `n_steps` and takes memory when it is first written to.
+
+    Args:
+        run: The training.
+        env: One environment; its scenarios are the tables of `replay=multi_tables`.
+        *transforms: What sampled batches go through, such as `MirrorSymmetry` and `TaskImpersonation`.
+
+    Raises:
+        ValueError: If batches are too small for the tables, or mirror images are asked for and there are none.
+    """
+    settings = run.settings
+    if settings.mirror and not any(isinstance(transform, MirrorSymmetry) for transform in transforms):
+        raise ValueError(f"mirror={settings.mirror}: {settings.domain} has no mirror images, expected mirror=0")
+    relabelled_sums = settings.impersonation.n and settings.n_steps > 1
+    options: dict[str, Any] = {"discounted_keys": [("next", STYLE_FEATURES)]} if relabelled_sums else {}
+    if _has_scenario_tables(settings):
+        scenarios = getattr(simulation_env(env), "scenario_names", None)
+        if scenarios is None:
+            raise ValueError(f"replay=multi_tables: {settings.domain} has no scenarios; expected replay=uniform")
+        options["scenarios"] = scenarios
+    replay = make(settings.replay)(**options)
+    tables = len(replay.names) if isinstance(replay, EventTableBuffer) else 0
+    if settings.train.batch_size < tables:
+        raise ValueError(
+            f"train.batch_size={settings.train.batch_size}: every batch holds at least one transition of each of "
+            f"the {tables} tables ({', '.join(replay.names)})"
+        )
+    for transform in transforms:
+        replay.append_transform(transform)
+    return replay
+
+
+def make_collector(run: Run, make_env: Callable[..., EnvBase], actor: nn.Module) -> BaseCollector:
+    """Make the collector, in this process, on this host or on many, as the group `collector` says."""
+    settings = run.settings
+    return make(settings.collector)(
+        make_env,
+        actor,
+        frames_per_batch=settings.env["num_envs"] * settings.collector["num_collectors"],
+        init_random_frames=settings.init_random_frames,
+        seed=settings.seed,
+        policy_device=run.device,
+    )
+
+
+def make_evaluation(run: Run, make_env: Callable[..., EnvBase], actor: nn.Module) -> Callable[[], dict[str, float]]:
+    """Return a function that evaluates the actor on the same starts and styles every time."""
+    settings = run.settings
+    seed = settings.seed + 10_000
+    env = make_env(seed, num_envs=settings.eval.num_envs)
+
+    def evaluate() -> dict[str, float]:
+        env.set_seed(seed)
+        return evaluate_policy(env, actor, max_steps=settings.eval.max_steps, device=run.device)
+
+    return evaluate
+
+
+def open_run_dir(run: Run, env: EnvBase, replay: ReplayBuffer) -> Path:
+    """Make the run's folder and write the configuration into it.
+
+    Args:
+        run: The training.
+        env: One environment; its transitions say how much room checkpoints need.
+        replay: The buffer that checkpoints hold.
+
+    Raises:
+        CheckpointError: If the folder holds another run, cannot be written to, or its disk is too small.
+    """
+    settings = run.settings
+    run_dir = Path(settings.run_dir)
+    if not settings.resume or not Path(settings.resume).resolve().is_relative_to(run_dir.resolve()):
+        check_unused(run_dir)
+    check_writable(run_dir)
+    if settings.checkpoint.replay:  # two at a time: the old one is removed when the new one is complete
+        size = replay_bytes(env, stored_keys(run, env, replay), settings.replay_capacity)
+        check_writable(run_dir, required_bytes=2 * size)
+    save_config(run.config, run_dir)
+    return run_dir
+
+
+def stored_keys(run: Run, env: EnvBase, replay: ReplayBuffer) -> tuple[NestedKey, ...]:
+    """Return which entries of a transition the replay buffer stores."""
+    tables = isinstance(replay, EventTableBuffer)
+    return replay_keys(env, tables=tables, scenarios=_has_scenario_tables(run.settings))
+
+
+def _has_scenario_tables(settings: Settings) -> bool:
+    return settings.replay["_target_"].endswith(".for_scenarios")
+
+
+def make_trainer(run: Run, run_dir: Path, env: EnvBase, **parts: Any) -> Train:
+    """Make the training loop with its log and its checkpoints; a resumed run continues where it stopped.
+
+    Args:
+        run: The training.
+        run_dir: Its folder.
+        env: One environment, which is closed.
+        **parts: Collector, replay, learner and the other arguments of `Train`.
+    """
+    settings = run.settings
+    trainer = Train(
+        settings=run.loop,
+        log=MetricsLog(run_dir, wandb_logger(settings.domain, run_dir, **run.config["wandb"])),
+        progress=Progress(settings.train.total_frames),
+        checkpoints=CheckpointStore(run_dir / "checkpoints", **run.config["checkpoint"]),
+        replay_keys=stored_keys(run, env, parts["replay"]),
+        **parts,
+    )
+    env.close()  # now, not whenever it is collected: TorchRL raises the number of threads when it closes a SerialEnv
+    torch.set_num_threads(run.learner_threads)
+    if settings.resume:
+        print(f"resumed {trainer.resume(settings.resume)} at {trainer.frames} env-steps")
+    return trainer

@@ -1,0 +1,109 @@
+"""A training in stages: one run folder, resumed in any stage, bit for bit."""
+
+import os
+from importlib import import_module
+
+import pytest
+import torch
+from recipe_config import compose_config, start_training
+
+from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
+from coachable.training.curriculum import Curriculum
+from coachable.training.loop import Train
+from tests.random_kills import differences
+
+TINY = ["preset=smoke", "threads.simulator=1", "threads.learner=1", "train.eval_interval=16", "eval.max_steps=3"]
+TINY += ["init_random_frames=8", "train.warmup_frames=8", "train.batch_size=12", "train.utd_ratio=0.25"]
+TINY += ["train.checkpoint_interval=0"]
+STAGES = "stages=[{name: first, total_frames: 24}, {name: second, total_frames: 40, alpha: 0.2, env: {num_envs: 4}}]"
+
+
+class Killed(BaseException):
+    pass
+
+
+def start(*arguments):
+    return start_training(import_module("rare_targets").build, compose_config("rare_targets", list(arguments)))
+
+
+@pytest.mark.parametrize("at", [("first", 16), ("second", 4), ("second", 24)])
+def test_a_training_that_is_killed_in_a_stage_ends_like_an_uninterrupted_one(at, tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "fsync", lambda _: None)
+    start(*TINY, STAGES, f"run_dir={tmp_path / 'whole'}").run()
+    store = Train._store
+
+    def die(train, data):
+        if (train.describe()["config"]["stage"], train.frames) == at:
+            raise Killed
+        store(train, data)
+
+    monkeypatch.setattr(Train, "_store", die)
+    with pytest.raises(Killed):
+        start(*TINY, STAGES, f"run_dir={tmp_path / 'killed'}").run()
+    monkeypatch.setattr(Train, "_store", store)
+    start(f"resume={tmp_path / 'killed'}").run()
+    for stage in ("1_first", "2_second"):
+        found = differences(tmp_path / "killed" / "stages" / stage, tmp_path / "whole" / "stages" / stage)
+        assert [name for name in found if name != "metrics/episodes"] == [], stage
+
+
+def test_a_stage_starts_from_the_weights_of_the_one_before(tmp_path):
+    curriculum = start(*TINY, STAGES, f"run_dir={tmp_path}", "train.utd_ratio=0")
+    curriculum.run()
+    states = [read_state(find_checkpoint(tmp_path / "stages" / name)) for name in ("1_first", "2_second")]
+    for part in ("actor", "critics"):
+        for name, value in states[0][part].items():
+            assert torch.equal(value, states[1][part][name]), name
+    assert [state["loop"]["frames"] for state in states] == [24, 40]
+    assert states[1]["config"]["loss"]["alpha_init"] == 0.2 and states[0]["config"]["loss"]["alpha_init"] == 0.01
+    assert find_checkpoint(tmp_path).parents[1].name == "2_second"
+    with pytest.raises(CheckpointError, match="holds a run already"):
+        start(*TINY, STAGES, f"run_dir={tmp_path}")
+
+
+def test_what_the_command_line_says_holds_in_all_stages():
+    config = compose_config("rare_targets", [*TINY, STAGES, "alpha=0.3", "train.total_frames=8"])
+    assert [stage["loss"]["alpha_init"] for stage in config["stages"]] == [0.3, 0.3]
+    assert [stage["train"]["total_frames"] for stage in config["stages"]] == [8, 8]
+
+
+def test_one_stage_can_be_trained_on_its_own():
+    config = compose_config("rare_targets", [*TINY, STAGES, "stage=second"])
+    assert config["stages"] == [] and config["alpha"] == 0.2 and config["train"]["total_frames"] == 40
+    with pytest.raises(ValueError, match=r"stage=third does not exist.* Valid: first, second"):
+        compose_config("rare_targets", [*TINY, STAGES, "stage=third"])
+
+
+@pytest.mark.parametrize(
+    "stages, message",
+    [
+        ("[{total_frames: 8}]", "a stage has no name"),
+        ("[{name: a, alhpa: 0.1}]", "stage a changes alhpa"),
+        ("[{name: a, train: {batchsize: 3}}]", "batchsize"),
+        ("[{name: a, total_frames: 0}]", "train.total_frames=0: expected a whole number"),
+    ],
+)
+def test_mistakes_in_a_stage_are_named_at_the_start(stages, message):
+    with pytest.raises(ValueError, match=message):
+        compose_config("rare_targets", [*TINY, f"stages={stages}"])
+
+
+@pytest.mark.parametrize("name", ["../../elsewhere", "/tmp/x", "", "..", None, 3])
+def test_the_name_of_a_stage_leads_nowhere_else(name, tmp_path):
+    config = {"run_dir": str(tmp_path), "stages": [{"stage": name}], "init_from": None, "resume": None}
+    with pytest.raises(CheckpointError, match="a stage is called"):
+        Curriculum(config, build=None)
+
+
+@pytest.mark.parametrize("harm", [{"_target_": "builtins.print"}, "${oc.env:HOME}", 7])
+def test_a_saved_stage_names_nothing_that_the_recipe_does_not(harm, tmp_path):
+    start(*TINY, STAGES, f"run_dir={tmp_path / 'run'}").run()
+    file = find_checkpoint(tmp_path / "run") / "state.pt"
+    state = torch.load(file, weights_only=True)
+    if harm == 7:
+        state["config"]["stages"] = [7, 7]
+    else:
+        state["config"]["stages"][1]["env"]["nested"] = harm
+    torch.save(state, file)
+    with pytest.raises(CheckpointError):
+        start(f"resume={tmp_path / 'run'}")
