@@ -124,9 +124,10 @@ class EnvPictures:
             RenderingError: if the environment draws no pictures; says what to declare instead.
         """
         simulation, _ = simulation_of(env, row)
-        width, height = self.size
         if hasattr(simulation, "physics"):
-            return np.asarray(simulation.physics.render(height=height, width=width))
+            buffer = simulation.physics.model.vis.global_  # the largest picture that MuJoCo draws
+            width, height = min(self.size[0], buffer.offwidth), min(self.size[1], buffer.offheight)
+            return self._fitted(simulation.physics.render(height=height, width=width))
         name = type(getattr(simulation, "unwrapped", simulation)).__name__
         if getattr(simulation, "render_mode", None) != "rgb_array":
             raise RenderingError(
@@ -137,6 +138,9 @@ class EnvPictures:
             picture = simulation.render()
         except Exception as error:  # whatever the environment needs for it
             raise RenderingError(f"{name} draws no pictures: {error}") from error
+        return self._fitted(picture)
+
+    def _fitted(self, picture: Any) -> np.ndarray:
         return np.asarray(Image.fromarray(np.asarray(picture, dtype=np.uint8)).resize(self.size))
 
     def close(self) -> None:

@@ -1,7 +1,9 @@
 """What a domain gets that declares only an environment, a style space and a style reward."""
 
 from functools import partial, wraps
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -130,6 +132,15 @@ def test_the_simulation_of_a_row_lies_below_transforms_and_batches():
 def test_an_environment_that_draws_nothing_says_what_to_declare():
     with pytest.raises(RenderingError, match=r"StyleEchoEnv draws no pictures: .*make_renderer"):
         EnvPictures(8, 6).draw(StyleEchoEnv(1))
+
+
+def test_pictures_larger_than_mujoco_draws_are_enlarged():
+    physics = SimpleNamespace(
+        model=SimpleNamespace(vis=SimpleNamespace(global_=SimpleNamespace(offwidth=64, offheight=48))),
+        render=lambda height, width: np.zeros((height, width, 3), dtype=np.uint8),
+    )
+    env = SimpleNamespace(physics=physics)
+    assert EnvPictures(80, 60).draw(env).shape == (60, 80, 3)
 
 
 def test_pictures_are_fitted_to_the_size():
