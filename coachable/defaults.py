@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
 
 from coachable.gl import RenderingError
 from coachable.keys import STYLE, STYLE_FEATURES
+from coachable.offscreen import OffscreenMujoco
 from coachable.styles import (
     Choice,
     ChoiceTolerance,
@@ -116,6 +117,8 @@ class EnvPictures:
 
     def __init__(self, width: int = 640, height: int = 480) -> None:
         self.size = (width, height)
+        self._model: Any = None
+        self._mujoco: OffscreenMujoco | None = None
 
     def draw(self, env: EnvBase, row: int = 0) -> np.ndarray:
         """Return a picture (height, width, 3) uint8 of one row.
@@ -124,10 +127,8 @@ class EnvPictures:
             RenderingError: if the environment draws no pictures; says what to declare instead.
         """
         simulation, _ = simulation_of(env, row)
-        if hasattr(simulation, "physics"):
-            buffer = simulation.physics.model.vis.global_  # the largest picture that MuJoCo draws
-            width, height = min(self.size[0], buffer.offwidth), min(self.size[1], buffer.offheight)
-            return self._fitted(simulation.physics.render(height=height, width=width))
+        if hasattr(simulation, "physics"):  # dm_control
+            return self._draw_mujoco(simulation.physics.model.ptr, simulation.physics.data.ptr)
         name = type(getattr(simulation, "unwrapped", simulation)).__name__
         if getattr(simulation, "render_mode", None) != "rgb_array":
             raise RenderingError(
@@ -140,11 +141,22 @@ class EnvPictures:
             raise RenderingError(f"{name} draws no pictures: {error}") from error
         return self._fitted(picture)
 
+    def _draw_mujoco(self, model: Any, data: Any) -> np.ndarray:
+        if self._mujoco is None or self._model is not model:  # an environment may make another one for each episode
+            self.close()
+            buffer = model.vis.global_  # the largest picture that MuJoCo draws
+            width, height = min(self.size[0], buffer.offwidth), min(self.size[1], buffer.offheight)
+            self._model, self._mujoco = model, OffscreenMujoco(model, width, height)
+        return self._fitted(self._mujoco.draw(data))
+
     def _fitted(self, picture: Any) -> np.ndarray:
         return np.asarray(Image.fromarray(np.asarray(picture, dtype=np.uint8)).resize(self.size))
 
     def close(self) -> None:
-        """Do nothing: the pictures belong to the environment."""
+        """Release the OpenGL context, where MuJoCo draws."""
+        if self._mujoco is not None:
+            self._mujoco.close()
+            self._mujoco = None
 
 
 def simulation_of(env: EnvBase, row: int = 0) -> tuple[Any, int]:

@@ -1,13 +1,11 @@
 """What a domain gets that declares only an environment, a style space and a style reward."""
 
 from functools import partial, wraps
-from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import PendulumEnv, SerialEnv, TransformedEnv
+from torchrl.envs import DMControlEnv, PendulumEnv, SerialEnv, TransformedEnv
 
 from coachable.defaults import EnvPictures, RewardMeasures, simulation_of, steps_per_episode, style_grid, time_per_step
 from coachable.domain import Domain
@@ -134,13 +132,17 @@ def test_an_environment_that_draws_nothing_says_what_to_declare():
         EnvPictures(8, 6).draw(StyleEchoEnv(1))
 
 
-def test_pictures_larger_than_mujoco_draws_are_enlarged():
-    physics = SimpleNamespace(
-        model=SimpleNamespace(vis=SimpleNamespace(global_=SimpleNamespace(offwidth=64, offheight=48))),
-        render=lambda height, width: np.zeros((height, width, 3), dtype=np.uint8),
-    )
-    env = SimpleNamespace(physics=physics)
-    assert EnvPictures(80, 60).draw(env).shape == (60, 80, 3)
+def test_pictures_of_dm_control_may_be_larger_than_mujoco_draws():
+    env = DMControlEnv("cartpole", "balance")
+    pictures = EnvPictures(800, 600)
+    try:
+        picture = pictures.draw(env)
+    except RenderingError as error:
+        pytest.skip(str(error))
+    assert picture.shape == (600, 800, 3) and picture.std() > 0
+    assert (pictures.draw(env) == picture).all()
+    pictures.close()
+    env.close()
 
 
 def test_pictures_are_fitted_to_the_size():

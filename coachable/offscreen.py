@@ -1,0 +1,76 @@
+"""Pictures of a MuJoCo model without a window."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from coachable.gl import INSTALL_HINT, NO_BACKEND, RenderingError, choose_gl_backend
+
+__all__ = ["OffscreenMujoco"]
+
+
+class OffscreenMujoco:
+    """Draw states of a MuJoCo model as RGB images.
+
+    `mujoco.Renderer` is not used because it knows only the backend that was set when MuJoCo was first imported. The
+    OpenGL context belongs to the thread that makes, uses and closes this object.
+
+    Args:
+        model: compiled model. Its offscreen buffer is at least as large as the image.
+        width: image width [px].
+        height: image height [px].
+        shadows: draw shadows and reflections, which cost three to four times the rest in software.
+
+    Raises:
+        RenderingError: if no OpenGL library is installed; names the package that gives one.
+
+    Attributes:
+        camera: the model's first camera, or a free one that sees all of the model where it has none.
+    """
+
+    def __init__(self, model: mujoco.MjModel, width: int, height: int, *, shadows: bool = False) -> None:
+        self._model = model
+        self._gl = _make_gl_context(width, height)
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._scene = mujoco.MjvScene(model, maxgeom=1000)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = shadows
+        self._option = mujoco.MjvOption()
+        self._viewport = mujoco.MjrRect(0, 0, width, height)
+        self.camera = mujoco.MjvCamera()
+        mujoco.mjv_defaultFreeCamera(model, self.camera)
+        if model.ncam:
+            self.camera.type, self.camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
+
+    def draw(self, data: mujoco.MjData) -> np.ndarray:
+        """Return an image (height, width, 3) uint8 of a state."""
+        everything = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(self._model, data, self._option, None, self.camera, everything, self._scene)
+        self._gl.make_current()
+        mujoco.mjr_render(self._viewport, self._scene, self._context)
+        image = np.empty((self._viewport.height, self._viewport.width, 3), dtype=np.uint8)
+        mujoco.mjr_readPixels(image, None, self._viewport, self._context)
+        return np.flipud(image)
+
+    def close(self) -> None:
+        """Release the OpenGL context."""
+        self._context.free()
+        self._gl.free()
+
+
+def _make_gl_context(width: int, height: int) -> Any:
+    """Make an OpenGL context of the chosen backend the current one, and return it."""
+    backend = choose_gl_backend()
+    if backend == NO_BACKEND:
+        raise RenderingError(INSTALL_HINT)
+    try:
+        context = import_module(f"mujoco.{backend}").GLContext(width, height)
+        context.make_current()
+    except (ImportError, AttributeError, RuntimeError, OSError) as error:
+        raise RenderingError(f"MUJOCO_GL={backend} failed ({error}): {INSTALL_HINT}") from error
+    return context
