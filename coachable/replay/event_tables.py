@@ -15,7 +15,7 @@ from coachable.ranges import NOT_NEGATIVE, Range
 from coachable.replay.events import EventPredicate, KeyRoute, Route, StyleEvents
 from coachable.replay.files import read_records, write_records
 from coachable.replay.n_step import NStep
-from coachable.replay.settings import checked_horizon, checked_minimum, checked_proportions, make_regions
+from coachable.replay.settings import checked_horizon, checked_proportions, make_regions
 from coachable.replay.stratified import StratifiedSampler, allot
 from coachable.replay.table_writer import TableWriter
 
@@ -45,8 +45,6 @@ class EventTableBuffer(TensorDictReplayBuffer):
         route: Which routed tables there are and where each step goes; without it there is one, "default".
         table_proportions: Share of each table in a batch. By default event tables share one half equally, routed tables
             the other (our choice).
-        table_minimum: Records, for all tables or by name, below which a table is left out of batches and the other
-            shares are renormalised.
         num_envs: Environments in a batch `(steps,)` that carries no trajectory numbers.
         n_steps: Steps summed into one transition, before routing; see `coachable.replay.n_step.NStep`.
         gamma: Discount of that sum.
@@ -91,7 +89,6 @@ class EventTableBuffer(TensorDictReplayBuffer):
         event_horizon: int | None = None,
         route: Route | None = None,
         table_proportions: Mapping[str, float] | None = None,
-        table_minimum: int | Mapping[str, int] = 1,
         num_envs: int | None = None,
         n_steps: int = 1,
         gamma: float | None = None,
@@ -106,7 +103,6 @@ class EventTableBuffer(TensorDictReplayBuffer):
         routed = len(route.names) if route is not None else 1
         horizon = checked_horizon(regions, routed, events, event_horizon, num_envs)
         shares = checked_proportions(regions.names, routed, table_proportions)
-        minimum = checked_minimum(regions, table_minimum)
         if kwargs.get("batch_size") is not None:
             allot(kwargs["batch_size"], shares, shares > 0)
         for name in ("prefetch", "sampler", "writer", "shared", "sample_unit", "consume_after_n_samples", "dim_extend"):
@@ -121,7 +117,7 @@ class EventTableBuffer(TensorDictReplayBuffer):
         self.regions = regions
         super().__init__(
             storage=storage(regions.total),
-            sampler=StratifiedSampler(regions, shares, minimum, prioritized, priority_alpha, priority_beta),
+            sampler=StratifiedSampler(regions, shares, prioritized, priority_alpha, priority_beta),
             writer=TableWriter(regions, route, events, horizon, n_step, num_envs),
             **kwargs,
         )

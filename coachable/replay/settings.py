@@ -8,7 +8,7 @@ from coachable.ranges import COUNT, Range
 from coachable.replay.events import EventPredicate, Route
 from coachable.replay.regions import Regions
 
-__all__ = ["checked_horizon", "checked_minimum", "checked_proportions", "make_regions"]
+__all__ = ["checked_horizon", "checked_proportions", "make_regions"]
 
 
 def make_regions(capacities: Mapping[str, int], route: Route | None, events: EventPredicate | None) -> Regions:
@@ -91,27 +91,3 @@ def checked_proportions(names: Sequence[str], routed: int, given: Mapping[str, f
             f"table_proportions are {dict(given)}, with sum {shares.sum():.6g}: expected shares >= 0 that sum to 1"
         )
     return shares
-
-
-def checked_minimum(regions: Regions, given: int | Mapping[str, int]) -> np.ndarray:
-    """Return the number of records below which a table is left out of batches.
-
-    Args:
-        regions: The tables.
-        given: For all tables, or by name (1 where not given).
-
-    Returns:
-        `(tables,)` int64.
-
-    Raises:
-        ValueError: If a name is unknown, or a number lies outside [1, capacity].
-    """
-    by_name = dict.fromkeys(regions.names, given) if not isinstance(given, Mapping) else dict(given)
-    stray = [name for name in by_name if name not in regions.names]
-    if stray:
-        raise ValueError(f"table_minimum names {stray}: the tables are {list(regions.names)}")
-    minimum = np.array([by_name.get(name, 1) for name in regions.names], dtype=np.int64)
-    for name, least, capacity in zip(regions.names, minimum.tolist(), regions.capacities.tolist(), strict=True):
-        if not 1 <= least <= capacity:
-            raise ValueError(f"table_minimum of {name!r} is {least}: expected 1 to its capacity, {capacity}")
-    return minimum

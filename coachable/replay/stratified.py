@@ -45,7 +45,7 @@ def allot(batch_size: int, proportions: np.ndarray, available: np.ndarray) -> np
     sharing = available & (proportions > 0)
     counts = np.zeros(len(proportions), dtype=np.int64)
     if not sharing.any():
-        raise ValueError("no table holds enough records to sample from: extend the buffer first (see table_minimum)")
+        raise ValueError("no table holds a record to sample: extend the buffer first")
     if sharing.sum() > batch_size:
         raise ValueError(
             f"a batch of {batch_size} cannot hold a record of each of {sharing.sum()} tables: raise batch_size, or "
@@ -88,7 +88,6 @@ class StratifiedSampler(Sampler):
     Args:
         regions: The tables.
         proportions: `(tables,)` shares that sum to 1.
-        minimum: `(tables,)` records below which a table is left out and the others are renormalised.
         prioritized: Whether to draw within a table in proportion to priorities instead of uniformly.
         alpha: Exponent of the priorities.
         beta: Exponent of the importance weights; may be changed while training.
@@ -99,7 +98,6 @@ class StratifiedSampler(Sampler):
         self,
         regions: Regions,
         proportions: np.ndarray,
-        minimum: np.ndarray,
         prioritized: bool = False,
         alpha: float = 0.6,
         beta: float = 0.4,
@@ -107,7 +105,6 @@ class StratifiedSampler(Sampler):
     ) -> None:
         self.regions = regions
         self.proportions = proportions
-        self.minimum = minimum
         self.prioritized = prioritized
         self.alpha = alpha
         self.beta = beta
@@ -188,7 +185,7 @@ class StratifiedSampler(Sampler):
         self._largest = torch.maximum(self._largest_priority(index.device), priority.max())
 
     def _allot(self, batch_size: int) -> np.ndarray:
-        return allot(batch_size, self.proportions, self.regions.sizes >= self.minimum)
+        return allot(batch_size, self.proportions, self.regions.sizes > 0)
 
     def _plan(self, batch_size: int, device: torch.device) -> _Plan:
         version, plan = self._plans.get((batch_size, device), (-1, None))

@@ -21,7 +21,7 @@ from coachable.training.precision import Precision, resolve_precision
 
 _ADVICE = "Look for extreme rewards or observations, lower the learning rates, or set max_grad_norm."
 
-UpdateOrder = Literal["simultaneous", "policy_first", "critic_first"]
+UpdateOrder = Literal["simultaneous", "policy_first"]
 
 
 class NonFiniteLossError(NonFiniteError):
@@ -40,7 +40,6 @@ class Learner:
       optimisers step, then the target networks move.
     - `"policy_first"` (the paper's racing and combat): the policy steps on `actor_loss`, then the critics on a
       target whose next actions come from the updated policy.
-    - `"critic_first"` (common elsewhere): the critics step, then the policy on the updated critics.
 
     Losses or gradients that are infinite or NaN reach no weight. On a CPU such an update raises. A GPU skips it, and
     the next check raises (see `check_every`).
@@ -161,7 +160,7 @@ class Learner:
         self._follow()
         if self._to_compile:
             self._losses, self._to_compile = compiled(self._losses, self._device_type), False
-        update = self._simultaneous if self.update_order == "simultaneous" else self._sequential
+        update = self._simultaneous if self.update_order == "simultaneous" else self._policy_first
         with self.backend.updating():
             metrics = update(batch)
         self.backend.move_targets()
@@ -301,9 +300,8 @@ class Learner:
         metrics["td_error"] = batch.get("td_error").mean()
         return metrics | _critic_health(outputs)
 
-    def _sequential(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        policy_first = self.update_order == "policy_first"
-        metrics = self._update_actor(batch) if policy_first else {}
+    def _policy_first(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        metrics = self._update_actor(batch)
         with self.backend.evaluating():
             loss_qvalue, extra = self._losses.critic(batch)
         loss_qvalue.backward()
@@ -311,8 +309,6 @@ class Learner:
         metrics |= self._step({"loss_qvalue": loss_qvalue}, "critic")
         batch.set("td_error", extra["td_error"])
         metrics["td_error"] = extra["td_error"].mean()
-        if not policy_first:
-            metrics |= self._update_actor(batch)
         return metrics | _critic_health(extra)
 
     def _update_actor(self, batch: TensorDictBase) -> dict[str, Tensor]:

@@ -474,8 +474,6 @@ BAD_CONSTRUCTIONS = {
         "sum to 1",
     ),
     "proportion names": (dict(table_capacities={"default": 9}, table_proportions={"all": 1.0}), "exactly the tables"),
-    "minimum": (dict(table_capacities={"default": 9}, table_minimum=10), "table_minimum"),
-    "minimum name": (dict(table_capacities={"default": 9}, table_minimum={"all": 1}), "table_minimum"),
     "batch": (dict(events=KeyEvents(["hit"]), event_horizon=1, batch_size=1), "batch of 1"),
     "gamma": (dict(table_capacities={"default": 9}, n_steps=3), "gamma"),
     "gamma range": (dict(table_capacities={"default": 9}, n_steps=3, gamma=1.1), "gamma"),

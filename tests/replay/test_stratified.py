@@ -98,8 +98,8 @@ def test_every_batch_holds_exact_shares():
     assert rb.sampler.counts(33) == {"a": 16, "b": 10, "c": 7}
 
 
-def test_tables_below_their_minimum_are_left_out_and_the_rest_renormalised():
-    rb = filled({"a": 20, "b": 4, "c": 20}, {"a": 0.5, "b": 0.25, "c": 0.25}, table_minimum={"b": 5})
+def test_empty_tables_are_left_out_and_the_rest_renormalised():
+    rb = filled({"a": 20, "b": 0, "c": 20}, {"a": 0.5, "b": 0.25, "c": 0.25})
     assert rb.sample(30)["table"].bincount(minlength=3).tolist() == [20, 0, 10]
     rb.extend(TensorDict({"scenario": torch.tensor([1]), "id": torch.tensor([1004])}, [1]))
     assert rb.sample(30)["table"].bincount(minlength=3).tolist() == [15, 8, 7]

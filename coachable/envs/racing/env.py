@@ -314,11 +314,6 @@ class RacingEnv(EnvBase):
         return Field(*cars, self.course, self.group, self.seeds, self.episode)
 
     @property
-    def telemetry_names(self) -> tuple[str, ...]:
-        """Columns of `telemetry`."""
-        return TELEMETRY
-
-    @property
     def scenario_names(self) -> tuple[str, ...]:
         """What the numbers of `scenario` mean."""
         return tuple(scenario.name for scenario in self.starter.scenarios)

@@ -112,17 +112,6 @@ def load_car(name: str) -> Car:
     return Car(**values, gears=tuple(gears + gears[-1:] * (MAX_GEARS - len(gears))), top_gear=float(len(gears)))
 
 
-def compound_index(name: str) -> int:
-    """Index of a tyre compound in `COMPOUNDS`.
-
-    Raises:
-        ValueError: if there is no such compound.
-    """
-    if name not in COMPOUNDS:
-        raise ValueError(f"unknown tyre compound {name!r}: expected one of {', '.join(COMPOUNDS)}")
-    return COMPOUNDS.index(name)
-
-
 def compound_table() -> Tensor:
     """Grip and wear factors of each compound, (9, 2)."""
     rows = []
