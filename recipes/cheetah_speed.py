@@ -7,13 +7,13 @@ python recipes/cheetah_speed.py loss=cat_rac seed=1       another loss; see --he
 docs/bring_your_own_environment.md goes through this file.
 """
 
-from functools import partial
 from typing import Any
 
 import torch
 from recipe_boxes import (
     make,
     make_collector,
+    make_description,
     make_evaluation,
     make_loss,
     make_replay,
@@ -34,7 +34,7 @@ from coachable.replay import PredicateEvents
 from coachable.styles import Setpoint, SetpointTolerance, StyleReward, StyleSpace
 from coachable.training.episodes import EpisodeSums
 from coachable.training.loop import Train
-from coachable.training.weights import agent_state, initialise_from
+from coachable.training.weights import initialise_from
 from coachable.transforms import CoachableEnv, StyleRewardTransform, StyleSampler, TaskImpersonation
 
 PITCH = 1  # in the suite's position
@@ -144,15 +144,7 @@ def build(config: dict[str, Any]) -> Train:
         replay=replay,
         learner=learner,
         evaluate=make_evaluation(run, make_env, actor),
-        describe=partial(
-            agent_state,
-            domain=cfg.domain,
-            space=space,
-            actor=actor,
-            loss_module=loss,
-            network=network,
-            config=run.config,
-        ),
+        describe=make_description(run, space, actor, loss, network),
         style_terms=style_reward.terms_of,
     )
 

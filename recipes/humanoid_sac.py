@@ -9,12 +9,12 @@ python recipes/humanoid_sac.py resume=runs/mine           continue where it stop
 python recipes/humanoid_sac.py init_from=runs/mine        new training from its actor and critics
 """
 
-from functools import partial
 from typing import Any
 
 from recipe_boxes import (
     make,
     make_collector,
+    make_description,
     make_evaluation,
     make_loss,
     make_replay,
@@ -32,7 +32,7 @@ from coachable.domains.humanoid.mirror_maps import humanoid_mirror_maps
 from coachable.fast import accelerate
 from coachable.training.episodes import EpisodeSums
 from coachable.training.loop import Train
-from coachable.training.weights import agent_state, initialise_from
+from coachable.training.weights import initialise_from
 from coachable.transforms import CoachableEnv, MirrorSymmetry, StyleRewardTransform, StyleSampler, TaskImpersonation
 
 
@@ -83,15 +83,7 @@ def build(config: dict[str, Any]) -> Train:
         replay=replay,
         learner=learner,
         evaluate=make_evaluation(run, make_env, actor),
-        describe=partial(
-            agent_state,
-            domain=cfg.domain,
-            space=space,
-            actor=actor,
-            loss_module=loss,
-            network=network,
-            config=run.config,
-        ),
+        describe=make_description(run, space, actor, loss, network),
         style_terms=style_reward.terms_of,
     )
 

@@ -10,12 +10,12 @@ python recipes/racing_qr_sac.py preset=smoke                   every part once, 
 A preset's stages are trained one after the other; `stage=NAME init_from=RUN` trains one of them.
 """
 
-from functools import partial
 from typing import Any
 
 from recipe_boxes import (
     make,
     make_collector,
+    make_description,
     make_evaluation,
     make_loss,
     make_replay,
@@ -32,7 +32,7 @@ from coachable.domains.racing.families import family_style
 from coachable.fast import accelerate
 from coachable.training.episodes import EpisodeSums
 from coachable.training.loop import Train
-from coachable.training.weights import agent_state, initialise_from
+from coachable.training.weights import initialise_from
 from coachable.transforms import CoachableEnv, StyleRewardTransform, StyleSampler, TaskImpersonation
 
 
@@ -81,15 +81,7 @@ def build(config: dict[str, Any]) -> Train:
         replay=replay,
         learner=learner,
         evaluate=make_evaluation(run, make_env, actor),
-        describe=partial(
-            agent_state,
-            domain=cfg.domain,
-            space=space,
-            actor=actor,
-            loss_module=loss,
-            network=network,
-            config=run.config,
-        ),
+        describe=make_description(run, space, actor, loss, network),
         style_terms=style_reward.terms_of,
     )
 

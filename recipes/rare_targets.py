@@ -9,13 +9,13 @@ each such path would have been worth to somebody who wanted that target.
 """
 
 import math
-from functools import partial
 from typing import Any
 
 import torch
 from recipe_boxes import (
     make,
     make_collector,
+    make_description,
     make_evaluation,
     make_loss,
     make_replay,
@@ -38,7 +38,7 @@ from coachable.styles import StyleReward, StyleSpace, Weight, WeightedFeature
 from coachable.styles.mixtures import style_mixture
 from coachable.training.episodes import EpisodeSums
 from coachable.training.loop import Train
-from coachable.training.weights import agent_state, initialise_from
+from coachable.training.weights import initialise_from
 from coachable.transforms import CoachableEnv, StyleRewardTransform, StyleSampler, TaskImpersonation
 
 TARGETS = 8
@@ -177,15 +177,7 @@ def build(config: dict[str, Any]) -> Train:
         replay=replay,
         learner=learner,
         evaluate=make_evaluation(run, make_env, actor),
-        describe=partial(
-            agent_state,
-            domain=cfg.domain,
-            space=space,
-            actor=actor,
-            loss_module=loss,
-            network=network,
-            config=run.config,
-        ),
+        describe=make_description(run, space, actor, loss, network),
         style_terms=style_reward.terms_of,
     )
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from configs.schema import Settings, typed_settings
 from hydra.utils import instantiate
 from recipe_config import save_config
 from tensordict import NestedKey
+from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.collectors import BaseCollector
 from torchrl.data import ReplayBuffer
@@ -28,6 +30,7 @@ from coachable.training.logging import MetricsLog, Progress, wandb_logger
 from coachable.training.loop import Train, replay_keys
 from coachable.training.rng import seed_everything
 from coachable.training.settings import TrainSettings
+from coachable.training.weights import agent_state
 from coachable.transforms import MirrorSymmetry
 
 
@@ -190,6 +193,21 @@ def make_evaluation(run: Run, make_env: Callable[..., EnvBase], actor: nn.Module
         return evaluate_policy(env, actor, max_steps=settings.eval.max_steps, device=run.device)
 
     return evaluate
+
+
+def make_description(
+    run: Run, space: StyleSpace, actor: TensorDictModuleBase, loss: LossModule, network: dict[str, dict[str, Any]]
+) -> Callable[[], dict[str, Any]]:
+    """Return a function that gathers what identifies the agent, for checkpoints; see `agent_state`."""
+    return partial(
+        agent_state,
+        domain=run.settings.domain,
+        space=space,
+        actor=actor,
+        loss_module=loss,
+        network=network,
+        config=run.config,
+    )
 
 
 def open_run_dir(run: Run, env: EnvBase, replay: ReplayBuffer) -> Path:

@@ -30,7 +30,7 @@ def composed_stages(cfg: DictConfig, said: Mapping[str, Any]) -> list[dict[str, 
             raise ValueError(f"a stage has no name: expected {{name: NAME, total_frames: N, ...}}, got {change}")
         if "total_frames" in change:
             change.setdefault("train", {})["total_frames"] = change.pop("total_frames")
-        known = {str(key) for key in cfg} - {"run_dir", "resume", "init_from", "stage", "stages", "hydra"}
+        known = {str(key) for key in cfg}.difference(_OF_THE_RUN) | {"init_new_observations"}
         if unknown := sorted(set(change) - known):
             raise ValueError(
                 f"stage {name} changes {', '.join(unknown)}: expected name, total_frames, {', '.join(sorted(known))}"
