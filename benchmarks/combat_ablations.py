@@ -33,8 +33,8 @@ from coachable.evaluation.curves import read_metric, summarise_runs
 from coachable.evaluation.statistics import bootstrap_interval
 from coachable.evaluation.style_grid import write_csv
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
-from coachable.training.loop import Train
 from coachable.training.rng import preserved_rng
+from coachable.training.trainer import Trainer
 from coachable.training.weights import LoadedPolicy
 
 VARIANTS: dict[str, list[str]] = {
@@ -96,7 +96,7 @@ def train(variant: str, seed: int, run_dir: Path, args: argparse.Namespace) -> N
         shutil.rmtree(replay)
 
 
-def evaluation(training: Train, config: dict[str, Any], episodes: int) -> Callable[[], Mapping[str, float]]:
+def evaluation(training: Trainer, config: dict[str, Any], episodes: int) -> Callable[[], Mapping[str, float]]:
     """Style scores and wins, by style, as `coachable evaluate` measures them."""
     domain = load_domain("combat", config)
     space = domain.make_space()

@@ -13,7 +13,7 @@ def physics(num_cars: int, compiled: bool, device: str) -> Callable[[], Any]:
     """The cars alone, from the same state over and over: neither track nor task."""
     import torch
 
-    from coachable.envs.racing.physics.parameters import Resources, load_car
+    from coachable.envs.racing.physics.cars import Resources, load_car
     from coachable.envs.racing.physics.simulation import Simulation
     from coachable.envs.racing.physics.state import HEATS, INPUT_ROWS, ROW, SPINS, STATE_ROWS, CarInputs
 
@@ -34,7 +34,7 @@ def physics(num_cars: int, compiled: bool, device: str) -> Callable[[], Any]:
 def make_env(num_cars: int, compiled: bool, device: str, cars: int) -> Any:
     """Races of `cars` cars, at most `num_cars` in all; wear and fuel as in the trainings."""
     from coachable.envs.racing import RacingEnv
-    from coachable.envs.racing.physics.parameters import Resources
+    from coachable.envs.racing.physics.cars import Resources
 
     resources = Resources(9.0, 3.0)
     return RacingEnv(

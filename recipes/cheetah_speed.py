@@ -33,7 +33,7 @@ from coachable.keys import STYLE_FEATURES, TASK_REWARD
 from coachable.replay import PredicateEvents
 from coachable.styles import Setpoint, SetpointTolerance, StyleReward, StyleSpace
 from coachable.training.episodes import EpisodeSums
-from coachable.training.loop import Train
+from coachable.training.trainer import Trainer
 from coachable.training.weights import initialise_from
 from coachable.transforms import CoachableEnv, StyleRewardTransform, StyleSampler, TaskImpersonation
 
@@ -99,7 +99,7 @@ def cheetah_events() -> PredicateEvents:
     return PredicateEvents({"fast": lambda steps: steps["next", STYLE_FEATURES][..., SPEED] > 2.5})
 
 
-def build(config: dict[str, Any]) -> Train:
+def build(config: dict[str, Any]) -> Trainer:
     """Compose the training, one box after the other."""
     run = start_run(config)
     cfg = run.settings

@@ -31,12 +31,12 @@ from torchrl.envs import Compose, EnvBase
 from coachable.domains.combat import combat_style_reward, combat_style_space
 from coachable.fast import accelerate
 from coachable.training.episodes import EpisodeSums
-from coachable.training.loop import Train
+from coachable.training.trainer import Trainer
 from coachable.training.weights import initialise_from
 from coachable.transforms import CoachableEnv, StyleRewardTransform, StyleSampler, TaskImpersonation
 
 
-def build(config: dict[str, Any]) -> Train:
+def build(config: dict[str, Any]) -> Trainer:
     """Compose the training, one box after the other."""
     run = start_run(config)
     cfg = run.settings

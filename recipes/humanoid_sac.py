@@ -31,12 +31,12 @@ from coachable.domains.humanoid import humanoid_style_reward, humanoid_style_spa
 from coachable.domains.humanoid.mirror_maps import humanoid_mirror_maps
 from coachable.fast import accelerate
 from coachable.training.episodes import EpisodeSums
-from coachable.training.loop import Train
+from coachable.training.trainer import Trainer
 from coachable.training.weights import initialise_from
 from coachable.transforms import CoachableEnv, MirrorSymmetry, StyleRewardTransform, StyleSampler, TaskImpersonation
 
 
-def build(config: dict[str, Any]) -> Train:
+def build(config: dict[str, Any]) -> Trainer:
     """Compose the training, one box after the other."""
     run = start_run(config)
     cfg = run.settings

@@ -37,7 +37,7 @@ from coachable.replay import KeyEvents
 from coachable.styles import StyleReward, StyleSpace, Weight, WeightedFeature
 from coachable.styles.mixtures import style_mixture
 from coachable.training.episodes import EpisodeSums
-from coachable.training.loop import Train
+from coachable.training.trainer import Trainer
 from coachable.training.weights import initialise_from
 from coachable.transforms import CoachableEnv, StyleRewardTransform, StyleSampler, TaskImpersonation
 
@@ -132,7 +132,7 @@ def target_events() -> KeyEvents:
     return KeyEvents(NAMES)
 
 
-def build(config: dict[str, Any]) -> Train:
+def build(config: dict[str, Any]) -> Trainer:
     """Compose the training, one box after the other."""
     run = start_run(config)
     cfg = run.settings

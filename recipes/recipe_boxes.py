@@ -27,9 +27,9 @@ from coachable.training.checkpoint import CheckpointStore, check_unused, check_w
 from coachable.training.collection import evaluate_policy, simulation_env
 from coachable.training.hardware import pick_device, share_threads
 from coachable.training.logging import MetricsLog, Progress, wandb_logger
-from coachable.training.loop import Train, replay_keys
 from coachable.training.rng import seed_everything
-from coachable.training.settings import TrainSettings
+from coachable.training.train_settings import TrainSettings
+from coachable.training.trainer import Trainer, replay_keys
 from coachable.training.weights import agent_state
 from coachable.transforms import MirrorSymmetry
 
@@ -243,17 +243,17 @@ def _has_scenario_tables(settings: Settings) -> bool:
     return settings.replay["_target_"].endswith(".for_scenarios")
 
 
-def make_trainer(run: Run, run_dir: Path, env: EnvBase, **parts: Any) -> Train:
+def make_trainer(run: Run, run_dir: Path, env: EnvBase, **parts: Any) -> Trainer:
     """Make the training loop with its log and its checkpoints; a resumed run continues where it stopped.
 
     Args:
         run: The training.
         run_dir: Its folder.
         env: One environment, which is closed.
-        **parts: Collector, replay, learner and the other arguments of `Train`.
+        **parts: Collector, replay, learner and the other arguments of `Trainer`.
     """
     settings = run.settings
-    trainer = Train(
+    trainer = Trainer(
         settings=run.loop,
         log=MetricsLog(run_dir, wandb_logger(settings.domain, run_dir, **run.config["wandb"])),
         progress=Progress(settings.train.total_frames),

@@ -29,7 +29,7 @@ from coachable.finite import NonFiniteError
 from coachable.training.checkpoint import find_checkpoint, read_state
 from coachable.training.curriculum import Curriculum
 from coachable.training.hardware import choose_preset, detect, estimate_update_seconds, pick_device
-from coachable.training.loop import Train
+from coachable.training.trainer import Trainer
 
 # What a checkpoint decides: its weights, its replay buffer and its generators belong to these values.
 _FIXED = (
@@ -78,7 +78,7 @@ OmegaConf.register_new_resolver(  # for --help
 )
 
 
-def run_recipe(config_name: str, build: Callable[[dict[str, Any]], Train]) -> None:
+def run_recipe(config_name: str, build: Callable[[dict[str, Any]], Trainer]) -> None:
     """Runs a recipe from the command line.
 
     Args:
@@ -173,7 +173,7 @@ def _composed(config_name: str, *choices: str) -> DictConfig:
         return hydra.compose(config_name, list(choices))
 
 
-def start_training(build: Callable[[dict[str, Any]], Train], config: dict[str, Any]) -> Train | Curriculum:
+def start_training(build: Callable[[dict[str, Any]], Trainer], config: dict[str, Any]) -> Trainer | Curriculum:
     """Make a training, or one in stages where the configuration lists any, and say what was chosen."""
     if config.get("stages"):
         return Curriculum(config, lambda stage: build_checked(build, stage), announce)
@@ -182,7 +182,7 @@ def start_training(build: Callable[[dict[str, Any]], Train], config: dict[str, A
     return train
 
 
-def build_checked(build: Callable[[dict[str, Any]], Train], config: dict[str, Any]) -> Train:
+def build_checked(build: Callable[[dict[str, Any]], Trainer], config: dict[str, Any]) -> Trainer:
     """Builds a training; a saved configuration that makes none is refused with a sentence.
 
     Raises:
@@ -255,7 +255,7 @@ def _chosen_stage(cfg: DictConfig, stages: list[dict[str, Any]]) -> DictConfig:
     return OmegaConf.create({**chosen, "stages": stages if cfg.stage is None else []})
 
 
-def announce(config: dict[str, Any], train: Train) -> None:
+def announce(config: dict[str, Any], train: Trainer) -> None:
     """Says what was chosen and about how long it will take."""
     parameters = sum(p.numel() for p in train.learner.loss_module.actor_network_params.parameters())
     bf16 = train.learner.precision == "bf16"

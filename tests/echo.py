@@ -18,8 +18,8 @@ from coachable.training.checkpoint import CheckpointStore
 from coachable.training.collection import make_collector
 from coachable.training.episodes import EpisodeSums
 from coachable.training.logging import MetricsLog, Progress
-from coachable.training.loop import Train
-from coachable.training.settings import TrainSettings
+from coachable.training.train_settings import TrainSettings
+from coachable.training.trainer import Trainer
 from coachable.training.weights import agent_state
 from coachable.transforms import CoachableEnv, coachable_env
 
@@ -132,7 +132,7 @@ def make_train(
     actor_lr: float = 1e-3,
     make_env: Callable[..., Any] = make_echo_env,
     **settings: Any,
-) -> Train:
+) -> Trainer:
     """Makes a small training on one thread; `settings` are those of `TrainSettings`."""
     torch.set_num_threads(1)
     torch.manual_seed(seed)
@@ -146,7 +146,7 @@ def make_train(
     network = {"actor": {"_target_": "coachable.networks.make_gaussian_actor", "obs_dim": 3, "action_dim": 1}}
     network["actor"]["widths"] = [width]
     defaults = {"batch_size": 16, "warmup_frames": 40, "utd_ratio": 0.25, "checkpoint_interval": 1e9}
-    return Train(
+    return Trainer(
         collector=make_collector(
             lambda s: make_env(s, num_envs, resumable=resumable),
             actor,

@@ -33,7 +33,7 @@ import numpy as np
 import torch
 
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
-from coachable.training.loop import Train
+from coachable.training.trainer import Trainer
 
 RECIPES = Path(__file__).resolve().parent.parent / "recipes"
 PARTS = ("start", "collect", "store", "update", "evaluate", "log", "checkpoint", "wait", "between")
@@ -46,7 +46,7 @@ INTERVALS = {"log_interval": 0.2, "checkpoint_interval": 0.2}  # [s]
 
 _FOREVER = float("inf")
 
-Make = Callable[[Path | None], Train]
+Make = Callable[[Path | None], Trainer]
 """Makes a training, resumed from a folder where one is given."""
 
 
@@ -169,7 +169,7 @@ def _wait(child: int, delay: float) -> int:
     return os.waitpid(child, 0)[1]
 
 
-def _publish_part(train: Train, part: mmap.mmap) -> Train:
+def _publish_part(train: Trainer, part: mmap.mmap) -> Trainer:
     """Lets the parent process see which part of the loop is being run."""
     timed = train._timed
 
@@ -233,7 +233,7 @@ def _equal(a: Any, b: Any) -> bool:
 # -- recipes -----------------------------------------------------------------------------------------------------------
 
 
-def make_recipe(recipe: str, run_dir: Path, arguments: list[str], resume: Path | None) -> Train:
+def make_recipe(recipe: str, run_dir: Path, arguments: list[str], resume: Path | None) -> Trainer:
     """Builds a recipe's training as its command line does."""
     from recipe_config import compose_config
 

@@ -17,8 +17,8 @@ from coachable.training import Learner
 from coachable.training.collection import evaluate_policy, make_collector
 from coachable.training.episodes import EpisodeSums
 from coachable.training.logging import MetricsLog, Progress
-from coachable.training.loop import Train
-from coachable.training.settings import TrainSettings
+from coachable.training.train_settings import TrainSettings
+from coachable.training.trainer import Trainer
 from coachable.transforms import coachable_env
 
 gymnasium = pytest.importorskip("gymnasium")
@@ -330,7 +330,7 @@ def test_training_on_a_gymnasium_environment(tmp_path):
         actor, critics, action_spec=make_env(0).action_spec[0], loss_function="l2", fixed_alpha=True, alpha_init=0.01
     )
     loss.make_value_estimator(gamma=0.9)
-    Train(
+    Trainer(
         collector=make_collector(make_env, actor, frames_per_batch=16, init_random_frames=200),
         replay=TensorDictReplayBuffer(storage=LazyTensorStorage(5000)),
         learner=Learner(loss, actor_lr=3e-3, critic_lr=3e-3, precision="fp32"),

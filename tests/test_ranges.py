@@ -19,8 +19,8 @@ from coachable.replay.n_step import NStep
 from coachable.training import Learner
 from coachable.training.checkpoint import CheckpointStore
 from coachable.training.hardware import share_threads
-from coachable.training.settings import TrainSettings
 from coachable.training.throttle import Throttle
+from coachable.training.train_settings import TrainSettings
 from coachable.transforms import MirrorSymmetry
 from tests.sac_problem import make_loss
 

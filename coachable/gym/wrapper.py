@@ -13,7 +13,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from coachable.gym.features import Features, checked_features, flat_observation
+from coachable.gym.checked_features import Features, checked_features, flat_observation
 from coachable.keys import STYLE, STYLE_REWARD, TASK_REWARD
 from coachable.styles import Sampler, StyleReward
 from coachable.transforms.style_sampler import derive_seed

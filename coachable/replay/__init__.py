@@ -1,7 +1,8 @@
 """Stratified replay: multi-tables and event tables (paper, Stratified Sampling)."""
 
 from coachable.replay.event_tables import EventTableBuffer
-from coachable.replay.events import (
+from coachable.replay.n_step import NStep
+from coachable.replay.routing import (
     EventPredicate,
     KeyEvents,
     KeyRoute,
@@ -10,7 +11,6 @@ from coachable.replay.events import (
     Route,
     StyleEvents,
 )
-from coachable.replay.n_step import NStep
 from coachable.replay.stratified import StratifiedSampler
 from coachable.replay.sum_tree import SumTree
 

@@ -12,11 +12,11 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from coachable.files import load_state, save_state
 from coachable.ranges import NOT_NEGATIVE, Range
-from coachable.replay.events import EventPredicate, KeyRoute, Route, StyleEvents
-from coachable.replay.files import read_records, write_records
 from coachable.replay.n_step import NStep
-from coachable.replay.settings import checked_horizon, checked_proportions, make_regions
+from coachable.replay.records import read_records, write_records
+from coachable.replay.routing import EventPredicate, KeyRoute, Route, StyleEvents
 from coachable.replay.stratified import StratifiedSampler, allot
+from coachable.replay.table_settings import checked_horizon, checked_proportions, make_regions
 from coachable.replay.table_writer import TableWriter
 
 __all__ = ["EventTableBuffer"]
@@ -40,7 +40,7 @@ class EventTableBuffer(TensorDictReplayBuffer):
 
     Args:
         table_capacities: Records per table, by name: routed tables and event tables.
-        events: Which event tables there are and when their events fire (`coachable.replay.events`).
+        events: Which event tables there are and when their events fire (`coachable.replay.routing`).
         event_horizon: H_max, steps stored per event, the event step included. Needed with `events`.
         route: Which routed tables there are and where each step goes; without it there is one, "default".
         table_proportions: Share of each table in a batch. By default event tables share one half equally, routed tables

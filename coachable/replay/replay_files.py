@@ -10,7 +10,7 @@ from torchrl.envs import EnvBase
 
 from coachable.files import load_state, refusing, save_state
 from coachable.replay import EventTableBuffer
-from coachable.replay.files import read_records, write_records
+from coachable.replay.records import read_records, write_records
 
 __all__ = ["read_replay", "replay_bytes", "write_replay"]
 

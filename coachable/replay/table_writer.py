@@ -10,9 +10,9 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage, Writer
 
 from coachable.keys import TABLE
-from coachable.replay.events import EventPredicate, Route, checked_events, checked_route
 from coachable.replay.n_step import NStep
 from coachable.replay.regions import Regions
+from coachable.replay.routing import EventPredicate, Route, checked_events, checked_route
 from coachable.replay.steps import Steps, flatten_time_major, read_steps
 from coachable.replay.windows import Copies, WindowHistory
 

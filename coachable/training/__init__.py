@@ -9,9 +9,9 @@ if TYPE_CHECKING:
     from coachable.training.episodes import EpisodeSums
     from coachable.training.learner import Learner, NonFiniteLossError
     from coachable.training.logging import MetricsLog, Progress
-    from coachable.training.loop import Train
     from coachable.training.precision import resolve_precision, supports_bf16
-    from coachable.training.settings import TrainSettings
+    from coachable.training.train_settings import TrainSettings
+    from coachable.training.trainer import Trainer
     from coachable.training.weights import agent_state
 
 # Resolved on first use, so that one part does not load the others.
@@ -22,8 +22,8 @@ _MODULE_OF = {
     "MetricsLog": "coachable.training.logging",
     "NonFiniteLossError": "coachable.training.learner",
     "Progress": "coachable.training.logging",
-    "Train": "coachable.training.loop",
-    "TrainSettings": "coachable.training.settings",
+    "Trainer": "coachable.training.trainer",
+    "TrainSettings": "coachable.training.train_settings",
     "agent_state": "coachable.training.weights",
     "make_collector": "coachable.training.collection",
     "resolve_precision": "coachable.training.precision",
@@ -37,8 +37,8 @@ __all__ = [
     "MetricsLog",
     "NonFiniteLossError",
     "Progress",
-    "Train",
     "TrainSettings",
+    "Trainer",
     "agent_state",
     "make_collector",
     "resolve_precision",

@@ -29,7 +29,7 @@ from coachable.files import (
     tensor_bytes,
     write_text,
 )
-from coachable.replay.files import record_bytes
+from coachable.replay.records import record_bytes
 from coachable.replay.replay_files import write_replay
 
 __all__ = [

@@ -7,7 +7,7 @@ from typing import Any
 
 from coachable.training.checkpoint import CheckpointError, check_unused, find_checkpoint, read_state
 from coachable.training.hardware import share_threads
-from coachable.training.loop import Train
+from coachable.training.trainer import Trainer
 
 __all__ = ["Curriculum"]
 
@@ -33,8 +33,8 @@ class Curriculum:
     def __init__(
         self,
         config: Mapping[str, Any],
-        build: Callable[[dict[str, Any]], Train],
-        announce: Callable[[dict[str, Any], Train], None] = lambda config, train: None,
+        build: Callable[[dict[str, Any]], Trainer],
+        announce: Callable[[dict[str, Any], Trainer], None] = lambda config, train: None,
     ) -> None:
         self.run_dir = Path(config["run_dir"])
         self.stages = _checked_stages(config["stages"])
@@ -72,7 +72,7 @@ class Curriculum:
         """Return the folder of a stage, which are counted from 0 here and from 1 in names."""
         return self.run_dir / "stages" / f"{number + 1}_{self.stages[number]['stage']}"
 
-    def _start(self, resume: str | None) -> Train:
+    def _start(self, resume: str | None) -> Trainer:
         first = self.number == 0
         init_from = self._init_from if first else str(self.folder(self.number - 1))
         config = {

@@ -16,8 +16,8 @@ from coachable.finite import NonFiniteError
 from coachable.ranges import AMOUNT, NOT_NEGATIVE, POSITIVE, Range
 from coachable.training.backend import Backend
 from coachable.training.loss_functions import check_loss, compiled, loss_functions
-from coachable.training.parameters import Watch, adopt_actor, follow, loaded, share_actor, trained_parameters
 from coachable.training.precision import Precision, resolve_precision
+from coachable.training.trained_parameters import Watch, adopt_actor, follow, loaded, share_actor, trained_parameters
 
 _ADVICE = "Look for extreme rewards or observations, lower the learning rates, or set max_grad_norm."
 

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 
 from coachable.domains.racing.families import racing_family
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
-from coachable.training.loop import REPLAY_KEYS
+from coachable.training.trainer import REPLAY_KEYS
 
 RECIPES = sorted(file.stem for file in (Path(__file__).resolve().parents[2] / "recipes" / "configs").glob("*_*.yaml"))
 TINY = ["preset=smoke", "env.num_envs=2", "threads.simulator=1", "threads.learner=1", "train.eval_interval=0"]

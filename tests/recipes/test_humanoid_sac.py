@@ -16,7 +16,7 @@ from coachable.domains.humanoid import humanoid_style_reward
 from coachable.envs.humanoid import HumanoidEnv
 from coachable.training import Learner
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
-from coachable.training.settings import TrainSettings
+from coachable.training.train_settings import TrainSettings
 from coachable.training.weights import load_policy
 
 REPOSITORY = Path(__file__).resolve().parents[2]

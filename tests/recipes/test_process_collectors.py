@@ -19,7 +19,7 @@ def quick_starts():
     """Workers start in a moment as copies of a process that has imported what they need; by default each imports it."""
     before = multiprocessing.get_start_method(allow_none=True)
     multiprocessing.set_start_method("forkserver", force=True)
-    multiprocessing.set_forkserver_preload(["coachable.training.loop", "torchrl.collectors", "gymnasium", *RECIPES])
+    multiprocessing.set_forkserver_preload(["coachable.training.trainer", "torchrl.collectors", "gymnasium", *RECIPES])
     yield
     multiprocessing.set_start_method(before, force=True)
 

@@ -9,7 +9,7 @@ from recipe_config import compose_config, start_training
 
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
 from coachable.training.curriculum import Curriculum
-from coachable.training.loop import Train
+from coachable.training.trainer import Trainer
 from tests.random_kills import differences
 
 TINY = ["preset=smoke", "threads.simulator=1", "threads.learner=1", "train.eval_interval=16", "eval.max_steps=3"]
@@ -30,17 +30,17 @@ def start(*arguments):
 def test_a_training_that_is_killed_in_a_stage_ends_like_an_uninterrupted_one(at, tmp_path, monkeypatch):
     monkeypatch.setattr(os, "fsync", lambda _: None)
     start(*TINY, STAGES, f"run_dir={tmp_path / 'whole'}").run()
-    store = Train._store
+    store = Trainer._store
 
     def die(train, data):
         if (train.describe()["config"]["stage"], train.frames) == at:
             raise Killed
         store(train, data)
 
-    monkeypatch.setattr(Train, "_store", die)
+    monkeypatch.setattr(Trainer, "_store", die)
     with pytest.raises(Killed):
         start(*TINY, STAGES, f"run_dir={tmp_path / 'killed'}").run()
-    monkeypatch.setattr(Train, "_store", store)
+    monkeypatch.setattr(Trainer, "_store", store)
     start(f"resume={tmp_path / 'killed'}").run()
     for stage in ("1_first", "2_second"):
         found = differences(tmp_path / "killed" / "stages" / stage, tmp_path / "whole" / "stages" / stage)

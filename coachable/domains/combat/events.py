@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from coachable.domains.combat.styles import combat_style_space
-from coachable.replay.events import StyleEvents
+from coachable.replay.routing import StyleEvents
 
 
 def combat_events(

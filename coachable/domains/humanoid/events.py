@@ -5,7 +5,7 @@ from torch import Tensor
 
 from coachable.envs.humanoid.features import COMPLETED
 from coachable.keys import STYLE_FEATURES
-from coachable.replay.events import PredicateEvents
+from coachable.replay.routing import PredicateEvents
 
 
 def humanoid_events() -> PredicateEvents:

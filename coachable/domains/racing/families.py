@@ -17,7 +17,7 @@ from coachable.domains.racing.styles import (
 from coachable.envs.racing.circuit.circuits import load_track
 from coachable.envs.racing.circuit.track import Track
 from coachable.envs.racing.env import RacingEnv
-from coachable.envs.racing.physics.parameters import Resources, load_car
+from coachable.envs.racing.physics.cars import Resources, load_car
 from coachable.envs.racing.race.driver import LineFollower
 from coachable.envs.racing.race.rivals import Rivals
 from coachable.envs.racing.race.scenarios import Conditions, drift_scenarios, race_scenarios

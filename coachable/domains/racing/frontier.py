@@ -23,7 +23,7 @@ from coachable.envs.racing.circuit.circuits import load_track
 from coachable.envs.racing.circuit.line import minimum_curvature_line
 from coachable.envs.racing.circuit.profile import Envelope
 from coachable.envs.racing.circuit.track import Track
-from coachable.envs.racing.physics.parameters import Car, Resources, load_car
+from coachable.envs.racing.physics.cars import Car, Resources, load_car
 from coachable.envs.racing.physics.powertrain import (
     ENGINE_EFFICIENCY,
     FRICTION_SHARE,

@@ -16,7 +16,7 @@ from coachable.domains.racing.frontier import TANK, WORN, sweep
 from coachable.domains.racing.metrics import TelemetryMeasures
 from coachable.domains.racing.traffic import draw_traffic, race_in_traffic, traffic_report, traffic_response
 from coachable.envs.racing.circuit.circuits import load_track
-from coachable.envs.racing.physics.parameters import Resources
+from coachable.envs.racing.physics.cars import Resources
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
 from coachable.envs.racing.race.scenarios import Conditions, Scenario
 from coachable.evaluation.evaluation_settings import EvaluationSettings

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 from coachable.envs.racing.circuit.circuits import load_track
 from coachable.envs.racing.circuit.profile import Envelope, speed_profile
 from coachable.envs.racing.circuit.track import Course, Track
-from coachable.envs.racing.physics.parameters import Resources, compound_table
+from coachable.envs.racing.physics.cars import Resources, compound_table
 from coachable.envs.racing.physics.simulation import SUBSTEPS, Simulation, maybe_compile
 from coachable.envs.racing.physics.state import STATE_ROWS
 from coachable.envs.racing.race.features import style_features_size

@@ -47,7 +47,7 @@ def train(run: Path, frames: int = 20_000) -> None:
     network = {"actor": {"_target_": "coachable.networks.make_gaussian_actor", **sizes}}
     agent = {"domain": DOMAIN.name, "space": space, "actor": actor, "loss_module": loss, "network": network}
     styled = partial(DOMAIN.styled_env, space, 8, transforms=[training.EpisodeSums()])
-    training.Train(
+    training.Trainer(
         collector=training.make_collector(styled, actor, frames_per_batch=8, init_random_frames=200),
         replay=TensorDictReplayBuffer(storage=LazyTensorStorage(100_000), transform=relabel),
         learner=training.Learner(loss),

@@ -18,7 +18,7 @@ from coachable.domains.racing.races import _count, _overtakes, _pair_results, ev
 from coachable.domains.racing.stints import _stint, evaluate_resources, range_at
 from coachable.domains.racing.traffic import race_in_traffic, traffic_report, traffic_response
 from coachable.envs.racing.circuit.circuits import load_track
-from coachable.envs.racing.physics.parameters import load_car
+from coachable.envs.racing.physics.cars import load_car
 from coachable.envs.racing.race.driver import LineFollower
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.statistics import wilson_interval

@@ -11,7 +11,7 @@ from coachable.domains.racing import frontier
 from coachable.domains.racing.frontier import SPEEDS, TANK, THROTTLE, WORN, LapProgramme
 from coachable.envs.racing.circuit.circuits import load_track
 from coachable.envs.racing.circuit.profile import Envelope, lap_time, speed_profile
-from coachable.envs.racing.physics.parameters import Resources, load_car
+from coachable.envs.racing.physics.cars import Resources, load_car
 from coachable.envs.racing.physics.powertrain import drive_wheels
 from coachable.envs.racing.race.driver import line_geometry
 

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from coachable.envs.racing.physics.cars import Resources, load_car
 from coachable.envs.racing.physics.dynamics import WheelSet, substep
-from coachable.envs.racing.physics.parameters import Resources, load_car
 from coachable.envs.racing.physics.state import HEATS, INPUT_ROWS, ROW, SPINS, STATE_ROWS, CarInputs
 
 INPUT = {name: row for row, name in enumerate(CarInputs._fields)}

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from coachable.envs.racing.physics.cars import Car, Resources, car_pool, load_car
 from coachable.envs.racing.physics.dynamics import GRAVITY, WheelSet, substep, total_mass
-from coachable.envs.racing.physics.parameters import Car, Resources, car_pool, load_car
 from coachable.envs.racing.physics.powertrain import FUEL_DENSITY, gear_ratio
 from coachable.envs.racing.physics.state import HEATS, ROW, SPINS, WEARS
 from coachable.envs.racing.physics.tyres import roll_wheel, slip_curve, wear_factor

@@ -15,7 +15,7 @@ from coachable.domains.racing import (
     resource_style_space,
 )
 from coachable.envs.racing import RacingEnv
-from coachable.envs.racing.physics.parameters import Resources
+from coachable.envs.racing.physics.cars import Resources
 from coachable.envs.racing.physics.state import HEATS, ROW, WEARS
 from coachable.envs.racing.race.counter_rng import normal, uniforms
 from coachable.envs.racing.race.driver import LineFollower

@@ -11,9 +11,9 @@ import torch
 from coachable.envs.racing import RacingEnv
 from coachable.envs.racing.circuit.circuits import load_track
 from coachable.envs.racing.circuit.track import Course
+from coachable.envs.racing.physics.cars import CARS, load_car
 from coachable.envs.racing.physics.contact import Bodies
 from coachable.envs.racing.physics.dynamics import AIR_DENSITY, GRAVITY, WheelSet, total_mass, wheel_loads
-from coachable.envs.racing.physics.parameters import CARS, load_car
 from coachable.envs.racing.physics.state import HEATS, ROW, SPINS, WEARS, CarState
 from coachable.envs.racing.race.observation import opponents_seen, own_car, own_columns
 from coachable.envs.racing.race.rescue import RESCUE_SPEED, back_on_track

@@ -10,7 +10,7 @@ from coachable.envs.racing.circuit.circuits import CIRCUITS, generate_track, loa
 from coachable.envs.racing.circuit.line import minimum_curvature_line
 from coachable.envs.racing.circuit.profile import Envelope, cornering_speed, lap_time, speed_profile
 from coachable.envs.racing.circuit.track import Course, Track, clearance
-from coachable.envs.racing.physics.parameters import load_car
+from coachable.envs.racing.physics.cars import load_car
 from coachable.envs.racing.race.driver import line_geometry
 
 

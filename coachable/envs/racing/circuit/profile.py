@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from coachable.envs.racing.physics.cars import Car
 from coachable.envs.racing.physics.dynamics import AIR_DENSITY, GRAVITY
-from coachable.envs.racing.physics.parameters import Car
 from coachable.envs.racing.physics.powertrain import FUEL_DENSITY
 
 LOAD_TRANSFER = 0.96  # share of the ideal grip that is left when the load shifts between wheels

@@ -21,7 +21,7 @@ from coachable.envs.racing.physics.body import (
     wheel_force,
     wheel_velocity,
 )
-from coachable.envs.racing.physics.parameters import Car, Resources
+from coachable.envs.racing.physics.cars import Car, Resources
 from coachable.envs.racing.physics.powertrain import FUEL_DENSITY, differential, drive_wheels, driven
 from coachable.envs.racing.physics.state import HEATS, SPINS, WEARS, CarInputs, CarState
 from coachable.envs.racing.physics.surface import (

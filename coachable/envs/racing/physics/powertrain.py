@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from coachable.envs.racing.physics.parameters import MAX_GEARS, Car, Resources
+from coachable.envs.racing.physics.cars import MAX_GEARS, Car, Resources
 
 SHIFT_TIME = 0.05  # [s] of torque cut
 FUEL_DENSITY = 0.745  # [kg/l]

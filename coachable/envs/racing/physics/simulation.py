@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 from torch.compiler import nested_compile_region
 
+from coachable.envs.racing.physics.cars import Car, Resources
 from coachable.envs.racing.physics.contact import Bodies, collide
 from coachable.envs.racing.physics.dynamics import WheelSet, substep, total_mass
-from coachable.envs.racing.physics.parameters import Car, Resources
 from coachable.envs.racing.physics.state import ROW
 
 CONTROL_STEP = 0.1  # [s]

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from coachable.envs.racing.circuit.profile import Envelope, speed_profile
 from coachable.envs.racing.circuit.track import Track
+from coachable.envs.racing.physics.cars import Car
 from coachable.envs.racing.physics.dynamics import total_mass
-from coachable.envs.racing.physics.parameters import Car
 from coachable.envs.racing.physics.state import CarState
 from coachable.envs.racing.physics.tyres import tangent
 from coachable.envs.racing.race.run import Field, Run, TyreView, look_around, tyre_view

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from coachable.envs.racing.physics.parameters import Car, car_pool, load_car
+from coachable.envs.racing.physics.cars import Car, car_pool, load_car
 from coachable.envs.racing.race.counter_rng import uniforms
 
 POOL = "pool"

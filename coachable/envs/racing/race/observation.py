@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from coachable.envs.racing.circuit.track import Course
+from coachable.envs.racing.physics.cars import COMPOUNDS, Car
 from coachable.envs.racing.physics.contact import Bodies, partner
 from coachable.envs.racing.physics.dynamics import WheelSet
-from coachable.envs.racing.physics.parameters import COMPOUNDS, Car
 from coachable.envs.racing.physics.powertrain import engine_speed, full_torque, gear_ratio
 from coachable.envs.racing.physics.state import HEATS, SPINS, WEARS, CarState
 from coachable.envs.racing.race.run import Others, Run, TyreView

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from coachable.envs.racing.circuit.track import Course
+from coachable.envs.racing.physics.cars import Car
 from coachable.envs.racing.physics.dynamics import WheelSet
-from coachable.envs.racing.physics.parameters import Car
 from coachable.envs.racing.physics.simulation import CONTROL_STEP, bodies_of
 from coachable.envs.racing.physics.state import HEATS, ROW, WEARS, CarInputs, CarState
 from coachable.envs.racing.physics.surface import beyond

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from coachable.envs.racing.circuit.track import Course
-from coachable.envs.racing.physics.parameters import Car
+from coachable.envs.racing.physics.cars import Car
 from coachable.envs.racing.physics.state import HEATS, ROW, WEARS
 from coachable.envs.racing.race.run import Run, look_around, others_of
 from coachable.envs.racing.race.scenarios import rolling_cars

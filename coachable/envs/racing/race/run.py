@@ -9,8 +9,8 @@ from torch import Tensor
 
 from coachable.envs.racing.circuit.track import Course
 from coachable.envs.racing.physics.body import rotate, wheel_velocity
+from coachable.envs.racing.physics.cars import Car
 from coachable.envs.racing.physics.dynamics import WheelSet, steering, wheel_grip, wheel_loads
-from coachable.envs.racing.physics.parameters import Car
 from coachable.envs.racing.physics.state import HEATS, SPINS, WEARS, CarState
 from coachable.envs.racing.physics.tyres import SLIP_SPEED
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from coachable.envs.racing.circuit.track import Course
-from coachable.envs.racing.physics.parameters import COMPOUNDS, RACE_COMPOUNDS, Car
+from coachable.envs.racing.physics.cars import COMPOUNDS, RACE_COMPOUNDS, Car
 from coachable.envs.racing.physics.state import HEATS, ROW, SPINS, STATE_ROWS, WEARS
 from coachable.envs.racing.race.counter_rng import normal, uniforms
 

@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from coachable.ranges import COUNT, Range
-from coachable.replay.events import EventPredicate, Route
 from coachable.replay.regions import Regions
+from coachable.replay.routing import EventPredicate, Route
 
 __all__ = ["checked_horizon", "checked_proportions", "make_regions"]
 

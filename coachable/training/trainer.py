@@ -25,13 +25,13 @@ from coachable.training.episodes import EpisodeStatistics, Means
 from coachable.training.learner import Learner
 from coachable.training.logging import MetricsLog, Progress
 from coachable.training.rng import rng_state, set_rng_state
-from coachable.training.settings import TrainSettings
 from coachable.training.simulators import UnsavableError
 from coachable.training.stopping import stop_signals
 from coachable.training.throttle import Throttle
+from coachable.training.train_settings import TrainSettings
 from coachable.training.weights import require_same_agent
 
-__all__ = ["REPLAY_KEYS", "Train", "replay_keys"]
+__all__ = ["REPLAY_KEYS", "Trainer", "replay_keys"]
 
 REPLAY_KEYS: tuple[NestedKey, ...] = (
     "observation",
@@ -63,7 +63,7 @@ def replay_keys(env: EnvBase, *, tables: bool = False, scenarios: bool = False) 
     return (*REPLAY_KEYS, ("collector", "traj_ids"), *events, *scenario)
 
 
-class Train:
+class Trainer:
     """Trains until `total_frames`, a stop signal or an error.
 
     Args:

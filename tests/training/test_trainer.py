@@ -16,8 +16,8 @@ from torchrl.envs.utils import check_env_specs
 from coachable.training.checkpoint import find_checkpoint, read_state
 from coachable.training.collection import evaluate_policy
 from coachable.training.logging import CsvLog, Progress, wandb_logger
-from coachable.training.settings import TrainSettings
 from coachable.training.throttle import Throttle
+from coachable.training.train_settings import TrainSettings
 
 
 def _tensors(state, prefix=""):
