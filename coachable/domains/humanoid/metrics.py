@@ -10,17 +10,34 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from coachable.domains.humanoid.styles import POSES, pose_bounds_deg
-from coachable.envs.humanoid.features import COMPLETED, LENGTH, NUM_ARM_JOINTS
+from coachable.envs.humanoid.features import (
+    CLEARANCE,
+    COMPLETED,
+    FOOT,
+    FORCE,
+    LENGTH,
+    NUM_ARM_JOINTS,
+    PITCH,
+    POWER,
+    SWING_KNEE,
+    WALK,
+)
 from coachable.envs.humanoid.observation import OBSERVATION_GROUPS
 from coachable.keys import STYLE, STYLE_FEATURES
 
 POSE_TOLERANCE_DEG = 10.0
 LENGTH_TOLERANCE = 0.06  # [m], a step this close to the request complies
+_DRIFT_SECONDS = 15.0
 _FORWARD_SPEED = sum(width for _, width, _ in OBSERVATION_GROUPS[:4])  # first of `com_velocity`
 
 
 class HumanoidMeasures:
-    """Forward speed, arms in pose, realised step length and its error.
+    """Forward speed, arms in pose, realised step length and its error, and how the walk looks and feels.
+
+    Of the walk: power [W]; at each strike the largest force under the foot during its stance [body weights], how high
+    the foot was lifted and how far its toes pointed down [m, deg], and how far the knee of the swinging leg was bent
+    [deg]; over an episode also the difference of the knees of both sides [deg] and how far the walker drifts off the
+    course in 15 s [m].
 
     Attributes:
         lower: (3, 6) joint bounds of the poses less the tolerance [rad].
@@ -44,16 +61,31 @@ class HumanoidMeasures:
         held = ((arms >= self.lower[pose]) & (arms <= self.upper[pose])).all(-1)
         struck = features[:, COMPLETED] > 0
         length = torch.where(struck, features[:, LENGTH], torch.nan)
+        observation = transition.get(("next", "observation"))
+        walk = transition.get(("next", WALK))
+        at_strike = torch.where(struck[:, None], walk, torch.nan)
+        knee = -at_strike[:, SWING_KNEE].rad2deg()
+        right = at_strike[:, FOOT] == 0
         return {
-            "forward_speed": transition.get(("next", "observation"))[:, _FORWARD_SPEED],
+            "forward_speed": observation[:, _FORWARD_SPEED],
+            "sideways_speed": observation[:, _FORWARD_SPEED + 1],
             "pose_held": held.float(),
             "step_length": length,
             "step_length_error": (length - theta[:, len(POSES)]).abs(),
+            "power": walk[:, POWER],
+            "strike_force": at_strike[:, FORCE],
+            "clearance": at_strike[:, CLEARANCE],
+            "strike_pitch": at_strike[:, PITCH].rad2deg(),
+            "right_knee": torch.where(right, knee, torch.nan),
+            "left_knee": torch.where(right, torch.nan, knee),
         }
 
     def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
         """See `StyleMeasures.summarise`: means over the steps that count."""
-        return {name: torch.where(alive, values, torch.nan).nanmean(0) for name, values in record.items()}
+        means = {name: torch.where(alive, values, torch.nan).nanmean(0) for name, values in record.items()}
+        drift = means.pop("sideways_speed").abs() * _DRIFT_SECONDS
+        right, left = means.pop("right_knee"), means.pop("left_knee")
+        return means | {"drift": drift, "swing_knee": (right + left) / 2, "knee_asymmetry": (right - left).abs()}
 
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
         """See `StyleMeasures.complies`: a strike of the requested length, with the arms in pose."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,9 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from coachable.envs.humanoid.features import STYLE_FEATURES_SIZE, pack_style_features
+from coachable.envs.humanoid.features import STYLE_FEATURES_SIZE, WALK, WALK_SIZE, pack_style_features, pack_walk
 from coachable.envs.humanoid.gait import GaitTracker
-from coachable.envs.humanoid.model import NUM_ACTIONS, NUM_POSITIONS
+from coachable.envs.humanoid.model import CONTROL_STEP, NUM_ACTIONS, NUM_POSITIONS
 from coachable.envs.humanoid.observation import (
     OBSERVATION_SCALE,
     OBSERVATION_SIZE,
@@ -22,16 +23,18 @@ from coachable.envs.humanoid.observation import (
     rotate_to_course,
     suite_observation,
 )
-from coachable.envs.humanoid.rewards import move_reward
+from coachable.envs.humanoid.rewards import COSTS, move_reward, walk_costs
 from coachable.envs.humanoid.simulation import HumanoidSimulation, Kinematics
 from coachable.finite import require_finite_action
 from coachable.keys import STYLE_FEATURES, TASK_REWARD
-from coachable.ranges import COUNT
+from coachable.ranges import COUNT, NOT_NEGATIVE, POSITIVE
 
 EPISODE_STEPS = 1000
 FALL_HEIGHT = 1.1  # [m], an episode ends when the head is lower
 HEADING_SPREAD = 0.3  # [rad], initial heading relative to the course
 STEP_MAX = 1.0  # [s], a step that takes longer times out
+PUSH_DURATION = 0.2  # [s]
+_PUSH_STEPS = round(PUSH_DURATION / CONTROL_STEP)
 _POSTURES = 512  # collision-free arm postures prepared at construction
 
 
@@ -48,8 +51,11 @@ class HumanoidEnv(EnvBase):
         seed: seed of the initial states.
         episode_steps: control steps (25 ms) after which an episode is truncated.
         step_max: time without a foot strike after which a step times out [s].
+        costs: weights of `walk_costs`, which are taken off the task reward; none by default, as in the paper.
+        push_force: largest force of random pushes of the torso [N], in any horizontal direction for 0.2 s; 0 for none.
+        push_interval: mean time between pushes [s].
 
-    Keys written: `observation` (N, 82) float32, `task_reward` (N, 1), `style_features` (N, 13),
+    Keys written: `observation` (N, 82) float32, `task_reward` (N, 1), `style_features` (N, 13), `walk` (N, 7),
     `done`, `terminated`, `truncated` (N, 1).
 
     Example:
@@ -66,12 +72,19 @@ class HumanoidEnv(EnvBase):
         seed: int | None = None,
         episode_steps: int = EPISODE_STEPS,
         step_max: float = STEP_MAX,
+        costs: Mapping[str, float] | None = None,
+        push_force: float = 0.0,
+        push_interval: float = 2.0,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
         if step_max <= 0:
             raise ValueError(f"step_max must be positive seconds, got {step_max}")
         COUNT.check("episode_steps", episode_steps)
+        NOT_NEGATIVE.check("push_force", push_force)
+        POSITIVE.check("push_interval", push_interval)
+        if unknown := set(costs or {}) - set(COSTS):
+            raise ValueError(f"costs of {', '.join(sorted(unknown))}: expected some of {', '.join(COSTS)}")
         super().__init__(device="cpu", batch_size=torch.Size((num_envs,)))
         if num_threads is None:
             num_threads = min(len(os.sched_getaffinity(0)), num_envs)
@@ -82,6 +95,10 @@ class HumanoidEnv(EnvBase):
         self.gait = GaitTracker.create(num_envs, step_max)
         self.course = np.zeros(num_envs)
         self.steps = np.zeros(num_envs, dtype=np.int64)
+        self.costs = dict(costs or {})
+        self.push_force, self._push_chance = push_force, CONTROL_STEP / push_interval
+        self.push = np.zeros((num_envs, 3))
+        self._push_left = np.zeros(num_envs, dtype=np.int64)
         self.divergences = 0
         self._observation = np.zeros((num_envs, OBSERVATION_SIZE), dtype=np.float32)
         self._postures = self._find_postures()
@@ -91,6 +108,11 @@ class HumanoidEnv(EnvBase):
     def steer(self, course: float | np.ndarray) -> None:
         """Set the direction that counts as forward, counter-clockwise from +x [rad], for all envs or each (N,)."""
         self.course[:] = course
+
+    def push_torso(self, force: np.ndarray) -> None:
+        """Push each torso with a force (N, 3) in the world frame [N] for the next 0.2 s; zeros leave a row alone."""
+        rows = np.any(force != 0, axis=1)
+        self.push[rows], self._push_left[rows] = force[rows], _PUSH_STEPS
 
     # -- TorchRL ---------------------------------------------------------------------------------------------------
 
@@ -104,6 +126,7 @@ class HumanoidEnv(EnvBase):
                 "observation": Unbounded(shape=rows(OBSERVATION_SIZE), dtype=torch.float32),
                 TASK_REWARD: Unbounded(shape=rows(1), dtype=torch.float32),
                 STYLE_FEATURES: Unbounded(shape=rows(STYLE_FEATURES_SIZE), dtype=torch.float32),
+                WALK: Unbounded(shape=rows(WALK_SIZE), dtype=torch.float32),
             },
             shape=self.batch_size,
         )
@@ -129,6 +152,7 @@ class HumanoidEnv(EnvBase):
                 "observation": torch.from_numpy(self._observation.copy()),
                 TASK_REWARD: zero,
                 STYLE_FEATURES: torch.zeros(self.num_envs, STYLE_FEATURES_SIZE),
+                WALK: torch.zeros(self.num_envs, WALK_SIZE),
                 "done": done,
                 "terminated": done.clone(),
                 "truncated": done.clone(),
@@ -140,16 +164,19 @@ class HumanoidEnv(EnvBase):
         action = tensordict.get("action").detach()
         require_finite_action(action)
         controls = np.clip(action.numpy().astype(np.float64), -1.0, 1.0)
-        diverged = self.simulation.step(controls)
+        diverged = self.simulation.step(controls, self._pushes())
         self.divergences += int(diverged.sum())
         self.steps += 1
         kinematics = self.simulation.kinematics()
-        feet = rotate_to_course(kinematics.feet, self.course)
-        report = self.gait.update(feet, kinematics.foot_clearance, self._knees())
+        forces, power = self.simulation.forces(), self.simulation.power()
+        report = self.gait.update(kinematics, self._knees(), forces, self.course)
         forward_speed = rotate_to_course(kinematics.com_velocity, self.course)[:, 0]
         upright = kinematics.torso_axes[:, 2, 2]
         facing = cosine_to_course(kinematics.pelvis_quaternion, self.course)
         task_reward = move_reward(forward_speed, kinematics.head_height, upright, facing, controls)
+        if self.costs:
+            costs = walk_costs(power, forces, kinematics.foot_clearance, report)
+            task_reward = task_reward - sum(weight * costs[name] for name, weight in self.costs.items())
         arms = self.simulation.positions[:, self.simulation.model.arm_positions]
         terminated = torch.from_numpy((kinematics.head_height < FALL_HEIGHT) | diverged)[:, None]
         truncated = torch.from_numpy(self.steps >= self.episode_steps)[:, None] & ~terminated
@@ -161,6 +188,7 @@ class HumanoidEnv(EnvBase):
                 TASK_REWARD: reward,
                 "reward": reward.clone(),
                 STYLE_FEATURES: torch.from_numpy(pack_style_features(arms, report)),
+                WALK: torch.from_numpy(pack_walk(power, report)),
                 "done": terminated | truncated,
                 "terminated": terminated,
                 "truncated": truncated,
@@ -182,6 +210,8 @@ class HumanoidEnv(EnvBase):
             "state": self.simulation.state,
             "course": self.course,
             "steps": self.steps,
+            "push": self.push,
+            "push_left": self._push_left,
             "observation": self._observation,
         }
         arrays |= {f"gait.{name}": value for name, value in self.gait.arrays().items()}
@@ -200,6 +230,8 @@ class HumanoidEnv(EnvBase):
         self.simulation.state[:] = arrays["state"]
         self.course[:] = arrays["course"]
         self.steps[:] = arrays["steps"]
+        self.push[:] = arrays["push"]
+        self._push_left[:] = arrays["push_left"]
         self._observation[:] = arrays["observation"]
         for name in self.gait.arrays():
             setattr(self.gait, name, arrays[f"gait.{name}"].copy())
@@ -217,10 +249,23 @@ class HumanoidEnv(EnvBase):
         self.simulation.state[rows, 1 : 1 + NUM_POSITIONS] = positions
         self.simulation.state[rows, 1 + NUM_POSITIONS :] = 0.0
         self.steps[rows] = 0
+        self._push_left[rows] = 0
         kinematics = self.simulation.kinematics(rows)
         feet = rotate_to_course(kinematics.feet, self.course[rows])
-        self.gait.reset(rows, self._random.integers(0, 2, len(rows)), feet, self._knees()[rows])
+        self.gait.reset(rows, self._random.integers(0, 2, len(rows)), feet, self._knees()[rows], kinematics.soles)
         self._observation[rows] = self._observe(kinematics, rows)
+
+    def _pushes(self) -> np.ndarray:
+        """Return the force on each torso in this control step (N, 3) [N]; random pushes begin as they come."""
+        if self.push_force:
+            begins = (self._random.random(self.num_envs) < self._push_chance) & (self._push_left == 0)
+            size = self._random.uniform(0.0, self.push_force, self.num_envs)
+            angle = self._random.uniform(-np.pi, np.pi, self.num_envs)
+            force = np.stack([size * np.cos(angle), size * np.sin(angle), np.zeros(self.num_envs)], axis=1)
+            self.push_torso(np.where(begins[:, None], force, 0.0))
+        pushed = np.where(self._push_left[:, None] > 0, self.push, 0.0)
+        self._push_left = np.maximum(self._push_left - 1, 0)
+        return pushed
 
     def _find_postures(self) -> np.ndarray:
         """Draw arm postures (M, 6) without self-collision, uniformly within the joint limits."""

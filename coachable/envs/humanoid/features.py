@@ -11,6 +11,11 @@ NUM_ARM_JOINTS = 6
 COMPLETED, LENGTH, DURATION, STRIDE_FRACTION, KNEE_MIN, KNEE_MAX, TIMED_OUT = range(NUM_ARM_JOINTS, NUM_ARM_JOINTS + 7)
 STYLE_FEATURES_SIZE = TIMED_OUT + 1
 
+WALK = "walk"
+"""Key of what is measured of the walk besides, see `pack_walk`; no reward under any theta depends on it."""
+POWER, FORCE, CLEARANCE, PITCH, DRIFT, SWING_KNEE, FOOT = range(7)
+WALK_SIZE = FOOT + 1
+
 
 def pack_style_features(arms: np.ndarray, report: StepReport) -> np.ndarray:
     """Pack the raw quantities of both style terms, which do not depend on theta.
@@ -32,3 +37,17 @@ def pack_style_features(arms: np.ndarray, report: StepReport) -> np.ndarray:
         report.timed_out,
     )
     return np.concatenate([arms, np.stack(step, axis=1)], axis=1).astype(np.float32)
+
+
+def pack_walk(power: np.ndarray, report: StepReport) -> np.ndarray:
+    """Pack what is measured of the walk; all but the power is 0 in control steps without a strike.
+
+    Args:
+        power: (N,) mechanical power of the motors [W].
+        report: what the gait did in this control step.
+
+    Returns:
+        (N, 7) float32: power [W], force [body weights], clearance [m], pitch [rad], drift [m], swing knee [rad], foot.
+    """
+    walk = (power, report.force, report.clearance, report.pitch, report.drift, report.swing_knee, report.foot)
+    return np.stack(walk, axis=1).astype(np.float32)

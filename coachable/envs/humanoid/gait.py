@@ -7,24 +7,34 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from coachable.envs.humanoid.model import CONTROL_STEP
+from coachable.envs.humanoid.observation import rotate_to_course
+from coachable.envs.humanoid.simulation import Kinematics
 
 # A foot counts as touching the floor when its lowest point is below this height [m].
 CONTACT_HEIGHT = 0.001
+# A foot that was off the floor for fewer control steps has bounced: it still stands on the same footprint.
+MIN_AIRBORNE = 2
 
 
 @dataclass
 class StepReport:
-    """What happened in one control step, per env.
+    """What happened in one control step, per env. Quantities of a step are 0 without a strike.
 
     Attributes:
         completed: (N,) bool, the expected foot struck.
-        length: (N,) distance along the course between the striking foot and the other one [m]; 0 without a strike.
-        duration: (N,) time since the previous strike [s]; 0 without a strike.
+        length: (N,) distance along the course from the other foot's last footprint to the new one [m].
+        duration: (N,) time since the previous strike [s].
         stride_fraction: (N,) share of this step in the stride, i.e. in the sum of this step and the previous one.
             0 where either did not go forward; 1/2 for the first step of an episode, which has no stride yet.
         knee_min: (N,) smallest knee angle of both legs during the step [rad].
         knee_max: (N,) largest one [rad].
         timed_out: (N,) bool, no strike for longer than `step_max`.
+        clearance: (N,) how high the lowest point of the striking foot was lifted [m].
+        pitch: (N,) pitch of the foot as it strikes, positive with the toes first [rad].
+        drift: (N,) distance to the left of the course from the striking foot's last footprint to the new one [m].
+        force: (N,) largest force under the foot that struck last, since then [body weights].
+        swing_knee: (N,) smallest angle of the knee of the leg that strikes, during the step [rad].
+        foot: (N,) index of the foot that struck.
     """
 
     completed: np.ndarray
@@ -34,6 +44,12 @@ class StepReport:
     knee_min: np.ndarray
     knee_max: np.ndarray
     timed_out: np.ndarray
+    clearance: np.ndarray
+    pitch: np.ndarray
+    drift: np.ndarray
+    force: np.ndarray
+    swing_knee: np.ndarray
+    foot: np.ndarray
 
 
 @dataclass
@@ -43,7 +59,10 @@ class GaitTracker:
     Attributes:
         expected: (N,) index of the foot that must strike next.
         clock: (N,) control steps since the last strike.
-        lifted: (N,) bool, the expected foot has left the floor since the last strike.
+        airborne: (N, 2) control steps since each foot left the floor; 0 in contact.
+        highest: (N, 2) largest clearance of each foot since it left the floor [m].
+        prints: (N, 2, 2) x and y of each foot's last footprint, see `Kinematics.soles` [m].
+        force: (N,) largest force since the last strike under the foot that struck [body weights].
         first_step: (N,) bool, no strike yet in this episode.
         knee_min: (N, 2) smallest angle of each knee since the step began [rad].
         knee_max: (N, 2) largest one [rad].
@@ -55,7 +74,10 @@ class GaitTracker:
 
     expected: np.ndarray
     clock: np.ndarray
-    lifted: np.ndarray
+    airborne: np.ndarray
+    highest: np.ndarray
+    prints: np.ndarray
+    force: np.ndarray
     first_step: np.ndarray
     knee_min: np.ndarray
     knee_max: np.ndarray
@@ -69,7 +91,10 @@ class GaitTracker:
         return cls(
             expected=np.zeros(num_envs, dtype=np.int64),
             clock=np.zeros(num_envs, dtype=np.int64),
-            lifted=np.zeros(num_envs, dtype=bool),
+            airborne=np.zeros((num_envs, 2), dtype=np.int64),
+            highest=np.zeros((num_envs, 2)),
+            prints=np.zeros((num_envs, 2, 2)),
+            force=np.zeros(num_envs),
             first_step=np.ones(num_envs, dtype=bool),
             knee_min=np.zeros((num_envs, 2)),
             knee_max=np.zeros((num_envs, 2)),
@@ -78,7 +103,9 @@ class GaitTracker:
             step_max=step_max,
         )
 
-    def reset(self, rows: np.ndarray, expected: np.ndarray, feet: np.ndarray, knees: np.ndarray) -> None:
+    def reset(
+        self, rows: np.ndarray, expected: np.ndarray, feet: np.ndarray, knees: np.ndarray, soles: np.ndarray
+    ) -> None:
         """Start an episode in `rows`.
 
         Args:
@@ -86,62 +113,79 @@ class GaitTracker:
             expected: (M,) foot that must strike first.
             feet: (M, 2, 2) foot positions along and across the course [m].
             knees: (M, 2) knee angles [rad].
+            soles: (M, 2, 2) x and y of the soles [m].
         """
         index = np.arange(len(rows))
         self.expected[rows] = expected
         self.clock[rows] = 0
-        self.lifted[rows] = False
+        self.airborne[rows] = 0
+        self.highest[rows] = 0.0
+        self.prints[rows] = soles
+        self.force[rows] = 0.0
         self.first_step[rows] = True
         self.knee_min[rows] = knees
         self.knee_max[rows] = knees
         self.step_vector[rows] = feet[index, expected] - feet[index, 1 - expected]
         self.stride_vector[rows] = self.step_vector[rows]
 
-    def update(self, feet: np.ndarray, clearance: np.ndarray, knees: np.ndarray) -> StepReport:
+    def update(self, kinematics: Kinematics, knees: np.ndarray, forces: np.ndarray, course: np.ndarray) -> StepReport:
         """Update the gait by one control step.
 
         Args:
-            feet: (N, 2, 2) foot positions along and across the course [m].
-            clearance: (N, 2) height of the lowest point of each foot [m].
+            kinematics: geometry of the walkers.
             knees: (N, 2) knee angles [rad].
+            forces: (N, 2) largest force under each foot in this control step [body weights].
+            course: (N,) direction that counts as forward, counter-clockwise from +x [rad].
         """
-        index = np.arange(len(self.expected))
+        index, expected = np.arange(len(self.expected)), self.expected
+        clearance, soles = kinematics.foot_clearance, kinematics.soles
         self.clock += 1
         np.minimum(self.knee_min, knees, out=self.knee_min)
         np.maximum(self.knee_max, knees, out=self.knee_max)
         touching = clearance < CONTACT_HEIGHT
-        expected_touches = touching[index, self.expected]
-        completed = self.lifted & expected_touches
-        self.lifted |= ~expected_touches
+        landed = touching & (self.airborne >= MIN_AIRBORNE)
+        completed = landed[index, expected]
 
-        vector = feet[index, self.expected] - feet[index, 1 - self.expected]
-        length = vector[:, 0]
-        # The other foot struck last: the length of its step, which began the stride, is minus our start vector.
-        previous = -self.step_vector[:, 0]
-        stride = length + previous
+        # The other foot struck last; the step before went from this foot's footprint to the other's.
+        step = rotate_to_course(soles[index, expected] - self.prints[index, 1 - expected], course)
+        before = rotate_to_course(self.prints[index, 1 - expected] - self.prints[index, expected], course)
+        length, previous = step[:, 0], before[:, 0]
         forward = (length > 0) & (previous > 0)
-        fraction = np.where(forward, length / np.where(forward, stride, 1.0), 0.0)
+        fraction = np.where(forward, length / np.where(forward, length + previous, 1.0), 0.0)
         fraction = np.where(self.first_step, np.where(length > 0, 0.5, 0.0), fraction)
+
+        def at_strike(values: np.ndarray) -> np.ndarray:
+            return np.where(completed, values, 0.0)
+
         report = StepReport(
             completed=completed,
-            length=np.where(completed, length, 0.0),
-            duration=np.where(completed, self.clock * CONTROL_STEP, 0.0),
-            stride_fraction=np.where(completed, fraction, 0.0),
+            length=at_strike(length),
+            duration=at_strike(self.clock * CONTROL_STEP),
+            stride_fraction=at_strike(fraction),
             knee_min=self.knee_min.min(axis=1),
             knee_max=self.knee_max.max(axis=1),
             timed_out=~completed & (self.clock * CONTROL_STEP > self.step_max),
+            clearance=at_strike(self.highest[index, expected]),
+            pitch=at_strike(kinematics.foot_pitch[index, expected]),
+            drift=at_strike(step[:, 1] + before[:, 1]),
+            force=at_strike(self.force),
+            swing_knee=at_strike(self.knee_min[index, expected]),
+            foot=expected.copy(),
         )
-        self._begin_step(completed, vector, touching, knees, index)
+        self.prints = np.where(landed[..., None], soles, self.prints)
+        self.airborne = np.where(touching, 0, self.airborne + 1)
+        self.highest = np.where(touching, 0.0, np.maximum(self.highest, clearance))
+        feet = rotate_to_course(kinematics.feet, course)
+        self._begin_step(completed, feet[index, expected] - feet[index, 1 - expected], knees)
+        stance = forces[index, 1 - self.expected]
+        self.force = np.where(completed, stance, np.maximum(self.force, stance))
         return report
 
-    def _begin_step(
-        self, struck: np.ndarray, vector: np.ndarray, touching: np.ndarray, knees: np.ndarray, index: np.ndarray
-    ) -> None:
+    def _begin_step(self, struck: np.ndarray, vector: np.ndarray, knees: np.ndarray) -> None:
         column = struck[:, None]
         self.stride_vector = np.where(column, self.step_vector, self.stride_vector)
         self.step_vector = np.where(column, -vector, self.step_vector)
         self.expected = np.where(struck, 1 - self.expected, self.expected)
-        self.lifted = np.where(struck, ~touching[index, self.expected], self.lifted)
         self.clock = np.where(struck, 0, self.clock)
         self.first_step = self.first_step & ~struck
         self.knee_min = np.where(column, knees, self.knee_min)

@@ -1,8 +1,9 @@
 """MuJoCo models of the DeepMind Control humanoid, and where its quantities lie in the state.
 
-Two compiled models share the suite's body. The *dynamics* model integrates; it has no sensors, because the suite's
-force sensors alone cost a pass of inverse dynamics per physics step. The *kinematics* model has only the sensors that
-our features need and every force switched off, so that one cheap step of it reads the geometry of any state.
+Two compiled models share the suite's body. The *dynamics* model integrates; its only sensors are the forces under the
+feet, because the suite's force sensors alone cost a pass of inverse dynamics per physics step. The *kinematics* model
+has only the sensors that our features need and every force switched off, so that one cheap step of it reads the
+geometry of any state.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ _FOOT_CAPSULES = {
     "left_foot": ((-0.07, 0.02), (0.14, 0.04), (-0.07, 0.0), (0.14, -0.02)),
 }
 FOOT_RADIUS = 0.027  # [m]
+HEEL, TOE = -0.07, 0.14  # [m], ends of the capsules along the foot
 
 _INCLUDES = ("materials", "skybox", "visual")
 
@@ -52,9 +54,12 @@ class HumanoidModel:
     """Compiled models and the addresses that the simulation reads.
 
     Attributes:
-        dynamics: model that integrates, without sensors.
+        dynamics: model that integrates; its sensors are the normal forces under the right and the left foot [N].
         kinematics: model whose sensors are the geometry of a state, without forces.
         sensors: name to slice of the kinematics model's sensor vector.
+        weight: weight of the body [N].
+        torques: (21,) torque of each motor at full command [N m].
+        motor_velocities: (21,) addresses in qvel of the joints that the motors turn.
         arm_positions: addresses of the six arm joints in qpos, in the order of `ARM_JOINTS`.
         knee_positions: addresses of the right and left knee in qpos.
         arm_ranges: (6, 2) joint limits of the arms [rad].
@@ -64,6 +69,9 @@ class HumanoidModel:
     dynamics: mujoco.MjModel
     kinematics: mujoco.MjModel
     sensors: dict[str, slice]
+    weight: float
+    torques: np.ndarray
+    motor_velocities: np.ndarray
     arm_positions: np.ndarray
     knee_positions: np.ndarray
     arm_ranges: np.ndarray
@@ -85,6 +93,11 @@ def build_model() -> HumanoidModel:
     dynamics_spec = load_spec()
     for sensor in list(dynamics_spec.sensors):
         dynamics_spec.delete(sensor)
+    for foot in FEET:  # a sphere around the foot: a touch sensor adds up the contacts of its body within its site
+        dynamics_spec.body(foot).add_site(name=foot, pos=((HEEL + TOE) / 2, 0, 0), size=(0.2, 0, 0))
+        dynamics_spec.add_sensor(
+            name=foot, type=mujoco.mjtSensor.mjSENS_TOUCH, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=foot
+        )
     dynamics = dynamics_spec.compile()
     # Without auto-reset a diverging state stays visible instead of turning silently into the initial one.
     dynamics.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
@@ -112,6 +125,9 @@ def build_model() -> HumanoidModel:
         dynamics=dynamics,
         kinematics=kinematics,
         sensors=sensors,
+        weight=float(dynamics.body_mass.sum() * np.linalg.norm(dynamics.opt.gravity)),
+        torques=dynamics.actuator_gear[:, 0].copy(),
+        motor_velocities=dynamics.jnt_dofadr[dynamics.actuator_trnid[:, 0]].copy(),
         arm_positions=_positions(dynamics, ARM_JOINTS),
         knee_positions=_positions(dynamics, KNEE_JOINTS),
         arm_ranges=np.stack([dynamics.joint(name).range for name in ARM_JOINTS]),

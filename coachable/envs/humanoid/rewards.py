@@ -5,6 +5,9 @@ from __future__ import annotations
 import numpy as np
 from dm_control.utils.rewards import tolerance
 
+from coachable.envs.humanoid.gait import StepReport
+from coachable.envs.humanoid.model import CONTROL_STEP
+
 WALK_SPEED = (
     1.0,
     1.2,
@@ -52,3 +55,38 @@ def move_reward(
         )
     effortless = np.mean(tolerance(controls, margin=1, value_at_margin=0, sigmoid="quadratic"), axis=1)
     return moving * standing * (1 + effortless) / 2
+
+
+COSTS = ("power", "impact", "clearance", "toe_strike", "drift")
+"""What a walk costs besides, see `walk_costs`."""
+_POWER = 1000.0  # [W] that cost 1
+_SOFT, _HARD = 1.5, 6.5  # forces under a foot [body weights] that cost 0 and 1
+_LOW, _HIGH = 0.06, 0.21  # clearances [m] that cost 0 and 1
+_TOE_STRIKE = np.deg2rad(20)  # pitch that costs 1; a foot that lands flat or heel first costs nothing
+_DRIFT = 0.10  # [m] to either side over a stride that cost 1
+
+
+def walk_costs(
+    power: np.ndarray, forces: np.ndarray, clearance: np.ndarray, report: StepReport
+) -> dict[str, np.ndarray]:
+    """Return what keeps a walk from being soft, low, straight and economical, each 0 at best and about 1 at worst.
+
+    None of them is in the paper. Quantities of a step are paid once for each control step that it took.
+
+    Args:
+        power: (N,) mechanical power of the motors [W].
+        forces: (N, 2) largest force under each foot in this control step [body weights].
+        clearance: (N, 2) height of the lowest point of each foot [m].
+        report: what the gait did in this control step.
+
+    Returns:
+        (N,) by the names of `COSTS`.
+    """
+    steps = report.duration / CONTROL_STEP
+    return {
+        "power": np.minimum(power / _POWER, 2.0),
+        "impact": np.clip((forces.max(axis=1) - _SOFT) / (_HARD - _SOFT), 0.0, 1.0),
+        "clearance": np.clip((clearance.max(axis=1) - _LOW) / (_HIGH - _LOW), 0.0, 1.0),
+        "toe_strike": steps * np.clip(report.pitch / _TOE_STRIKE, 0.0, 1.0),
+        "drift": steps * np.clip(np.abs(report.drift) / _DRIFT, 0.0, 1.0),
+    }

@@ -12,10 +12,12 @@ from coachable.envs.humanoid.model import (
     EXTREMITIES,
     FEET,
     FOOT_RADIUS,
+    HEEL,
     NUM_ACTIONS,
     NUM_POSITIONS,
     NUM_VELOCITIES,
     PHYSICS_STEPS_PER_CONTROL,
+    TOE,
     HumanoidModel,
     build_model,
     state_size,
@@ -23,6 +25,9 @@ from coachable.envs.humanoid.model import (
 
 # Beyond this speed of any degree of freedom [m/s, rad/s] the integration has left the physical regime.
 _EXPLODED = 1e3
+
+
+_CONTROL_SPEC = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
 
 
 @dataclass
@@ -36,6 +41,8 @@ class Kinematics:
         extremities: (N, 4, 3) positions of left hand, left foot, right hand, right foot [m].
         feet: (N, 2, 3) positions of the right and left foot [m].
         foot_clearance: (N, 2) height of the lowest point of each foot above the floor [m]; negative in contact.
+        foot_pitch: (N, 2) pitch of each foot, positive with the toes down [rad].
+        soles: (N, 2, 2) x and y of the middle of each sole once the foot lies flat around its lowest end [m].
         com_velocity: (N, 3) [m/s].
         pelvis_quaternion: (N, 4) w, x, y, z.
     """
@@ -46,6 +53,8 @@ class Kinematics:
     extremities: np.ndarray
     feet: np.ndarray
     foot_clearance: np.ndarray
+    foot_pitch: np.ndarray
+    soles: np.ndarray
     com_velocity: np.ndarray
     pelvis_quaternion: np.ndarray
 
@@ -73,7 +82,8 @@ class HumanoidSimulation:
         self.state = np.zeros((num_envs, state_size(self.model.dynamics)))
         self.state[:, 1 : 1 + NUM_POSITIONS] = self.model.dynamics.qpos0
         self._states_out = np.zeros((num_envs, PHYSICS_STEPS_PER_CONTROL, self.state.shape[1]))
-        self._controls = np.zeros((num_envs, PHYSICS_STEPS_PER_CONTROL, NUM_ACTIONS))
+        self._controls = np.zeros((num_envs, PHYSICS_STEPS_PER_CONTROL, NUM_ACTIONS + NUM_VELOCITIES))
+        self._forces = np.zeros((num_envs, PHYSICS_STEPS_PER_CONTROL, len(FEET)))
 
     @property
     def positions(self) -> np.ndarray:
@@ -85,23 +95,26 @@ class HumanoidSimulation:
         """Generalised velocities (N, 27), a view of the state."""
         return self.state[:, 1 + NUM_POSITIONS : 1 + NUM_POSITIONS + NUM_VELOCITIES]
 
-    def step(self, actions: np.ndarray) -> np.ndarray:
+    def step(self, actions: np.ndarray, push: np.ndarray | float = 0.0) -> np.ndarray:
         """Advance every state by one control step.
 
         Args:
             actions: (N, 21) motor commands; MuJoCo clips them to [-1, 1].
+            push: (N, 3) force on the torso in the world frame [N].
 
         Returns:
             (N,) True where the integration diverged. Those states are left as they were before the step.
         """
-        self._controls[:] = actions[:, None, :]
-        # The sensors of the dynamics model are empty, so only states come back.
+        self._controls[..., :NUM_ACTIONS] = actions[:, None, :]
+        self._controls[..., NUM_ACTIONS : NUM_ACTIONS + 3] = np.asarray(push)[..., None, :] if np.ndim(push) else push
         self._rollout.rollout(
             self.model.dynamics,
             self._dynamics_data,
             self.state,
             self._controls,
             state=self._states_out,
+            sensordata=self._forces,
+            control_spec=_CONTROL_SPEC,
             skip_checks=False,
         )
         after = self._states_out[:, -1]
@@ -113,6 +126,17 @@ class HumanoidSimulation:
         else:
             self.state[:] = after
         return diverged
+
+    def forces(self) -> np.ndarray:
+        """Return the largest normal force under each foot in the last control step (N, 2), in body weights."""
+        return np.nan_to_num(self._forces.max(axis=1)) / self.model.weight
+
+    def power(self) -> np.ndarray:
+        """Return the mechanical power of the motors (N,), the mean of `sum |torque * speed|` over a step [W]."""
+        first = 1 + NUM_POSITIONS
+        speeds = self._states_out[..., first + self.model.motor_velocities]
+        torques = np.clip(self._controls[..., :NUM_ACTIONS], -1.0, 1.0) * self.model.torques
+        return np.nan_to_num(np.abs(torques * speeds).sum(axis=-1).mean(axis=1))
 
     def kinematics(self, rows: np.ndarray | None = None) -> Kinematics:
         """Return the geometry of the current states, or of `rows` of them."""
@@ -129,17 +153,24 @@ class HumanoidSimulation:
 
         feet = np.stack([read(f"{foot}_position") for foot in FEET], axis=1)
         # Height of the capsule end points: position + x * (x axis)_z + y * (y axis)_z.
-        axis_x = np.stack([read(f"{foot}_x_axis")[:, 2] for foot in FEET], axis=1)
+        axis_x = np.stack([read(f"{foot}_x_axis") for foot in FEET], axis=1)
         axis_y = np.stack([read(f"{foot}_y_axis")[:, 2] for foot in FEET], axis=1)
         points = self.model.foot_points  # (2, 4, 2)
-        lowest = (axis_x[..., None] * points[..., 0] + axis_y[..., None] * points[..., 1]).min(axis=-1)
+        heights = axis_x[..., 2:] * points[..., 0] + axis_y[..., None] * points[..., 1]
+        # What touches the ground first stays where it is while the rest of the foot comes down around it.
+        end = np.where(axis_x[..., 2] < 0, TOE, HEEL)[..., None]
+        ahead = axis_x[..., :2]
+        level = ahead / np.maximum(np.linalg.norm(ahead, axis=-1, keepdims=True), 1e-6)
+        soles = feet[..., :2] + end * ahead + ((HEEL + TOE) / 2 - end) * level
         return Kinematics(
             torso_axes=np.stack([read(f"torso_{axis}_axis") for axis in "xyz"], axis=-1),
             torso_position=read("torso_position"),
             head_height=read("head_position")[:, 2],
             extremities=np.stack([read(f"{limb}_position") for limb in EXTREMITIES], axis=1),
             feet=feet,
-            foot_clearance=feet[..., 2] + lowest - FOOT_RADIUS,
+            foot_clearance=feet[..., 2] + heights.min(axis=-1) - FOOT_RADIUS,
+            foot_pitch=-np.arcsin(np.clip(axis_x[..., 2], -1.0, 1.0)),
+            soles=soles,
             com_velocity=read("com_velocity"),
             pelvis_quaternion=read("pelvis_quaternion"),
         )
