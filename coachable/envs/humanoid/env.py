@@ -85,6 +85,8 @@ class HumanoidEnv(EnvBase):
         POSITIVE.check("push_interval", push_interval)
         if unknown := set(costs or {}) - set(COSTS):
             raise ValueError(f"costs of {', '.join(sorted(unknown))}: expected some of {', '.join(COSTS)}")
+        for name, weight in (costs or {}).items():
+            NOT_NEGATIVE.check(f"costs.{name}", weight)
         super().__init__(device="cpu", batch_size=torch.Size((num_envs,)))
         if num_threads is None:
             num_threads = min(len(os.sched_getaffinity(0)), num_envs)

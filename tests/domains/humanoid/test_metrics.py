@@ -9,12 +9,24 @@ from tensordict import TensorDict
 from coachable.domains.humanoid import humanoid_style_space
 from coachable.domains.humanoid.metrics import HumanoidMeasures
 from coachable.domains.humanoid.styles import POSES, pose_bounds_deg
-from coachable.envs.humanoid.features import COMPLETED, LENGTH, STYLE_FEATURES_SIZE
+from coachable.envs.humanoid.features import (
+    CLEARANCE,
+    COMPLETED,
+    FOOT,
+    FORCE,
+    LENGTH,
+    PITCH,
+    POWER,
+    STYLE_FEATURES_SIZE,
+    SWING_KNEE,
+    WALK,
+    WALK_SIZE,
+)
 from coachable.envs.humanoid.observation import OBSERVATION_GROUPS
 from coachable.keys import STYLE, STYLE_FEATURES
 
 
-def transition(pose="t_pose", asked=0.5, angles=None, struck=True, length=0.5, speed=1.2):
+def transition(pose="t_pose", asked=0.5, angles=None, struck=True, length=0.5, speed=1.2, walk=None):
     space = humanoid_style_space()
     features = torch.zeros(1, STYLE_FEATURES_SIZE)
     centre = torch.from_numpy(pose_bounds_deg()[POSES.index(pose)].mean(1)).float()
@@ -24,9 +36,12 @@ def transition(pose="t_pose", asked=0.5, angles=None, struck=True, length=0.5, s
     first = 0
     for name, width, _ in OBSERVATION_GROUPS:
         if name == "com_velocity":
-            observation[0, first] = speed
+            observation[0, first], observation[0, first + 1] = speed, 0.1
         first += width
-    following = {STYLE_FEATURES: features, "observation": observation}
+    measured = torch.zeros(1, WALK_SIZE)
+    for column, value in (walk or {}).items():
+        measured[0, column] = value
+    following = {STYLE_FEATURES: features, "observation": observation, WALK: measured}
     return TensorDict({STYLE: space.make(pose=pose, step_length=asked)[None], "next": following}, [1])
 
 
@@ -62,11 +77,32 @@ def test_a_step_within_six_centimetres_complies(length, complies):
 
 
 def test_means_are_over_the_steps_that_count():
+    nan = torch.nan
     record = {"forward_speed": torch.tensor([[1.0, 1.0], [3.0, 1.0], [9.0, 1.0]])}
-    record["step_length"] = torch.tensor([[torch.nan, torch.nan], [0.4, torch.nan], [0.9, torch.nan]])
+    record["step_length"] = torch.tensor([[nan, nan], [0.4, nan], [0.9, nan]])
+    record["sideways_speed"] = torch.tensor([[0.1, -0.2], [-0.3, -0.2], [9.0, -0.2]])
+    record["right_knee"] = torch.tensor([[60.0, nan], [nan, nan], [nan, nan]])
+    record["left_knee"] = torch.tensor([[nan, nan], [80.0, 50.0], [10.0, nan]])
     means = HumanoidMeasures().summarise(record, torch.tensor([[True, True], [True, True], [False, True]]))
     assert means["forward_speed"].tolist() == [2.0, 1.0]
     assert means["step_length"][0] == pytest.approx(0.4) and means["step_length"][1].isnan()
+    assert means["drift"].tolist() == pytest.approx([1.5, 3.0])  # [m] in 15 s
+    assert means["swing_knee"][0] == 70.0 and means["knee_asymmetry"][0] == 20.0
+    assert means["knee_asymmetry"][1].isnan()  # one leg only
+    assert "right_knee" not in means and "sideways_speed" not in means
+
+
+@pytest.mark.parametrize("foot, side", [(0, "right_knee"), (1, "left_knee")])
+def test_the_walk_is_measured_at_strikes_and_its_power_in_every_step(foot, side):
+    walk = {POWER: 300.0, FORCE: 1.4, CLEARANCE: 0.05, PITCH: -0.1, SWING_KNEE: -math.pi / 3, FOOT: foot}
+    row = HumanoidMeasures().step(transition(walk=walk))
+    for name, value in (("power", 300.0), ("strike_force", 1.4), ("clearance", 0.05), (side, 60.0)):
+        assert row[name].item() == pytest.approx(value)
+    assert row["strike_pitch"].item() == pytest.approx(math.degrees(-0.1))
+    assert row["sideways_speed"].item() == pytest.approx(0.1)
+    between = HumanoidMeasures().step(transition(struck=False, walk=walk))
+    assert between["power"].item() == 300.0
+    assert all(math.isnan(between[name]) for name in ("strike_force", "clearance", "strike_pitch", side))
 
 
 def test_walking_is_judged_by_footsteps():

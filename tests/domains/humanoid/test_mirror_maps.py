@@ -35,9 +35,10 @@ def test_a_mirrored_walker_stays_the_mirror_image():
     env.reset()
     simulation = env.simulation
     simulation.velocities[0] = np.random.default_rng(0).uniform(-0.5, 0.5, 27)
+    simulation.positions[0, 2] += 0.05  # both feet come down within the rollout
     simulation.state[1] = mirror_state(simulation.state[0])
-    feet = simulation.kinematics().feet[..., :2]
-    env.gait.reset(np.arange(2), np.array([0, 1]), feet, env._knees())
+    kinematics = simulation.kinematics()
+    env.gait.reset(np.arange(2), np.array([0, 1]), kinematics.feet[..., :2], env._knees(), kinematics.soles)
     generator = torch.Generator().manual_seed(0)
     strikes = 0
     for _ in range(20):

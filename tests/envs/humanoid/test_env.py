@@ -182,9 +182,19 @@ def test_a_diverged_policy_is_named():
         env.step(env.reset().set("action", torch.full((3, 21), torch.nan)))
 
 
-@pytest.mark.parametrize("options", [{"num_envs": 0}, {"step_max": 0.0}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"num_envs": 0},
+        {"step_max": 0.0},
+        {"costs": {"powr": 1.0}},
+        {"costs": {"power": -1.0}},
+        {"push_force": -1.0},
+        {"push_interval": 0.0},
+    ],
+)
 def test_bad_arguments_are_refused(options):
-    with pytest.raises(ValueError, match="must be"):
+    with pytest.raises(ValueError, match=r"must be|expected|powr"):
         HumanoidEnv(**{"num_threads": 1, **options})
 
 
@@ -216,3 +226,83 @@ def test_threads_share_the_physics_and_change_no_number():
     assert (one.simulation.num_threads, two.simulation.num_threads) == (0, 2)
     assert torch.equal(roll(one, actions(one, 3)), roll(two, actions(two, 3)))
     two.close()
+
+
+def test_forces_under_the_feet_of_a_standing_humanoid_add_up_to_its_weight():
+    env = make_env(num_envs=1)
+    current = env.reset()
+    sums = []
+    for _ in range(8):  # it begins to fall later
+        current = env.step(current.set("action", torch.zeros(1, 21)))["next"]
+        sums.append(env.simulation._forces.sum(axis=-1).mean() / env.simulation.model.weight)
+    assert np.mean(sums) == pytest.approx(1.0, abs=0.15)
+    assert env.simulation.model.weight == pytest.approx(40.844 * 9.81, rel=1e-3)
+
+
+def test_power_is_torque_times_speed():
+    """One joint turns at a known speed under a known command, whichever the order of motors and joints."""
+    env = make_env(num_envs=1)
+    simulation = env.simulation
+    model = simulation.model.dynamics
+    motor, joint = "right_ankle_x", "right_ankle_x"  # in the motors before, in the joints after the other ankle
+    index = [model.actuator(i).name for i in range(model.nu)].index(motor)
+    simulation._states_out[:] = 0.0
+    simulation._states_out[..., 1 + 28 + int(model.joint(joint).dofadr[0])] = -3.0
+    simulation._controls[:] = 0.0
+    simulation._controls[..., index] = 0.5
+    assert simulation.power()[0] == pytest.approx(0.5 * model.actuator_gear[index, 0] * 3.0)
+
+
+def test_costs_are_taken_off_the_task_reward_and_change_nothing_else():
+    weights = {"power": 0.5, "clearance": 2.0}
+    plain, costly = make_env(), make_env(costs=weights)
+    first, second = plain.reset(), costly.reset()
+    for action in actions(plain, 5):
+        first = plain.step(first.set("action", action))["next"]
+        second = costly.step(second.set("action", action))["next"]
+    for key in ("observation", "style_features", "walk"):
+        assert torch.equal(first[key], second[key])
+    clearance = plain.simulation.kinematics().foot_clearance.max(axis=1)
+    lost = 0.5 * np.minimum(plain.simulation.power() / 1000, 2.0) + 2.0 * np.clip((clearance - 0.06) / 0.15, 0, 1)
+    np.testing.assert_allclose((first["task_reward"] - second["task_reward"])[:, 0], lost, rtol=1e-4)
+
+
+def test_a_push_moves_the_body_by_its_impulse_and_ends():
+    still, pushed = make_env(num_envs=2), make_env(num_envs=2)
+    for env in (still, pushed):
+        env.reset()
+    pushed.push_torso(np.array([[0.0, 0.0, 0.0], [0.0, 60.0, 0.0]]))
+    zero = TensorDict({"action": torch.zeros(2, 21)}, [2])
+    for _ in range(8):  # 0.2 s
+        still.step(zero.clone())
+        pushed.step(zero.clone())
+    gained = pushed.simulation.kinematics().com_velocity - still.simulation.kinematics().com_velocity
+    assert (gained[0] == 0).all()
+    impulse = 60.0 * 0.2 / 40.844  # [m/s]; the floor adds and takes some
+    assert 0.3 * impulse < gained[1, 1] < 1.2 * impulse
+    assert abs(gained[1, 0]) < 0.1 * impulse
+    assert (pushed._push_left == 0).all()
+    assert (pushed._pushes() == 0).all()
+
+
+def test_random_pushes_come_as_often_and_as_hard_as_asked():
+    env = make_env(num_envs=200, push_force=100.0, push_interval=0.5)
+    env.reset()
+    forces = np.stack([env._pushes() for _ in range(400)])  # 10 s
+    sizes = np.linalg.norm(forces, axis=-1)
+    assert (forces[..., 2] == 0).all() and 99.0 < sizes.max() <= 100.0
+    begins = ((sizes[1:] > 0) & (sizes[:-1] != sizes[1:])).sum()
+    assert begins / 200 == pytest.approx(10 / (0.5 + 0.2), rel=0.05)  # none begins while one lasts
+    assert np.abs(forces.mean(axis=(0, 1))).max() < 2.0  # from every side
+
+
+def test_pushes_continue_exactly_from_a_saved_state():
+    env, other = make_env(push_force=80.0, push_interval=0.1), make_env(seed=9, push_force=80.0, push_interval=0.1)
+    roll(env, actions(env, 6))
+    other.reset()
+    other.load_simulator_state(env.simulator_state())
+    assert (env._push_left > 0).any()
+    for action in actions(env, 6, seed=1):
+        a = env.step(TensorDict({"action": action}, [3]))["next"]
+        b = other.step(TensorDict({"action": action}, [3]))["next"]
+        assert torch.equal(a["observation"], b["observation"])
