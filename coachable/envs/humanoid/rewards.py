@@ -59,6 +59,7 @@ def move_reward(
 
 COSTS = ("power", "impact", "clearance", "toe_strike", "drift")
 """What a walk costs besides, see `walk_costs`."""
+_WORST = 3.0  # of any of them in a control step
 _POWER = 1000.0  # [W] that cost 1
 _SOFT, _HARD = 1.5, 6.5  # forces under a foot [body weights] that cost 0 and 1
 _LOW, _HIGH = 0.06, 0.21  # clearances [m] that cost 0 and 1
@@ -69,7 +70,7 @@ _DRIFT = 0.10  # [m] to either side over a stride that cost 1
 def walk_costs(
     power: np.ndarray, forces: np.ndarray, clearance: np.ndarray, report: StepReport
 ) -> dict[str, np.ndarray]:
-    """Return what keeps a walk from being soft, low, straight and economical, each 0 at best and about 1 at worst.
+    """Return what keeps a walk from being soft, low, straight and economical, each 0 at best and 1 where a walk looks wrong.
 
     None of them is in the paper. Quantities of a step are paid once for each control step that it took.
 
@@ -83,10 +84,12 @@ def walk_costs(
         (N,) by the names of `COSTS`.
     """
     steps = report.duration / CONTROL_STEP
-    return {
-        "power": np.minimum(power / _POWER, 2.0),
-        "impact": np.clip((forces.max(axis=1) - _SOFT) / (_HARD - _SOFT), 0.0, 1.0),
-        "clearance": np.clip((clearance.max(axis=1) - _LOW) / (_HIGH - _LOW), 0.0, 1.0),
-        "toe_strike": steps * np.clip(report.pitch / _TOE_STRIKE, 0.0, 1.0),
-        "drift": steps * np.clip(np.abs(report.drift) / _DRIFT, 0.0, 1.0),
+    costs = {
+        "power": power / _POWER,
+        "impact": (forces.max(axis=1) - _SOFT) / (_HARD - _SOFT),
+        "clearance": (clearance.max(axis=1) - _LOW) / (_HIGH - _LOW),
+        "toe_strike": report.pitch / _TOE_STRIKE,
+        "drift": np.abs(report.drift) / _DRIFT,
     }
+    costs = {name: np.clip(cost, 0.0, _WORST) for name, cost in costs.items()}
+    return costs | {name: steps * costs[name] for name in ("toe_strike", "drift")}

@@ -263,7 +263,7 @@ def test_costs_are_taken_off_the_task_reward_and_change_nothing_else():
     for key in ("observation", "style_features", "walk"):
         assert torch.equal(first[key], second[key])
     clearance = plain.simulation.kinematics().foot_clearance.max(axis=1)
-    lost = 0.5 * np.minimum(plain.simulation.power() / 1000, 2.0) + 2.0 * np.clip((clearance - 0.06) / 0.15, 0, 1)
+    lost = 0.5 * np.minimum(plain.simulation.power() / 1000, 3.0) + 2.0 * np.clip((clearance - 0.06) / 0.15, 0, 3)
     np.testing.assert_allclose((first["task_reward"] - second["task_reward"])[:, 0], lost, rtol=1e-4)
 
 

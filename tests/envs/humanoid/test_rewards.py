@@ -57,16 +57,16 @@ def costs(power=0.0, forces=(0.0, 0.0), clearance=(0.0, 0.0), steps=0, **report)
     [
         ({}, {}),
         ({"power": 250.0}, {"power": 0.25}),
-        ({"power": 9000.0}, {"power": 2.0}),
+        ({"power": 9000.0}, {"power": 3.0}),
         ({"forces": (1.5, 0.3)}, {}),  # what walking takes is free
         ({"forces": (0.0, 4.0)}, {"impact": 0.5}),
-        ({"forces": (20.0, 0.0)}, {"impact": 1.0}),
+        ({"forces": (30.0, 0.0)}, {"impact": 3.0}),
         ({"clearance": (0.06, -0.01)}, {}),
         ({"clearance": (0.135, 0.0)}, {"clearance": 0.5}),
         ({"steps": 20, "pitch": np.deg2rad(5.0)}, {"toe_strike": 5.0}),  # paid for each control step of the step
         ({"steps": 20, "pitch": -0.2}, {}),  # heel first
         ({"steps": 10, "drift": -0.05}, {"drift": 5.0}),
-        ({"steps": 10, "drift": 0.5}, {"drift": 10.0}),
+        ({"steps": 10, "drift": 0.5}, {"drift": 30.0}),
     ],
 )
 def test_each_cost(walk, expected):
