@@ -70,7 +70,7 @@ _DRIFT = 0.10  # [m] to either side over a stride that cost 1
 def walk_costs(
     power: np.ndarray, forces: np.ndarray, clearance: np.ndarray, report: StepReport
 ) -> dict[str, np.ndarray]:
-    """Return what keeps a walk from being soft, low, straight and economical, each 0 at best and 1 where a walk looks wrong.
+    """Return what a walk costs that is not soft, low, straight and economical: 0 at best, 1 where it looks wrong.
 
     None of them is in the paper. Quantities of a step are paid once for each control step that it took.
 
