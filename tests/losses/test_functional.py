@@ -143,7 +143,7 @@ def test_terminal_values_are_selected_out() -> None:
     assert target.tolist() == pytest.approx([1.0, 1.0, 2.8])
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     st.lists(st.floats(-1e15, 1e15), min_size=4, max_size=4),
     st.lists(st.floats(-1e15, 1e15), min_size=3, max_size=3),

@@ -18,7 +18,9 @@ RECIPES = sorted(file.stem for file in (Path(__file__).resolve().parents[2] / "r
 TINY = ["preset=smoke", "env.num_envs=2", "threads.simulator=1", "threads.learner=1", "train.eval_interval=0"]
 TINY += ["init_random_frames=8", "train.warmup_frames=8", "train.batch_size=12", "eval.max_steps=3"]
 TINY += ["train.total_frames=28", "train.utd_ratio=0.125", "impersonation.n=0", "eval.num_envs=1"]
+TINY += ["replay_capacity=100", "event_capacity=60"]
 BRIEF = ["train.utd_ratio=0", "train.total_frames=3"]
+FULLY = ("humanoid_sac", "combat_cat_rac")  # continuous actions, and mixed ones
 POLICY_FIRST = {"qr_sac", "rac", "cat_rac", "sac_categorical"}  # paper, Appendix B
 
 
@@ -38,11 +40,19 @@ def _has_tables(recipe, replay):
 
 
 def _losses_and_buffers():
-    """Every loss with one buffer, so that every recipe is trained with every loss and with every buffer."""
+    """Every loss with one buffer for each kind of action; the other recipes share the losses, with every buffer each.
+
+    Their losses differ in nothing but their numbers: what a recipe gives to one, it gives to all of them.
+    """
+    losses = itertools.cycle(config_groups("humanoid_sac")["loss"])
     for recipe in RECIPES:
         groups = config_groups(recipe)
-        buffers = itertools.cycle([name for name in groups["replay"] if _has_tables(recipe, name)])
-        yield from ((recipe, loss, next(buffers)) for loss in groups["loss"] if _is_served(recipe, loss))
+        buffers = [name for name in groups["replay"] if _has_tables(recipe, name)]
+        if recipe in FULLY:
+            served = [loss for loss in groups["loss"] if _is_served(recipe, loss)]
+            yield from ((recipe, loss, buffer) for loss, buffer in zip(served, itertools.cycle(buffers), strict=False))
+        else:
+            yield from ((recipe, next(losses), buffer) for buffer in buffers)
 
 
 def test_recipes_were_found():

@@ -191,7 +191,7 @@ def make_buffer(routed: int, events: int, horizon: int, base: int, fed: int, n: 
     return buffer, Reference(capacities, routed, horizon, n, gamma or 1.0)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     seed=st.integers(0, 2**31),
     workers=st.integers(1, 3),
@@ -235,7 +235,7 @@ def test_tables_equal_the_reference(seed, workers, envs, events, routed, horizon
     assert buffer.write_count == source.count
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**31), envs=st.integers(1, 3), time=st.integers(1, 30), n=st.integers(1, 3))
 def test_small_tables_keep_the_newest(seed, envs, time, n):
     """Batches larger than a table, in one call or many, leave its last records."""

@@ -46,7 +46,7 @@ def test_centre_line_laps_are_those_of_the_specification(name, expected):
 def test_a_higher_price_saves_more_and_costs_more(car, resource, coarse_speeds):
     programme, free = lakeside(car)
     scale = {"tyre": free.wear, "fuel": free.fuel}[resource]
-    laps = programme.laps(resource, [0.0, 2.0 / scale, 8.0 / scale, 30.0 / scale])
+    laps = programme.laps(resource, [0.0, 3.0 / scale, 30.0 / scale])
     times = [lap.time for lap in laps]
     used = [{"tyre": lap.wear, "fuel": lap.fuel}[resource] for lap in laps]
     assert times[0] == pytest.approx(free.time, abs=1e-9)
