@@ -12,8 +12,8 @@ import pytest
 
 # Imported inside the fixtures: a test that needs none of this should not pay for it.
 
-# Read when torch is imported. Sums are rounded as the number of threads says, and TorchRL raises that number to what it
-# found first whenever a `SerialEnv` is closed, be it one of an earlier test that is collected in the middle of a training.
+# Read when torch is imported. Sums are rounded as the number of threads says. TorchRL raises it, up to what it was at
+# first, whenever a `SerialEnv` is closed, and one of an earlier test may be collected in the middle of a training.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 if os.environ.get("COACHABLE_SANITIZE") == "1":  # see CONTRIBUTING.md

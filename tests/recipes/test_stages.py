@@ -1,7 +1,9 @@
 """A training in stages: one run folder, resumed in any stage, bit for bit."""
 
 import shutil
+import weakref
 from importlib import import_module
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -69,6 +71,33 @@ def test_a_stage_starts_from_the_weights_of_the_one_before(tmp_path):
     assert find_checkpoint(tmp_path).parents[1].name == "2_second"
     with pytest.raises(CheckpointError, match="holds a run already"):
         start(*TINY, STAGES, f"run_dir={tmp_path}")
+
+
+def test_a_stage_is_forgotten_before_the_next_one_is_built(tmp_path):
+    """Its replay buffer takes memory, and TorchRL raises the number of threads when its environments are closed."""
+
+    class Stage:
+        frames, settings = 1, SimpleNamespace(total_frames=1)
+
+        def __init__(self):
+            self.cycle = self
+
+        def run(self):
+            return {}
+
+    remembered, built = weakref.WeakSet(), []
+
+    def build(config):
+        assert not remembered
+        stage = Stage()
+        remembered.add(stage)
+        built.append(config["stage"])
+        return stage
+
+    threads = {"simulator": 1, "learner": 1}
+    stages = [{"stage": name, "threads": threads} for name in ("first", "second", "third")]
+    Curriculum({"run_dir": str(tmp_path), "stages": stages, "init_from": None, "resume": None}, build).run()
+    assert built == ["first", "second", "third"]
 
 
 def test_what_the_command_line_says_holds_in_all_stages():

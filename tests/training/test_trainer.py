@@ -37,7 +37,8 @@ def test_n_plus_n_equals_2n_bit_for_bit(make_train, tmp_path):
     whole.run()
     half = make_train(tmp_path / "half", total_frames=160, utd_ratio=0.05)
     half.run()
-    rest = make_train(tmp_path / "half", total_frames=320, utd_ratio=0.05, seed=7)  # the checkpoint decides everything, not the seed
+    # The checkpoint decides everything, not the seed.
+    rest = make_train(tmp_path / "half", total_frames=320, utd_ratio=0.05, seed=7)
     rest.resume(tmp_path / "half")
     assert rest.frames == 160
     rest.run()
