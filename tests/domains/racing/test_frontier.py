@@ -17,7 +17,13 @@ from coachable.envs.racing.race.driver import line_geometry
 
 
 @pytest.fixture
-def coarse_speeds(monkeypatch):
+def long_stages(monkeypatch):
+    """Half as many stages of a lap."""
+    monkeypatch.setattr(frontier, "STAGE", 2 * frontier.STAGE)
+
+
+@pytest.fixture
+def coarse_speeds(monkeypatch, long_stages):
     """A quarter as many: enough to compare prices."""
     monkeypatch.setattr(frontier, "SPEEDS", frontier.SPEEDS[::4])
 
@@ -65,7 +71,7 @@ def test_a_ring_is_driven_at_the_speed_that_friction_allows():
 
 
 @pytest.mark.parametrize("car", ["gt3", "x2019"])
-def test_a_stint_lasts_about_ten_laps(car):
+def test_a_stint_lasts_about_ten_laps(car, long_stages):
     """An uncoached lap: the fastest of the programme on its own line."""
     programme = LapProgramme(load_track("lakeside"), load_car(car), Resources.calibrated(car), fuel=TANK / 2)
     [lap] = programme.laps("fuel", [0.0])
