@@ -59,13 +59,15 @@ def test_a_training_that_is_killed_in_its_stages_ends_like_an_uninterrupted_one(
 
 
 def test_a_stage_starts_from_the_weights_of_the_one_before(tmp_path):
-    once = ["train.utd_ratio=0", "train.checkpoint_interval=300", "train.eval_interval=0"]
-    curriculum = start(*TINY, STAGES, f"run_dir={tmp_path}", *once)
+    tiny = [argument for argument in TINY if not argument.startswith("train.utd_ratio")]
+    tiny += ["train.checkpoint_interval=300", "train.eval_interval=0", f"run_dir={tmp_path}"]
+    curriculum = start(*tiny, STAGES.replace("alpha: 0.2", "alpha: 0.2, train: {utd_ratio: 0}"))
     curriculum.run()
     states = [read_state(find_checkpoint(tmp_path / "stages" / name)) for name in ("1_first", "2_second")]
     for part in ("actor", "critics"):
         for name, value in states[0][part].items():
             assert torch.equal(value, states[1][part][name]), name
+    assert states[0]["learner"]["updates"] > states[1]["learner"]["updates"] == 0
     assert [state["loop"]["frames"] for state in states] == [24, 40]
     assert states[1]["config"]["loss"]["alpha_init"] == 0.2 and states[0]["config"]["loss"]["alpha_init"] == 0.01
     assert find_checkpoint(tmp_path).parents[1].name == "2_second"
@@ -134,8 +136,15 @@ def test_the_name_of_a_stage_leads_nowhere_else(name, tmp_path):
         Curriculum(config, build=None)
 
 
-@pytest.mark.parametrize("harm", [{"_target_": "builtins.print"}, "${oc.env:HOME}", 7])
-def test_a_saved_stage_names_nothing_that_the_recipe_does_not(harm, whole, tmp_path):
+@pytest.mark.parametrize(
+    "harm, message",
+    [
+        ({"_target_": "builtins.print"}, r"names 'builtins.print' as its env.nested._target_: expected none"),
+        ("${oc.env:HOME}", r"as its env.nested: expected a plain value"),
+        (7, r"frames_0*40"),
+    ],
+)
+def test_a_saved_stage_names_nothing_that_the_recipe_does_not(harm, message, whole, tmp_path):
     shutil.copytree(whole, tmp_path / "run")
     file = find_checkpoint(tmp_path / "run") / "state.pt"
     state = torch.load(file, weights_only=True)
@@ -144,5 +153,5 @@ def test_a_saved_stage_names_nothing_that_the_recipe_does_not(harm, whole, tmp_p
     else:
         state["config"]["stages"][1]["env"]["nested"] = harm
     torch.save(state, file)
-    with pytest.raises(CheckpointError):
+    with pytest.raises(CheckpointError, match=message):
         start(f"resume={tmp_path / 'run'}")

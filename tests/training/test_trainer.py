@@ -33,16 +33,16 @@ def test_the_test_environment_keeps_its_specs(make_echo_env):
 
 
 def test_n_plus_n_equals_2n_bit_for_bit(make_train, tmp_path):
-    whole = make_train(tmp_path / "whole", total_frames=320, utd_ratio=0.05)
+    whole = make_train(tmp_path / "whole", total_frames=320, utd_ratio=0.06)
     whole.run()
-    half = make_train(tmp_path / "half", total_frames=160, utd_ratio=0.05)
+    half = make_train(tmp_path / "half", total_frames=160, utd_ratio=0.06)
     half.run()
     # The checkpoint decides everything, not the seed.
-    rest = make_train(tmp_path / "half", total_frames=320, utd_ratio=0.05, seed=7)
+    rest = make_train(tmp_path / "half", total_frames=320, utd_ratio=0.06, seed=7)
     rest.resume(tmp_path / "half")
     assert rest.frames == 160
     rest.run()
-    assert whole.learner.updates == rest.learner.updates == (320 - 40) // 20
+    assert whole.learner.updates == rest.learner.updates == 16  # 0.06 of 280
     states = [read_state(find_checkpoint(tmp_path / name)) for name in ("whole", "half")]
     expected, found = (dict(_tensors(state)) for state in states)
     assert expected.keys() == found.keys()
