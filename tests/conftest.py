@@ -29,6 +29,7 @@ def pytest_collection_finish() -> None:
     """Spare the garbage collector what was imported, and racing environments the same speeds again and again."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(20_000, 20, 20)  # rarely: tests leave little behind
     gc.enable()
     for name in ("env", "race.driver"):
         module = sys.modules.get(f"coachable.envs.racing.{name}")
@@ -37,7 +38,7 @@ def pytest_collection_finish() -> None:
 
 
 def _remembering(speed_profile: Callable[..., Any]) -> Callable[..., Any]:
-    """Compute the speeds of each car on each line once, in a second or so."""
+    """Return a function that computes the speeds of each car on each line once."""
     known: dict[Any, Any] = {}
 
     def remember(envelope: Any, curvature: Any, spacing: Any) -> Any:
