@@ -116,15 +116,6 @@ class ActorCriticLoss(SACLoss):
         """Return the successor's value (...,) or quantiles (..., M) from the target critics' output (K, ..., out)."""
         return self._values(output).min(0).values
 
-    def _soft_target(
-        self, reward: Tensor, next_value: Tensor, log_prob: Tensor, terminated: Tensor, steps: Tensor | None
-    ) -> Tensor:
-        """Return the target; the successor's entropy is inside the discount, so that terminals have none."""
-        if next_value.ndim > log_prob.ndim:
-            log_prob = log_prob.unsqueeze(-1)
-        soft = next_value - self._alpha * log_prob
-        return bootstrap_target(reward, soft, terminated, self._gamma, steps)
-
     def _errors(self, output: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         """Return the losses (K, ...) of the critics against the target, and their absolute TD errors (K, ...)."""
         raise NotImplementedError
@@ -165,7 +156,10 @@ class ActorCriticLoss(SACLoss):
 
     @torch.no_grad()
     def compute_target(self, tensordict: TensorDictBase) -> Tensor:
-        """Return the target, (...,) or (..., M), from hard actions of the present policy and the target critics."""
+        """Return the target, (...,) or (..., M), from hard actions of the present policy and the target critics.
+
+        The successor's entropy is inside the discount, so that terminals have none.
+        """
         successor = tensordict.get("next")
         with self._without_dropout():
             policy = self._policy_at(successor)
@@ -174,11 +168,13 @@ class ActorCriticLoss(SACLoss):
             output = self._critics_at(successor, action, self.target_qvalue_network_params)
         with self._full_precision():
             next_value = self._next_value(at_least_float32(output))
-            return self._soft_target(
+            if next_value.ndim > log_prob.ndim:
+                log_prob = log_prob.unsqueeze(-1)
+            return bootstrap_target(
                 self._scalar(successor, self.tensor_keys.reward).to(next_value.dtype),
-                next_value,
-                log_prob,
+                next_value - self._alpha * log_prob,
                 self._scalar(successor, self.tensor_keys.terminated),
+                self._gamma,
                 self._scalar(tensordict, self.value_estimator.tensor_keys.steps_to_next_obs, required=False),
             )
 
