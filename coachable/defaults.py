@@ -24,8 +24,9 @@ from coachable.styles import (
     StyleSpace,
     WeightedFeature,
     WeightedSum,
+    feature,
+    scalar_feature,
 )
-from coachable.styles.reward import feature, scalar_feature
 
 __all__ = ["EnvPictures", "RewardMeasures", "simulation_of", "steps_per_episode", "style_grid", "time_per_step"]
 

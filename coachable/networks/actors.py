@@ -82,7 +82,6 @@ def make_gaussian_actor(
     widths: Sequence[int] = (512, 512, 512),
     *,
     log_scale_range: tuple[float, float] = (-5.0, 2.0),
-    observation_key: str = "observation",
     action_spec: Bounded | None = None,
     **trunk: Any,
 ) -> ProbabilisticActor:
@@ -94,7 +93,6 @@ def make_gaussian_actor(
         space: Style space; theta is read from the key `style` and encoded inside. `None` for no style.
         widths: Widths of the residual layers.
         log_scale_range: Bounds of the logarithm of the scale, see :class:`GaussianPolicy`.
-        observation_key: Key of the observation.
         action_spec: Spec of the action; default [-1, 1] in every dimension.
         **trunk: Further arguments of :class:`~coachable.networks.residual.ResidualMLP`.
 
@@ -102,7 +100,7 @@ def make_gaussian_actor(
         A `ProbabilisticActor` reading `observation` and `style`, writing `loc`, `scale` and `action`.
     """
     policy = GaussianPolicy(obs_dim, action_dim, space, widths, log_scale_range=log_scale_range, **trunk)
-    in_keys: list[Any] = [observation_key] if space is None else [observation_key, STYLE]
+    in_keys: list[Any] = ["observation"] if space is None else ["observation", STYLE]
     module = TensorDictModule(policy, in_keys=in_keys, out_keys=["loc", "scale"])  # pyright: ignore[reportArgumentType]
     return ProbabilisticActor(
         module,

@@ -56,8 +56,6 @@ def make_critic(
     widths: Sequence[int] = (512, 512, 512),
     *,
     num_outputs: int = 1,
-    observation_key: str = "observation",
-    action_key: str = "action",
     **trunk: Any,
 ) -> ValueOperator:
     """Build one critic.
@@ -71,13 +69,11 @@ def make_critic(
         space: Style space; theta is read from the key `style` and encoded inside. `None` for no style.
         widths: Widths of the residual layers.
         num_outputs: 1 for a scalar value, else the number of quantiles or logits.
-        observation_key: Key of the observation.
-        action_key: Key of the action.
         **trunk: Further arguments of :class:`~coachable.networks.residual.ResidualMLP`.
 
     Returns:
         A `ValueOperator` reading `observation`, `action`, `style` and writing `state_action_value`.
     """
     critic = StyleCritic(obs_dim, action_dim, space, widths, num_outputs=num_outputs, **trunk)
-    in_keys = [observation_key, action_key] if space is None else [observation_key, action_key, STYLE]
+    in_keys = ["observation", "action"] if space is None else ["observation", "action", STYLE]
     return ValueOperator(critic, in_keys=in_keys, out_keys=["state_action_value"])

@@ -6,33 +6,9 @@ from typing import Any
 from torch import Tensor, nn
 
 from coachable.styles.space import StyleSpace
-from coachable.styles.terms import (
-    ChoiceTolerance,
-    Features,
-    SetpointTolerance,
-    StyleTerm,
-    Term,
-    WeightedFeature,
-    WeightedSum,
-    feature,
-    scalar_feature,
-    weighted_sum,
-)
-from coachable.styles.tolerance import tolerance
+from coachable.styles.terms import Features, StyleTerm, WeightedFeature, WeightedSum
 
-__all__ = [
-    "ChoiceTolerance",
-    "SetpointTolerance",
-    "StyleReward",
-    "StyleTerm",
-    "Term",
-    "WeightedFeature",
-    "WeightedSum",
-    "feature",
-    "scalar_feature",
-    "tolerance",
-    "weighted_sum",
-]
+__all__ = ["StyleReward"]
 
 
 class StyleReward(nn.Module):
@@ -70,11 +46,6 @@ class StyleReward(nn.Module):
         # Registered, so that `.to(device)` reaches the weights of a module used as a term.
         functions = {name: getattr(term, "function", None) for name, term in terms.items()}
         self.modules_of_terms = nn.ModuleDict({n: f for n, f in functions.items() if isinstance(f, nn.Module)})
-
-    @property
-    def term_names(self) -> tuple[str, ...]:
-        """Names of the terms, in the order in which they are added."""
-        return tuple(self.scales)
 
     @property
     def terms(self) -> dict[str, StyleTerm]:
