@@ -61,7 +61,7 @@ class RewardMeasures:
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
         """See `StyleMeasures.step`."""
         theta, features = transition.get(STYLE), transition.get(("next", STYLE_FEATURES))
-        style, paid = self._reward.space.lazy_view(theta), self._reward.terms_of(features, theta)
+        style, paid = self._reward.space.view(theta), self._reward.terms_of(features, theta)
         found: dict[str, Tensor] = {}
         for name, term in self._reward.terms.items():
             if isinstance(term, SetpointTolerance):

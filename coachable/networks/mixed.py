@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from tensordict.nn import InteractionType, TensorDictModule
-from torch import Tensor, nn
-from torchrl.data import TensorSpec
+from tensordict.nn import InteractionType
+from torch import Tensor
 from torchrl.modules import ProbabilisticActor
 
 from coachable.distributions.action_heads import ActionHeads
@@ -16,11 +15,10 @@ from coachable.distributions.categorical import regret_matching_probabilities
 from coachable.distributions.mixed_action import MixedAction
 from coachable.distributions.tanh_gaussian import at_least_float32
 from coachable.keys import STYLE
-from coachable.networks.actors import StyleEncoding
-from coachable.networks.residual import ResidualMLP
+from coachable.networks.actors import StyleEncoding, StyleNetwork, TensorModule
 
 
-class MixedPolicy(nn.Module):
+class MixedPolicy(StyleNetwork):
     """Probabilities of the categorical heads, location and scale of the axes, given observation and style.
 
     The trunk sees `cat(observation, encode(theta))`. Heads run in float32, also under autocast. The scale of the axes
@@ -42,20 +40,12 @@ class MixedPolicy(nn.Module):
         widths: Sequence[int] = (512, 512, 512),
         **trunk: Any,
     ) -> None:
-        super().__init__()
+        super().__init__(space, obs_dim, heads.num_parameters, widths, **trunk)
         self.heads = heads
-        self.space = space
-        style_dim = space.dim if space is not None else 0
-        self.trunk = ResidualMLP(obs_dim + style_dim, heads.num_parameters, widths, **trunk)
 
     def forward(self, observation: Tensor, style: Tensor | None = None) -> tuple[Tensor, ...]:
         """Return `probs` if there are categorical heads, then `loc` and `scale` if there are axes, float32."""
-        inputs = (observation,)
-        if self.space is not None:
-            if style is None:
-                raise ValueError("this policy is conditioned on a style: pass theta as the second argument")
-            inputs = (observation, self.space.encode(style))
-        raw = at_least_float32(self.trunk(*inputs))
+        raw = at_least_float32(self.head(observation, style))
         preferences, loc, raw_scale = raw.split((self.heads.num_categorical, self.heads.axes, self.heads.axes), -1)
         outputs: tuple[Tensor, ...] = ()
         if self.heads.categorical:
@@ -70,8 +60,6 @@ def make_mixed_actor(
     heads: ActionHeads | Mapping[str, Any],
     space: StyleEncoding | None,
     widths: Sequence[int] = (512, 512, 512),
-    *,
-    action_spec: TensorSpec | None = None,
     **trunk: Any,
 ) -> ProbabilisticActor:
     """Build the policy of RAC and Cat-RAC.
@@ -82,7 +70,6 @@ def make_mixed_actor(
             works with only axes or only categorical heads.
         space: Style space; theta is read from the key `style` and encoded inside. None for no style.
         widths: Widths of the residual layers.
-        action_spec: Spec of the action, by default `heads.spec()`.
         **trunk: Further arguments of `ResidualMLP`.
 
     Returns:
@@ -100,9 +87,9 @@ def make_mixed_actor(
     names: list[Any] = (["probs"] if heads.categorical else []) + (["loc", "scale"] if heads.axes else [])
     in_keys: list[Any] = ["observation"] if space is None else ["observation", STYLE]
     return ProbabilisticActor(
-        TensorDictModule(MixedPolicy(obs_dim, heads, space, widths, **trunk), in_keys=in_keys, out_keys=names),
+        TensorModule(MixedPolicy(obs_dim, heads, space, widths, **trunk), in_keys=in_keys, out_keys=names),
         in_keys=names,
-        spec=heads.spec() if action_spec is None else action_spec,
+        spec=heads.spec(),
         distribution_class=MixedAction,
         distribution_kwargs={"heads": heads},
         default_interaction_type=InteractionType.RANDOM if heads.categorical else InteractionType.DETERMINISTIC,

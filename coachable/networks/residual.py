@@ -11,7 +11,7 @@ a collector holds a copy of it that nobody has put into evaluation mode.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -20,7 +20,6 @@ from torch import Tensor, nn
 from coachable.ranges import Range
 
 Side = Literal["end", "beginning"]
-Padding = Literal["alternate", "end", "beginning"]
 
 
 def fit_features(x: Tensor, width: int, side: Side = "end") -> Tensor:
@@ -57,7 +56,6 @@ class ResidualBlock(nn.Module):
         out_features: Width of the output.
         side: Padding side of the identity path, see :func:`fit_features`.
         layer_norm: Without it the layer is `ReLU(W x + b) + fit(x)`.
-        eps: Epsilon of the layer norm.
         dropout: Probability with which a unit is dropped after the ReLU, in training mode and where gradients are on.
     """
 
@@ -68,12 +66,11 @@ class ResidualBlock(nn.Module):
         *,
         side: Side = "end",
         layer_norm: bool = True,
-        eps: float = 1e-5,
         dropout: float = 0.0,
     ) -> None:
         super().__init__()
         self.linear = nn.Linear(in_features, out_features)
-        self.norm = nn.LayerNorm(out_features, eps=eps) if layer_norm else None
+        self.norm = nn.LayerNorm(out_features) if layer_norm else None
         self.side: Side = side
         self.dropout = nn.Dropout(dropout) if dropout else None
         self.reset_parameters()
@@ -103,20 +100,19 @@ class ResidualBlock(nn.Module):
 class ResidualMLP(nn.Module):
     """Stack of residual layers with a linear head.
 
+    Layers pad their input at the end and at the beginning in turns, which makes no difference between equal widths.
+
     Args:
         in_features: Width of the input.
         out_features: Width of the head; `None` leaves the head out.
         widths: Widths of the layers. The paper uses three of 512 (humanoid), 4096, 2048, 1024, 512 (combat).
-        padding: Padding side of the layers: `"alternate"` (end, beginning, end, … as in combat), one side for all, or
-            one side per layer. Irrelevant between layers of equal width.
         layer_norm: Layer norm before the activation of every layer.
-        eps: Epsilon of the layer norms.
         head_gain: Factor on the head's initial weights. With the paper's Glorot weights (1) and inputs of unit size the
             outputs have a standard deviation of about 2, where tanh is nearly flat: a policy may want less.
         dropout: Probability with which a layer's unit is dropped while learning; see the module.
 
     Raises:
-        ValueError: If a width is not positive, `padding` is unknown, or `dropout` is not in [0, 1).
+        ValueError: If a width is not positive, or `dropout` is not in [0, 1).
 
     Example:
         >>> ResidualMLP(10, 2, widths=(64, 64))(torch.zeros(5, 10)).shape
@@ -129,9 +125,7 @@ class ResidualMLP(nn.Module):
         out_features: int | None,
         widths: Sequence[int] = (512, 512, 512),
         *,
-        padding: Padding | Sequence[Side] = "alternate",
         layer_norm: bool = True,
-        eps: float = 1e-5,
         head_gain: float = 1.0,
         dropout: float = 0.0,
     ) -> None:
@@ -139,14 +133,13 @@ class ResidualMLP(nn.Module):
         if not widths or min(in_features, *widths) < 1:
             raise ValueError(f"widths must be positive and at least one, got in_features={in_features}, {widths=}")
         Range("[0, 1)").check("dropout", dropout)
-        sides = _sides(padding, len(widths))
         self.in_features = in_features
         self.out_features = out_features
         ins = (in_features, *widths[:-1])
         self.blocks = nn.Sequential(
             *(
-                ResidualBlock(i, o, side=side, layer_norm=layer_norm, eps=eps, dropout=dropout)
-                for i, o, side in zip(ins, widths, sides, strict=True)
+                ResidualBlock(ins[k], o, side="beginning" if k % 2 else "end", layer_norm=layer_norm, dropout=dropout)
+                for k, o in enumerate(widths)
             )
         )
         self.head = None if out_features is None else nn.Linear(widths[-1], out_features)
@@ -177,7 +170,7 @@ def with_new_inputs(weights: Mapping[str, Tensor], seen: int, new: int) -> dict[
 
     Args:
         weights: `blocks.0.linear.weight` and so on, with any leading dimensions (a stack of critics), of a network
-            whose first layer pads at the end, as it does by default.
+            whose first layer pads at the end.
         seen: Inputs before the new ones.
         new: How many there are.
 
@@ -209,15 +202,3 @@ def with_new_inputs(weights: Mapping[str, Tensor], seen: int, new: int) -> dict[
             value = value.index_select(-1, order)
         wide[name] = value
     return wide
-
-
-def _sides(padding: Padding | Sequence[Side], layers: int) -> tuple[Side, ...]:
-    alternate: tuple[Side, Side] = ("end", "beginning")
-    if padding == "alternate":
-        return tuple(alternate[i % 2] for i in range(layers))
-    sides = (padding,) * layers if isinstance(padding, str) else tuple(padding)
-    if len(sides) != layers or any(side not in get_args(Side) for side in sides):
-        raise ValueError(
-            f"padding must be 'alternate', 'end', 'beginning' or one side per layer ({layers}), got {padding!r}"
-        )
-    return sides  # pyright: ignore[reportReturnType]  # checked above

@@ -70,7 +70,7 @@ class StyleReward(nn.Module):
         Raises:
             ValueError: If a term returns another shape than one number per style.
         """
-        style = self.space.lazy_view(theta)
+        style = self.space.view(theta)
         total: Tensor | None = None
         for name, term, scale in self._terms:
             value = self._checked(name, term(features, style), theta)
@@ -82,7 +82,7 @@ class StyleReward(nn.Module):
 
     def terms_of(self, features: Features, theta: Tensor) -> dict[str, Tensor]:
         """Return each term before its scale, `(...,)`, for logging and reports."""
-        style = self.space.lazy_view(theta)
+        style = self.space.view(theta)
         return {name: self._checked(name, term(features, style), theta) for name, term, _ in self._terms}
 
     @staticmethod

@@ -11,7 +11,7 @@ SHAPES = {
     "equal": (70, (64, 64, 64), {}),
     "padded": (40, (96, 64, 32), {}),
     "narrowing": (200, (96, 64, 32), {}),
-    "all_beginning": (40, (64, 80, 64), {"padding": "beginning"}),
+    "beginning": (40, (64, 80, 64), {}),
     "no_norm": (40, (64, 64), {"layer_norm": False}),
     "no_head": (40, (64, 64), {}),
     "wide_head": (40, (64, 64), {}),

@@ -42,7 +42,6 @@ def test_initialisation_is_glorot_uniform_with_zero_bias():
         (1500, {}, 0),
         (2048, {}, 0),
         (2600, {}, 40),
-        (2600, {"padding": "end"}, 512),
     ],
 )
 def test_identity_paths_of_the_padded_network(in_features, options, paths):
@@ -86,7 +85,7 @@ def test_head_is_float32_under_autocast():
 
 @pytest.mark.parametrize(
     "options",
-    [{"widths": ()}, {"widths": (4, 0)}, {"padding": "left"}, {"padding": ("end",)}, {"dropout": 1.0}],
+    [{"widths": ()}, {"widths": (4, 0)}, {"dropout": 1.0}],
 )
 def test_bad_options_raise(options):
     with pytest.raises(ValueError, match=r"must be|dropout is 1.0: expected a number in \[0, 1\)"):
