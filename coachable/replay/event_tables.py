@@ -31,9 +31,8 @@ class EventTableBuffer(TensorDictReplayBuffer):
 
     Batches `(steps,)` are read as time-major (all environments at one time, then at the next), batches `(num_envs,
     time)` as TorchRL's collectors yield them. Trajectory numbers, `("collector", "traj_ids")`, override both. Episodes
-    may span any number of `extend` calls; batches of several workers may be interleaved (`extend(data, worker=i)`,
-    needed only where trajectory numbers are not unique across workers). All of it runs in the process that calls
-    `extend`.
+    may span any number of `extend` calls, and batches of several workers may be interleaved if they carry trajectory
+    numbers. All of it runs in the process that calls `extend`.
 
     Samples carry `index` and `table`, the number of the table in `names`.
 
@@ -198,12 +197,11 @@ class EventTableBuffer(TensorDictReplayBuffer):
         tables = {f"tables/{name}/{key}": v for name, row in self.statistics().items() for key, v in row.items()}
         return {**super().stats(), **tables}
 
-    def extend(self, tensordicts: TensorDictBase, *, worker: int = 0, update_priority: bool | None = None) -> Tensor:
+    def extend(self, tensordicts: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
         """Add steps; the input is left as it is.
 
         Args:
             tensordicts: `(steps,)`, time-major, or `(num_envs, time)`, as collectors yield them.
-            worker: Number of the worker that collected them.
             update_priority: Not used: new records get the largest priority seen so far.
 
         Returns:
@@ -216,7 +214,7 @@ class EventTableBuffer(TensorDictReplayBuffer):
         if tensordicts is None:
             return torch.zeros(0, dtype=torch.long)
         with self._replay_lock, self._write_lock:
-            index = self._writer.extend(tensordicts, worker)
+            index = self._writer.extend(tensordicts)
             self._sampler.extend(index)
         return index
 

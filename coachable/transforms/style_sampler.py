@@ -39,7 +39,6 @@ class StyleSampler(Transform):
         sampler: Distribution to draw from; the space's own if None.
         seed: Seed of this transform's generator; taken from the operating system if None, so that workers differ. With
             `CoachableEnv`, `env.set_seed` reaches it.
-        device: Where styles are drawn; they are then moved to the environment's device.
 
     Raises:
         ValueError: If the sampler's dimension is not the space's.
@@ -50,7 +49,6 @@ class StyleSampler(Transform):
         space: StyleSpace,
         sampler: Sampler | None = None,
         seed: int | None = None,
-        device: torch.device | str = "cpu",
     ) -> None:
         super().__init__(in_keys=[], out_keys=[STYLE])
         self.space = space
@@ -59,7 +57,7 @@ class StyleSampler(Transform):
             raise ValueError(
                 f"sampler has dimension {self.sampler.dim}, the style space {list(space.names)} has {space.dim}."
             )
-        self.generator = torch.Generator(device)
+        self.generator = torch.Generator()
         self._held: Tensor | None = None
         self._seeded = False
         self.set_seed(seed)
@@ -142,14 +140,13 @@ class StyleSampler(Transform):
 
     def __getstate__(self) -> dict[str, Any]:
         state = super().__getstate__()
-        generator = state.pop("generator")
-        state["generator"] = (str(generator.device), generator.get_state())
+        state["generator"] = state["generator"].get_state()
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        device, generator_state = state.pop("generator")
+        generator_state = state.pop("generator")
         super().__setstate__(state)
-        self.generator = torch.Generator(device)
+        self.generator = torch.Generator()
         if self._seeded:
             self.generator.set_state(generator_state)
         else:  # copies sent to workers must not draw the same styles
@@ -194,7 +191,6 @@ def coachable_env(
     *transforms: Transform,
     sampler: Sampler | None = None,
     seed: int | None = None,
-    sampler_device: torch.device | str = "cpu",
     **kwargs: Any,
 ) -> CoachableEnv:
     """Add styles to a domain: `StyleSampler`, then `StyleRewardTransform`, then any further transforms.
@@ -206,13 +202,12 @@ def coachable_env(
         *transforms: Further transforms, such as `StepCounter` or `RewardSum`.
         sampler: Distribution of styles; the space's own if None.
         seed: Seeds the environment and its transforms, if given.
-        sampler_device: Where styles are drawn.
         **kwargs: For `TransformedEnv`.
 
     Returns:
         The environment, ready for a collector.
     """
-    styles = StyleSampler(space, sampler, seed=seed, device=sampler_device)
+    styles = StyleSampler(space, sampler, seed=seed)
     chain = Compose(styles, StyleRewardTransform(style_reward), *transforms)  # pyright: ignore[reportCallIssue]
     env = CoachableEnv(base_env=base_env, transform=chain, **kwargs)
     if seed is not None:

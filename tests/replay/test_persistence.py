@@ -61,7 +61,7 @@ def use(buffer: EventTableBuffer, start: int, stop: int) -> list[TensorDict]:
     """Extends, samples and updates priorities, as a training does."""
     samples = []
     for seed in range(start, stop):
-        buffer.extend(batch(seed), worker=seed % 2)
+        buffer.extend(batch(seed))
         samples.append(buffer.sample())
         if buffer.sampler.prioritized:
             samples[-1]["td_error"] = samples[-1]["next", "reward"].squeeze(-1)
