@@ -45,8 +45,8 @@ def read_replay(replay: ReplayBuffer, folder: Path) -> int:
             it).
     """
     storage: Any = replay.storage  # typed too narrowly in TorchRL: it takes slices and tensors
-    filled = read_records(storage, folder)
     state = load_state(folder / "state.pt")  # of a buffer without records, too: it may hold steps back
+    filled = read_records(storage, folder)
     with refusing(folder / "state.pt", "the state of a replay buffer"):
         # The records are in place already: the storage gets its own state.
         replay.load_state_dict({**state, "_storage": storage.state_dict()})
