@@ -13,6 +13,7 @@ from tensordict import TensorDict
 from coachable.domains.racing.families import racing_family
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
 from coachable.training.trainer import REPLAY_KEYS
+from coachable.training.weights import load_policy
 
 RECIPES = sorted(file.stem for file in (Path(__file__).resolve().parents[2] / "recipes" / "configs").glob("*_*.yaml"))
 TINY = ["preset=smoke", "env.num_envs=2", "threads.simulator=1", "threads.learner=1", "train.eval_interval=0"]
@@ -73,6 +74,27 @@ def test_every_loss_and_every_replay_buffer_train(recipe, loss, replay, tmp_path
         assert train.replay.names == ("solo", "recovery") and "scenario" in set(sample.keys())
         return
     assert train.replay.names[:1] == ("default",) and (len(train.replay.names) > 1) == (replay == "event_tables")
+
+
+def test_the_papers_racing_learns_with_dropout_and_acts_without(tmp_path):
+    tiny = ["preset=paper", "device=cpu", "env.num_envs=3", "network.actor.widths=[8,8]", "network.critic.widths=[8]"]
+    tiny += ["replay_capacity=300", "init_random_frames=0", "train.warmup_frames=3", "train.total_frames=18"]
+    tiny += ["train.utd_ratio=0.25", "n_steps=2", "train.batch_size=8", "threads.learner=1"]
+    train = import_module("racing_qr_sac").build(compose_config("racing_qr_sac", [*TINY, *tiny, f"run_dir={tmp_path}"]))
+    policy = train.collector.policy
+    dropped = []
+    for module in policy.modules():
+        if isinstance(module, torch.nn.Dropout):
+            assert module.p == 0.1
+            module.register_forward_hook(lambda *_: dropped.append(train.learner.updates))
+    acted = next(iter(train.collector)).select("observation", "style", "loc")
+    assert not dropped
+    train.run()
+    assert train.learner.updates == 2 and dropped == [0, 0, 1, 1]  # two layers, in the policy's loss alone
+    loaded = load_policy(tmp_path).actor
+    with torch.no_grad():
+        again, mode = policy(acted.clone())["loc"], loaded(acted.clone())["loc"]
+    assert torch.equal(again, mode) and torch.equal(loaded(acted.clone())["loc"], mode)
 
 
 def test_returns_over_several_steps_are_relabelled_by_the_sum_of_their_features(tmp_path):

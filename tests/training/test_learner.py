@@ -6,7 +6,8 @@ import pytest
 import torch
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from coachable.training import Learner, NonFiniteLossError, resolve_precision
+from coachable.training.learner import Learner, NonFiniteLossError
+from coachable.training.precision import resolve_precision
 from tests import sac_problem
 from tests.sac_problem import ACT, make_batch, make_loss
 
