@@ -35,7 +35,7 @@ def drawing(
         grid: whether the panels have grid lines.
         **options: further arguments of `matplotlib.pyplot.subplots`.
     """
-    with plt.rc_context({"axes.grid": grid, "grid.alpha": 0.3}):
+    with plt.rc_context({"axes.grid": grid, "grid.alpha": 0.3 if grid else 1.0}):
         figure, panels = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained", **options)
     try:
         yield panels

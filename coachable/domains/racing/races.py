@@ -245,7 +245,7 @@ def _rows(cells: Sequence[tuple[str, float]], found: Mapping[str, np.ndarray]) -
 def draw_radar(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """One radar per setting, one polygon per margin; every axis runs from the lowest to the highest value on it."""
     angles = np.linspace(0.0, 2.0 * np.pi, len(_METRICS), endpoint=False) + np.pi / 2
-    with drawing(path, 1, len(SETTINGS), size=(9.5, 4.6), subplot_kw={"projection": "polar"}) as panels:
+    with drawing(path, 1, len(SETTINGS), size=(9.5, 4.6), grid=False, subplot_kw={"projection": "polar"}) as panels:
         for panel, setting in zip(panels[0], SETTINGS, strict=True):
             own = [row for row in rows if row["setting"] == setting]
             table = np.array([[row[name] for name in _METRICS] for row in own])
