@@ -1,37 +1,31 @@
-"""The numbers of a configuration and the ranges in which they make sense."""
+"""What is wrong with a configuration, in one sentence that names the key and what is valid."""
 
+import difflib
+from collections.abc import Iterable
+from dataclasses import Field, fields, is_dataclass
 from typing import Any
+
+from configs.schema import RacingSettings, Settings, composed_type
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException, ValidationError
 
 from coachable.ranges import AMOUNT, COUNT, FINITE, NOT_NEGATIVE, POSITIVE, SHARE, Range
 
-# By the end of a number's path in the configuration, so that `gamma` is that of the losses and that of replay; `*` is
-# any entry of a list or group. Numbers that are not listed have to be finite.
-RANGES: dict[str, Range] = {
-    "seed": Range("[0, 4e9]", whole=True),
-    "init_new_observations": AMOUNT,
-    "init_random_frames": AMOUNT,
+# Ranges of numbers in the groups that take what their target takes, by the end of the number's path; `*` is any entry
+# of a list or group. The schema declares the others; `replay.gamma` and `loss.alpha` have those of `gamma` and `alpha`.
+RANGES: dict[str, Range] = {entry.name: entry.metadata["range"] for entry in fields(Settings) if entry.metadata} | {
     # losses
-    "gamma": SHARE,
-    "alpha": POSITIVE,
     "alpha_init": POSITIVE,
-    "entropy_samples": COUNT,
     "num_quantiles": COUNT,
     "kappa": NOT_NEGATIVE,
     "num_atoms": Range("[2, inf)", whole=True),
     "sigma_ratio": POSITIVE,
     # replay
-    "n_steps": COUNT,
-    "replay_capacity": COUNT,
     "capacity": COUNT,
     "table_capacities.*": COUNT,
-    "event_capacity": COUNT,
-    "event_horizon": COUNT,
-    "event_share": Range("(0, 1)"),
     "table_proportions.*": SHARE,
     "priority_alpha": NOT_NEGATIVE,
     "priority_beta": NOT_NEGATIVE,
-    "mirror": SHARE,
-    "impersonation.n": AMOUNT,
     # sampler
     "share": SHARE,
     "neutral": SHARE,
@@ -42,33 +36,13 @@ RANGES: dict[str, Range] = {
     "widths.*": COUNT,
     "categorical.*": COUNT,
     "axes": AMOUNT,
-    "num_critics": COUNT,
     "num_outputs": COUNT,
     "head_gain": NOT_NEGATIVE,
-    # learner
-    "actor_lr": NOT_NEGATIVE,
-    "critic_lr": NOT_NEGATIVE,
+    # learner, beyond what the configuration lists
     "alpha_lr": NOT_NEGATIVE,
-    "adam_eps": POSITIVE,
-    "tau": Range("(0, 1]"),
-    "max_grad_norm": Range("(0, inf)", optional=True),
     "check_every": AMOUNT,
-    # train
-    "total_frames": COUNT,
-    "batch_size": COUNT,
-    "warmup_frames": AMOUNT,
-    "utd_ratio": Range("[0, inf)", optional=True),
-    "throttle": Range("(0, inf)", optional=True),
-    "anneal": SHARE,
-    "anneal_entropy": Range("(0, 1]"),
-    "eval_interval": AMOUNT,
-    "log_interval": NOT_NEGATIVE,
-    "checkpoint_interval": NOT_NEGATIVE,
-    "max_steps": COUNT,
-    "keep": COUNT,
-    "threads.*": Range("[1, inf)", whole=True, optional=True),
+    # collector, env and style_reward
     "num_collectors": COUNT,
-    # env and style_reward
     "num_envs": COUNT,
     "episode_steps": COUNT,
     "seconds": POSITIVE,
@@ -81,15 +55,59 @@ RANGES: dict[str, Range] = {
     "style_reward.*": NOT_NEGATIVE,
 }
 
+_KINDS = {bool: "true or false", str: "a name or path", str | None: "a name or path, or null"}
+
+
+def choices(given: str, valid: Iterable[str]) -> str:
+    """Return the sentences that follow the name of something misspelt: the closest valid name, and all of them."""
+    valid = list(valid)
+    close = difflib.get_close_matches(given, valid, n=1)
+    guess = f" Did you mean {close[0]}?" if close else ""
+    return f"{guess} Valid: {', '.join(valid) or 'none'}"
+
+
+def mistake_in(error: OmegaConfBaseException) -> str:
+    """Say what OmegaConf refused: a key that there is not, or a value of another type."""
+    key = str(error.full_key)
+    where, _, part = key.rpartition(".")
+    parent = error.parent_node
+    if isinstance(error, ConfigAttributeError | ConfigKeyError) and isinstance(parent, DictConfig):
+        names = [str(name) for name in parent if name != "hydra" and not str(name).startswith("_")]
+        return f"{key} does not exist: {where or 'the configuration'} has no {part!r}.{choices(part, names)}"
+    entry = _declared(tuple(key.split(".")))
+    if isinstance(error, ValidationError) and entry is not None:
+        return f"{key}={error.value}: expected {_in_words(entry)}".replace("None", "null")
+    return f"{key}: {str(error).splitlines()[0]}"
+
+
+def typed_settings(config: dict[str, Any]) -> Settings:
+    """Return a plain configuration as typed settings; entries that the command line added with `+` are left out.
+
+    Args:
+        config: Plain containers, resolved.
+
+    Raises:
+        ValueError: If a key is missing or unknown, or a value has another type.
+    """
+    config = {"stages": [], "stage": None, **config}
+    known = {entry.name: config[entry.name] for entry in fields(Settings) if entry.name in config}
+    try:
+        merged = OmegaConf.merge(OmegaConf.structured(composed_type(Settings)), known)
+        return _typed(Settings, OmegaConf.to_container(merged, throw_on_missing=True))
+    except OmegaConfBaseException as error:
+        raise ValueError(mistake_in(error)) from None
+
 
 def range_of(path: tuple[str, ...]) -> Range | None:
-    """Range of the number at a path, or None if any finite one makes sense."""
+    """Return the range of the number at a path, or None if any finite one makes sense."""
+    if entry := _declared(path):
+        return entry.metadata.get("range")
     ends = [".".join(path[i:]) for i in range(len(path))] + [".".join((*path[-2:-1], "*"))]
     return next((RANGES[end] for end in ends if end in RANGES), None)
 
 
-def checked_numbers(config: dict[str, Any]) -> dict[str, Any]:
-    """Check every number of a configuration.
+def checked_values(config: dict[str, Any]) -> dict[str, Any]:
+    """Check every number and every switch of a configuration.
 
     Args:
         config: Plain containers.
@@ -116,15 +134,39 @@ def _checked(value: Any, path: tuple[str, ...]) -> Any:
         return {key: _checked(entry, (*path, str(key))) for key, entry in value.items()}
     if isinstance(value, list):
         return [_checked(entry, (*path, "*")) for entry in value]
-    expected = None if path[-1] == "_target_" else range_of(path)
+    entry = _declared(path)
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not number and expected is None:
+    expected = None if path[-1] == "_target_" else range_of(path) or (FINITE if number else None)
+    if expected is not None and not expected.holds(value):
+        wanted = str(expected)
+    elif entry is not None and entry.type is bool and not isinstance(value, bool):
+        wanted = _KINDS[bool]
+    elif value is not None and (each := range_of((*path, "*"))):
+        wanted = f"a list, each entry {each}"
+    else:
+        return int(value) if expected is not None and expected.whole and number else value
+    raise ValueError(f"{'.'.join(path).replace('.*', '')}={value}: expected {wanted}".replace("None", "null"))
+
+
+def _declared(path: tuple[str, ...]) -> Field[Any] | None:
+    """Return the field of the schema at a path; None in a group that takes whatever its target takes."""
+    kind, entry = RacingSettings, None
+    for part in path:
+        entry = {field.name: field for field in fields(kind)}.get(part) if is_dataclass(kind) else None
+        kind = entry and entry.type
+    return entry
+
+
+def _in_words(entry: Field[Any]) -> str:
+    if "range" in entry.metadata:
+        return str(entry.metadata["range"])
+    return _KINDS.get(entry.type, "a list" if "list" in str(entry.type) else "a group of settings")  # pyright: ignore
+
+
+def _typed(kind: Any, value: Any) -> Any:
+    if not is_dataclass(kind):
         return value
-    expected = expected or FINITE
-    if not expected.holds(value):
-        key = ".".join(path).replace(".*", "")
-        raise ValueError(f"{key}={value}: expected {expected}".replace("None", "null"))
-    return int(value) if expected.whole and number else value
+    return kind(**{entry.name: _typed(entry.type, value[entry.name]) for entry in fields(kind)})  # pyright: ignore
 
 
 def _at(config: dict[str, Any], path: str) -> dict[str, Any]:
