@@ -116,7 +116,7 @@ def test_so_are_values_that_only_we_refuse(argument, message):
 @pytest.mark.parametrize(
     "text, message",
     [
-        ("trian: {batch_size: 3}", r"trian does not exist: .* Did you mean train\? Valid: .*train"),
+        ("alphaa: 0.1", r"alphaa does not exist: .* Did you mean alpha\? Valid: .*train"),
         ("train: {batchsize: 3}", r"train.batchsize does not exist: train has no 'batchsize'. Did you mean batch_size"),
         ("train: {batch_size: many}", r"train.batch_size=many: expected a whole number of at least 1"),
         ("learner: 3", r"In 'preset/humanoid_sac/mine': .* int is not a subclass of Learner"),
