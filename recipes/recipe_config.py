@@ -85,8 +85,8 @@ def run_recipe(config_name: str, build: Callable[[dict[str, Any]], Trainer]) -> 
         except (CheckpointError, ValueError, ImportError) as error:
             if "HYDRA_FULL_ERROR" in os.environ:
                 raise
-            # The user's to solve: the sentence says how, a traceback would hide it.
-            raise SystemExit(f"error: {error}") from None
+            # The user's to solve: the sentence says how, a traceback would hide it. TorchRL appends that of a worker.
+            raise SystemExit(f"error: {error}".split("\n\nWorker traceback:\n")[0]) from None
         try:
             train.run()
         except (NonFiniteError, CheckpointError) as error:
