@@ -1,9 +1,9 @@
 """Boxes that recipes share; each function makes one, and recipes/humanoid_sac.py shows how they fit together."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from inspect import Parameter, signature
+from inspect import Parameter, isclass, signature
 from pathlib import Path
 from typing import Any
 
@@ -83,25 +83,28 @@ def make(target: dict[str, Any]) -> Callable[..., Any]:
         ValueError: If it takes no such argument, or an argument is `true` or `false` and the value is not.
     """
     made = instantiate(target, _convert_="all", _partial_=True)
-    parameters = signature(made.func).parameters
-    if not any(parameter.kind is Parameter.VAR_KEYWORD for parameter in parameters.values()):
-        check_arguments(target["_target_"], made.keywords, parameters)
+    known = _arguments_of(made.func)
     for name, value in made.keywords.items():
-        if name in parameters and parameters[name].annotation in (bool, "bool") and not isinstance(value, bool):
+        if name not in known and not any(argument.kind is Parameter.VAR_KEYWORD for argument in known.values()):
+            valid = [other for other in known if other not in ("self", "args", "space")]
+            raise ValueError(f"{target['_target_']} takes no {name!r}.{choices(name, valid)}")
+        if name in known and known[name].annotation in (bool, "bool") and not isinstance(value, bool):
             raise ValueError(f"{name}={value} of {target['_target_']}: expected true or false")
     return made
 
 
-def check_arguments(what: str, given: Iterable[str], valid: Iterable[str]) -> None:
-    """Check that every argument is one of those that something takes.
-
-    Raises:
-        ValueError: Naming the first that is not, and the valid ones.
-    """
-    valid = [name for name in valid if name not in ("self", "space")]
-    for name in given:
-        if name not in valid:
-            raise ValueError(f"{what} takes no {name!r}.{choices(name, valid)}")
+def _arguments_of(function: Callable[..., Any]) -> dict[str, Parameter]:
+    """Return the arguments of a function; of a class or its factory also those that `**options` pass on."""
+    kind = function if isclass(function) else getattr(function, "__self__", None)
+    known = {} if isclass(function) else dict(signature(function).parameters)
+    for base in kind.__mro__ if isclass(kind) else ():
+        options = [name for name, argument in known.items() if argument.kind is Parameter.VAR_KEYWORD]
+        if known and not options:
+            break
+        for name in options:
+            del known[name]
+        known = {**signature(base.__init__).parameters, **known}
+    return known
 
 
 def make_style_reward(run: Run, factory: Callable[..., StyleReward], space: StyleSpace) -> StyleReward:

@@ -135,6 +135,15 @@ def test_whole_numbers_may_be_written_with_an_exponent():
         ),
         ("rare_targets", ["event_horizon=5000"], "less than event_horizon"),
         ("rare_targets", ["train.batch_size=2"], "train.batch_size=2: every batch"),
+        (
+            "rare_targets",
+            ["+env.num_env=2"],
+            r"RareTargets takes no 'num_env'. Did you mean num_envs\? Valid: num_envs",
+        ),
+        ("rare_targets", ["replay.prioritized=2"], r"prioritized=2 of .*for_events: expected true or false"),
+        ("rare_targets", ["+loss.alhpa=2"], r"SACLoss takes no 'alhpa'"),
+        ("racing_qr_sac", ["+loss.kapa=2"], r"QRSACLoss takes no 'kapa'. Did you mean kappa"),
+        ("humanoid_sac", ["+train.batchsize=2"], r"train.batchsize does not exist: .*Did you mean batch_size"),
     ],
 )
 def test_contradictions_are_refused_before_anything_is_written(recipe, arguments, message, tmp_path):
