@@ -120,7 +120,14 @@ class TaskImpersonation(Transform):
 
     def _refuse_sums(self, tensordict: TensorDictBase) -> None:
         steps = tensordict.get("steps_to_next_obs", None)
-        if steps is None or self.style_reward.is_linear or steps.max() <= 1:
+        if steps is None or steps.max() <= 1:
+            return
+        if self.style_reward.is_linear and ("next", "original_reward") in tensordict.keys(True):
+            raise ValueError(
+                f"TaskImpersonation got sums over up to {int(steps.max())} steps from TorchRL's MultiStep, which sums "
+                "no style features: let EventTableBuffer sum rewards and features (n_steps, discounted_keys)"
+            )
+        if self.style_reward.is_linear:
             return
         raise ValueError(
             f"TaskImpersonation got sums over up to {int(steps.max())} steps: the style reward is not linear in its "
