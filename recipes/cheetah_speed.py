@@ -4,7 +4,7 @@ python recipes/cheetah_speed.py                           minutes on two cores
 python recipes/cheetah_speed.py preset=smoke              every part once, within a minute
 python recipes/cheetah_speed.py loss=cat_rac seed=1       another loss; see --help for all groups
 
-docs/bring_your_own_environment.md goes through this file.
+docs/guides/bring_your_own_environment.md goes through this file.
 """
 
 from typing import Any

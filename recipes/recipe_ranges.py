@@ -45,6 +45,7 @@ RANGES: dict[str, Range] = {
     "num_critics": COUNT,
     "num_outputs": COUNT,
     "head_gain": NOT_NEGATIVE,
+    "dropout": Range("[0, 1)"),
     # learner
     "actor_lr": NOT_NEGATIVE,
     "critic_lr": NOT_NEGATIVE,

@@ -61,8 +61,8 @@ def accelerate(learner: Learner, when: When | bool = "auto") -> bool:
 def obstacle(loss_module: LossModule) -> str | None:
     """Return why a loss cannot be accelerated, or `None` if it can.
 
-    It can if all networks are residual ones on a CPU, are trained entirely, and evaluate their critics as TorchRL's
-    `SACLoss` does.
+    It can if all networks are residual ones without dropout on a CPU, are trained entirely, and evaluate their critics
+    as TorchRL's `SACLoss` does.
     """
     loss: Any = loss_module
     if device := {p.device.type for p in loss_module.parameters()} - {"cpu"}:
@@ -79,6 +79,8 @@ def obstacle(loss_module: LossModule) -> str | None:
     if not isinstance(critic, TensorDictModule) or not isinstance(critic.module, nn.Module):
         return "the critic is not a module inside a TensorDictModule"
     for name, network in (("policy", loss.actor_network), ("critic", critic)):
+        if any(isinstance(module, nn.Dropout) for module in network.modules()):
+            return f"the {name} has dropout"
         if not residual_networks(network):
             return f"the {name} has parameters outside of residual networks"
     if not any(name.startswith("target_qvalue_network_params") for name, _ in loss_module.named_buffers()):

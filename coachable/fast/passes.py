@@ -19,7 +19,6 @@ class Layer:
     in_features: int
     out_features: int
     side: str
-    narrowing: str
     eps: float
     norm: bool
 
@@ -34,7 +33,7 @@ class Layer:
         n, m = self.in_features, self.out_features
         if n <= m:
             return 0, 0 if self.side == "end" else m - n, n
-        return 0 if self.side == "end" or self.narrowing == "keep_first" else n - m, 0, m
+        return 0 if self.side == "end" else n - m, 0, m
 
     def skip(self, x: Tensor, hidden: Tensor, *, inplace: bool) -> Tensor:
         """Return `hidden + fit(x)`; `hidden` may be overwritten if `inplace`."""

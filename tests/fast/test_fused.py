@@ -11,8 +11,8 @@ from coachable.networks.residual import ResidualMLP
 SHAPES = {
     "equal": (70, (64, 64, 64), {}),
     "padded": (40, (96, 64, 32), {}),
-    "keep_first": (200, (96, 64, 32), {"narrowing": "keep_first"}),
-    "all_beginning": (40, (64, 80, 64), {"padding": "beginning"}),
+    "narrowing": (200, (96, 64, 32), {}),
+    "beginning": (40, (64, 80, 64), {}),
     "no_norm": (40, (64, 64), {"layer_norm": False}),
     "no_head": (40, (64, 64), {}),
     "wide_head": (40, (64, 64), {}),

@@ -23,6 +23,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 RECIPE = REPOSITORY / "recipes" / "humanoid_sac.py"
 TINY = ["preset=smoke", "env.num_envs=2", "threads.simulator=1", "threads.learner=1", "train.eval_interval=0"]
 TINY += ["init_random_frames=8", "train.warmup_frames=8", "train.batch_size=8", "eval.max_steps=3"]
+TINY += ["replay_capacity=100"]
 
 
 def _compose(*arguments):
@@ -47,10 +48,13 @@ def _resume(run_dir, *arguments):
 
 @pytest.mark.parametrize("name", ["a=b", "a, b", "it's {here}", "1.5", "x=y=[z]"])
 def test_any_name_of_a_folder_can_be_written_to_and_resumed(tmp_path, name):
-    assert _compose(f"run_dir={tmp_path / name}")["run_dir"] == str(tmp_path / name)
-    assert _compose(f"run_dir='{tmp_path / 'quoted'}'")["run_dir"] == str(tmp_path / "quoted")
-    assert _compose(f"init_from={tmp_path / name}")["init_from"] == str(tmp_path / name)
-    assert _compose("init_from=null")["init_from"] is None
+    config = _compose(f"run_dir={tmp_path / name}", f"init_from={tmp_path / name}")
+    assert config["run_dir"] == config["init_from"] == str(tmp_path / name)
+
+
+def test_a_path_may_be_quoted_or_null(tmp_path):
+    config = _compose(f"run_dir='{tmp_path / 'quoted'}'", "init_from=null")
+    assert config["run_dir"] == str(tmp_path / "quoted") and config["init_from"] is None
 
 
 def test_the_paper_preset_is_the_papers():
@@ -163,6 +167,7 @@ def test_a_new_run_starts_from_another_ones_weights(tmp_path):
 def test_the_command_line_from_another_folder(tmp_path):
     """The smoke preset as a user starts it: trains, evaluates, writes a checkpoint that loads and can be resumed."""
     command = [sys.executable, str(RECIPE), "preset=smoke", "train.total_frames=240", "train.eval_interval=120"]
+    command.append("eval.max_steps=10")
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stderr
     (run,) = (tmp_path / "runs" / "humanoid").iterdir()
