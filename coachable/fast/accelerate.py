@@ -13,10 +13,12 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.objectives import LossModule, SoftUpdate
 
+from coachable.fast.crew import crew
 from coachable.fast.ensemble import CriticEnsemble, Triple, make_plan, planned_copy, residual_networks, use_plan
 from coachable.fast.flat import FlatBuffers
 from coachable.fast.flat_adam import FlatAdam
 from coachable.fast.fused import Plan
+from coachable.fast.native import KERNEL_THREADS, load_kernels
 from coachable.training.backend import Backend
 from coachable.training.learner import Learner
 
@@ -129,7 +131,8 @@ class Acceleration(Backend):
         for name, network in self._policies.items():
             use_plan(network, self._actor_plans[name])
         try:
-            yield
+            with crew(KERNEL_THREADS if load_kernels() else 1):
+                yield
         finally:
             loss._vmap_qnetworkN0 = ordinary
             for network in self._policies.values():
