@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from coachable.replay import EventTableBuffer, SumTree
+from coachable.replay import EventTableBuffer, StyleEvents, SumTree
 from coachable.styles import (
     ContinuousOneHot,
     Mixture,
@@ -83,12 +83,11 @@ def transitions(n: int) -> TensorDict:
 
 def stratified(prioritized: bool = False, **kwargs) -> EventTableBuffer:
     """20 tables: default, one per style, one for kills."""
-    return EventTableBuffer.for_styles(
-        SPACE,
+    return EventTableBuffer.for_events(
+        StyleEvents.of(SPACE, extra=["kill"]),
         capacity=40_000,
         event_capacity=1_000,
         event_horizon=10,
-        extra=["kill"],
         num_envs=ENVS,
         batch_size=BATCH,
         prioritized=prioritized,

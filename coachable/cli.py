@@ -21,7 +21,7 @@ _SOURCE_HELP = "a run's folder, a checkpoint, a weights file, or a domain that s
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs the command line.
+    """Run the command line.
 
     Args:
         arguments: without the program's name; `sys.argv` by default.
@@ -59,28 +59,25 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"coachable {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    train = commands.add_parser("train", help="train an agent with a recipe, as python recipes/RECIPE.py does")
+    def command(name: str, run: Callable[[argparse.Namespace], int], text: str) -> argparse.ArgumentParser:
+        parser = commands.add_parser(name, help=text)
+        parser.set_defaults(run=run)
+        return parser
+
+    train = command("train", _train, "train an agent with a recipe, as python recipes/RECIPE.py does")
     train.add_argument("recipe", choices=sorted(_recipes()), help="one of %(choices)s")
     train.add_argument("arguments", nargs=argparse.REMAINDER, help="KEY=VALUE ..., or --help for what there is")
-    train.set_defaults(run=_train)
 
-    evaluate = commands.add_parser("evaluate", help="measure every style of an agent: tables and a figure")
+    evaluate = command("evaluate", _evaluate, "measure every style of an agent: tables and a figure")
     evaluate.add_argument("source", help=_SOURCE_HELP)
-    evaluate.add_argument("--out", type=Path, default=Path("evaluation"), help="folder (default: %(default)s)")
-    evaluate.add_argument("--episodes", type=_at_least(1), default=20, help="per style (default: %(default)s)")
-    evaluate.add_argument(
-        "--switch-episodes", type=_at_least(1), default=60, help="with switching styles (default: %(default)s)"
-    )
-    evaluate.add_argument("--steps", type=_at_least(1), help="length of an episode (default: the domain's)")
-    evaluate.add_argument("--seed", type=_at_least(0), default=0)
-    evaluate.add_argument(
-        "--threads", type=_at_least(1), dest="num_threads", help="physics threads (default: all free cores)"
-    )
-    evaluate.set_defaults(run=_evaluate)
+    _add_out(evaluate, "evaluation", "folder")
+    _add_number(evaluate, "--episodes", 20, "per style")
+    _add_number(evaluate, "--switch-episodes", 60, "with switching styles")
+    _add_rollout(evaluate)
 
-    render = commands.add_parser("render", help="film an agent whose style is switched while it acts")
+    render = command("render", _render, "film an agent whose style is switched while it acts")
     render.add_argument("source", help=_SOURCE_HELP)
-    render.add_argument("--out", type=Path, default=Path("coachable.mp4"), help=".mp4, .gif or .png (%(default)s)")
+    _add_out(render, "coachable.mp4", ".mp4, .gif or .png")
     render.add_argument(
         "--style",
         action="append",
@@ -94,65 +91,63 @@ def _parser() -> argparse.ArgumentParser:
     )
     render.add_argument("--size", type=_size, default=(640, 480), metavar="WIDTHxHEIGHT")
     render.add_argument("--seed", type=_at_least(0), default=0)
-    render.set_defaults(run=_render)
 
-    curves = commands.add_parser("curves", help="draw learning curves of runs, with intervals over seeds")
+    curves = command("curves", _curves, "draw learning curves of runs, with intervals over seeds")
     curves.add_argument(
         "groups", nargs="+", type=_group, metavar="LABEL=PATTERN", help="runs by label, such as bf16='runs/bf16_*'"
     )
     curves.add_argument("--x", default="updates", help="metric of the horizontal axis (default: %(default)s)")
     curves.add_argument("--y", default="episode/return", help="metric to draw (default: %(default)s)")
-    curves.add_argument(
-        "--smooth", type=_at_least(1), default=5, help="rows of the moving average (default: %(default)s)"
-    )
-    curves.add_argument("--out", type=Path, default=Path("curves.png"), help="(default: %(default)s)")
-    curves.set_defaults(run=_curves)
+    _add_number(curves, "--smooth", 5, "rows of the moving average")
+    _add_out(curves, "curves.png")
 
-    weights = commands.add_parser("weights", help="write the small weights file of a checkpoint")
+    weights = command("weights", _weights, "write the small weights file of a checkpoint")
     weights.add_argument("source", help="a run's folder or a checkpoint")
     weights.add_argument("out", type=Path, help="the file, such as weights.pt")
-    weights.set_defaults(run=_weights)
 
-    report = commands.add_parser("report", help="everything that can be measured of an agent, on one page")
+    report = command("report", _report, "everything that can be measured of an agent, on one page")
     report.add_argument("sources", nargs="+", metavar="source", help=f"{_SOURCE_HELP}; several: one per training seed")
-    report.add_argument("--out", type=Path, default=Path("report"), help="folder (default: %(default)s)")
-    report.add_argument("--seeds", type=_at_least(1), default=5, help="runs of a single agent (default: %(default)s)")
-    report.add_argument("--episodes", type=_at_least(1), default=4, help="per run and style (default: %(default)s)")
-    report.add_argument("--switch-episodes", type=_at_least(1), default=20, help="per run (default: %(default)s)")
-    report.add_argument(
-        "--sweep-points", type=_at_least(2), default=5, help="values of each weight (default: %(default)s)"
-    )
-    report.add_argument("--steps", type=_at_least(1), help="length of an episode (default: the domain's)")
-    report.add_argument("--seed", type=_at_least(0), default=0)
-    report.add_argument(
-        "--threads", type=_at_least(1), dest="num_threads", help="physics threads (default: all free cores)"
-    )
-    report.set_defaults(run=_report)
+    _add_out(report, "report", "folder")
+    _add_number(report, "--seeds", 5, "runs of a single agent")
+    _add_number(report, "--episodes", 4, "per run and style")
+    _add_number(report, "--switch-episodes", 20, "per run")
+    _add_number(report, "--sweep-points", 5, "values of each weight", lowest=2)
+    _add_rollout(report)
 
-    explain = commands.add_parser("explain", help="rank the inputs that the agent listens to, by SHAP and saliency")
+    explain = command("explain", _explain, "rank the inputs that the agent listens to, by SHAP and saliency")
     explain.add_argument("source", help=_SOURCE_HELP)
-    explain.add_argument("--out", type=Path, default=Path("explanation"), help="folder (default: %(default)s)")
-    explain.add_argument("--episodes", type=_at_least(2), default=100, help="trajectories (default: %(default)s)")
-    explain.add_argument("--states", type=_at_least(1), default=16, help="of each trajectory (default: %(default)s)")
-    explain.add_argument("--steps", type=_at_least(1), help="length of an episode (default: the domain's)")
-    explain.add_argument("--seed", type=_at_least(0), default=0)
-    explain.add_argument(
-        "--threads", type=_at_least(1), dest="num_threads", help="physics threads (default: all free cores)"
-    )
-    explain.set_defaults(run=_explain)
+    _add_out(explain, "explanation", "folder")
+    _add_number(explain, "--episodes", 100, "trajectories", lowest=2)
+    _add_number(explain, "--states", 16, "of each trajectory")
+    _add_rollout(explain)
 
-    export = commands.add_parser("export", help="write the policy as one ONNX file, to run it without torch")
+    export = command("export", _export, "write the policy as one ONNX file, to run it without torch")
     export.add_argument("source", help=_SOURCE_HELP)
-    export.add_argument("--out", type=Path, default=Path("policy.onnx"), help="(default: %(default)s)")
-    export.set_defaults(run=_export)
+    _add_out(export, "policy.onnx")
 
     from coachable.coach.page.command import add_parser
 
     add_parser(commands, _SOURCE_HELP, _coach)
 
-    doctor = commands.add_parser("doctor", help="check this installation and say what it can do")
-    doctor.set_defaults(run=_doctor)
+    command("doctor", _doctor, "check this installation and say what it can do")
     return parser
+
+
+def _add_out(parser: argparse.ArgumentParser, default: str, what: str = "") -> None:
+    parser.add_argument("--out", type=Path, default=Path(default), help=f"{what} (default: %(default)s)".strip())
+
+
+def _add_number(parser: argparse.ArgumentParser, flag: str, default: int, what: str, lowest: int = 1) -> None:
+    parser.add_argument(flag, type=_at_least(lowest), default=default, help=f"{what} (default: %(default)s)")
+
+
+def _add_rollout(parser: argparse.ArgumentParser) -> None:
+    """Add `coachable.evaluation.rollouts.RolloutOptions`."""
+    parser.add_argument("--steps", type=_at_least(1), help="length of an episode (default: the domain's)")
+    parser.add_argument("--seed", type=_at_least(0), default=0)
+    parser.add_argument(
+        "--threads", type=_at_least(1), dest="num_threads", help="physics threads (default: all free cores)"
+    )
 
 
 def _recipes() -> dict[str, Path]:
@@ -172,10 +167,21 @@ def _train(options: argparse.Namespace) -> int:
 
 def _evaluate(options: argparse.Namespace) -> int:
     from coachable.evaluation.evaluate import evaluate
+
+    return _measure(options, evaluate)
+
+
+def _explain(options: argparse.Namespace) -> int:
+    from coachable.evaluation.explain import explain
+
+    return _measure(options, explain)
+
+
+def _measure(options: argparse.Namespace, function: Callable[..., str]) -> int:
     from coachable.evaluation.outputs import complete_folder
 
     with complete_folder(options.out) as options.out:
-        text = evaluate(options.source, **_arguments(options, without=("source",)))
+        text = function(options.source, **_arguments(options, without=("source",)))
     print(text)
     return 0
 
@@ -212,16 +218,6 @@ def _report(options: argparse.Namespace) -> int:
     from coachable.evaluation.report import report
 
     print(report(options.sources, **_arguments(options, without=("sources",))))
-    return 0
-
-
-def _explain(options: argparse.Namespace) -> int:
-    from coachable.evaluation.explain import explain
-    from coachable.evaluation.outputs import complete_folder
-
-    with complete_folder(options.out) as options.out:
-        text = explain(options.source, **_arguments(options, without=("source",)))
-    print(text)
     return 0
 
 

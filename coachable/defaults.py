@@ -24,8 +24,9 @@ from coachable.styles import (
     StyleSpace,
     WeightedFeature,
     WeightedSum,
+    feature,
+    scalar_feature,
 )
-from coachable.styles.reward import feature, scalar_feature
 
 __all__ = ["EnvPictures", "RewardMeasures", "simulation_of", "steps_per_episode", "style_grid", "time_per_step"]
 
@@ -60,7 +61,7 @@ class RewardMeasures:
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
         """See `StyleMeasures.step`."""
         theta, features = transition.get(STYLE), transition.get(("next", STYLE_FEATURES))
-        style, paid = self._reward.space.lazy_view(theta), self._reward.terms_of(features, theta)
+        style, paid = self._reward.space.view(theta), self._reward.terms_of(features, theta)
         found: dict[str, Tensor] = {}
         for name, term in self._reward.terms.items():
             if isinstance(term, SetpointTolerance):

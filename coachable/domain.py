@@ -247,14 +247,20 @@ def load_domain(name: str, config: Mapping[str, Any] | None = None) -> Domain:
         config: of a training; the domain is as it was there.
 
     Raises:
-        ValueError: if no installed package registers such a domain; lists those that exist.
+        ValueError: if no installed package registers such a domain, or more than one does; lists the domains that
+            exist, or names the packages.
         TypeError: if a package registers something that is not a `Domain`.
     """
-    for entry in entry_points(group=_GROUP, name=name):
-        domain = entry.load()
-        if not isinstance(domain, Domain):
-            raise TypeError(f"the entry point {name} = {entry.value!r} is a {type(domain).__name__}: expected a Domain")
-        return domain if config is None or domain.as_trained is None else domain.as_trained(config.get("env", {}))
-    names = domain_names()
-    expected = f"expected one of {names}" if names else "no package registers any; install this one anew with pip"
-    raise ValueError(f"unknown domain {name!r}: {expected}")
+    entries = list(entry_points(group=_GROUP, name=name))
+    if not entries:
+        names = domain_names()
+        expected = f"expected one of {names}" if names else "no package registers any; install this one anew with pip"
+        raise ValueError(f"unknown domain {name!r}: {expected}")
+    if len(entries) > 1:
+        packages = " and ".join(sorted(entry.dist.name if entry.dist else entry.value for entry in entries))
+        raise ValueError(f"the packages {packages} register a domain {name!r} each: uninstall or rename all but one")
+    domain = entries[0].load()
+    if not isinstance(domain, Domain):
+        value = entries[0].value
+        raise TypeError(f"the entry point {name} = {value!r} is a {type(domain).__name__}: expected a Domain")
+    return domain if config is None or domain.as_trained is None else domain.as_trained(config.get("env", {}))

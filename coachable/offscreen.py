@@ -23,7 +23,6 @@ class OffscreenMujoco:
         model: compiled model. Its offscreen buffer is at least as large as the image.
         width: image width [px].
         height: image height [px].
-        shadows: draw shadows and reflections, which cost three to four times the rest in software.
 
     Raises:
         RenderingError: if no OpenGL library is installed; names the package that gives one.
@@ -32,14 +31,17 @@ class OffscreenMujoco:
         camera: the model's first camera, or a free one that sees all of the model where it has none.
     """
 
-    def __init__(self, model: mujoco.MjModel, width: int, height: int, *, shadows: bool = False) -> None:
+    def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
         self._model = model
         self._gl = _make_gl_context(width, height)
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._scene = mujoco.MjvScene(model, maxgeom=1000)
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = shadows
+        for slow in (
+            mujoco.mjtRndFlag.mjRND_SHADOW,
+            mujoco.mjtRndFlag.mjRND_REFLECTION,
+        ):  # most of the time, in software
+            self._scene.flags[slow] = False
         self._option = mujoco.MjvOption()
         self._viewport = mujoco.MjrRect(0, 0, width, height)
         self.camera = mujoco.MjvCamera()

@@ -11,20 +11,8 @@ each such path would have been worth to somebody who wanted that target.
 import math
 from typing import Any
 
+import recipe_boxes as boxes
 import torch
-from recipe_boxes import (
-    make,
-    make_collector,
-    make_description,
-    make_evaluation,
-    make_loss,
-    make_replay,
-    make_style_reward,
-    make_trainer,
-    network_settings,
-    open_run_dir,
-    start_run,
-)
 from recipe_config import run_recipe
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -134,17 +122,17 @@ def target_events() -> KeyEvents:
 
 def build(config: dict[str, Any]) -> Trainer:
     """Compose the training, one box after the other."""
-    run = start_run(config)
+    run = boxes.start_run(config)
     cfg = run.settings
 
     # What can be coached, and how it is rewarded
     space = target_space()
-    space = space.with_sampler(make(cfg.sampler)(space))
-    style_reward = make_style_reward(run, target_reward, space)
+    space = space.with_sampler(boxes.make(cfg.sampler)(space))
+    style_reward = boxes.make_style_reward(run, target_reward, space)
 
     # The targets: styles are drawn at reset, the reward is that of the task plus that of the style
     def make_env(seed: int, **settings: Any) -> EnvBase:
-        targets = make(cfg.env)(seed=seed, **settings)
+        targets = boxes.make(cfg.env)(seed=seed, **settings)
         env = CoachableEnv(targets, Compose(StyleSampler(space), StyleRewardTransform(style_reward), EpisodeSums()))
         env.set_seed(seed)
         return env
@@ -152,34 +140,27 @@ def build(config: dict[str, Any]) -> Trainer:
     example = make_env(cfg.seed, num_envs=1)
 
     # Who acts, who judges, and what is minimised
-    network = network_settings(run, example)
-    actor = make(network["actor"])(space=space).to(run.device)
-    critics = [make(network["critic"])(space=space).to(run.device) for _ in range(cfg.network.num_critics)]
-    loss = make_loss(run, actor, critics, example)
+    network = boxes.network_settings(run, example)
+    actor = boxes.make(network["actor"])(space=space).to(run.device)
+    critics = [boxes.make(network["critic"])(space=space).to(run.device) for _ in range(cfg.network.num_critics)]
+    loss = boxes.make_loss(run, actor, critics, example)
     if cfg.init_from:
         initialise_from(cfg.init_from, actor, loss, space, cfg.init_new_observations)
-    learner = make(run.config["learner"])(loss)
+    learner = boxes.make(run.config["learner"])(loss)
     accelerate(learner, cfg.fast)
 
     # What is remembered, summed over n steps, and seen again under other styles
     relabelled = []
     if cfg.impersonation.n:
         relabelled.append(TaskImpersonation(style_reward, n=cfg.impersonation.n, seed=cfg.seed))
-    replay = make_replay(run, example, *relabelled)
-    run_dir = open_run_dir(run, example, replay)
+    replay = boxes.make_replay(run, example, *relabelled)
+    boxes.open_run_dir(run, example, replay)
 
     # Who collects, and the loop
-    return make_trainer(
-        run,
-        run_dir,
-        example,
-        collector=make_collector(run, make_env, actor),
-        replay=replay,
-        learner=learner,
-        evaluate=make_evaluation(run, make_env, actor),
-        describe=make_description(run, space, actor, loss, network),
-        style_terms=style_reward.terms_of,
-    )
+    collector = boxes.make_collector(run, make_env, actor)
+    evaluate = boxes.make_evaluation(run, make_env, actor)
+    describe = boxes.make_description(run, space, actor, loss, network)
+    return boxes.make_trainer(run, example, collector, replay, learner, evaluate, describe, style_reward)
 
 
 if __name__ == "__main__":

@@ -3,13 +3,14 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from inspect import signature
+from inspect import Parameter, isclass, signature
 from pathlib import Path
 from typing import Any
 
 import torch
-from configs.schema import Settings, typed_settings
+from configs.schema import Settings
 from hydra.utils import instantiate
+from recipe_checks import choices, typed_settings
 from recipe_config import save_config
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
@@ -26,9 +27,9 @@ from coachable.styles import StyleReward, StyleSpace
 from coachable.training.checkpoint import CheckpointStore, check_unused, check_writable
 from coachable.training.collection import evaluate_policy, simulation_env
 from coachable.training.hardware import pick_device, share_threads
+from coachable.training.learner import Learner
 from coachable.training.logging import MetricsLog, Progress, wandb_logger
 from coachable.training.rng import seed_everything
-from coachable.training.train_settings import TrainSettings
 from coachable.training.trainer import Trainer, replay_keys
 from coachable.training.weights import agent_state
 from coachable.transforms import MirrorSymmetry
@@ -41,7 +42,6 @@ class Run:
     Attributes:
         config: The configuration as plain containers, as checkpoints hold it.
         settings: The same, typed.
-        loop: When the training does what.
         device: Device of the networks.
         simulator_threads: Threads of one simulator.
         learner_threads: Threads of the learner.
@@ -49,7 +49,6 @@ class Run:
 
     config: dict[str, Any]
     settings: Settings
-    loop: TrainSettings
     device: torch.device
     simulator_threads: int
     learner_threads: int
@@ -67,7 +66,6 @@ def start_run(config: dict[str, Any]) -> Run:
     settings = typed_settings(config)
     if "events" in settings.replay and settings.replay["events"] is None:
         raise ValueError(f"replay=event_tables: {settings.domain} names no events; expected replay=uniform")
-    loop = make(config["train"])()
     threads = share_threads(**config["threads"])
     # The learner's sums are rounded as their number of threads says: a resumed training takes as many.
     config = {**config, "threads": {**config["threads"], "learner": threads.learner}}
@@ -75,12 +73,38 @@ def start_run(config: dict[str, Any]) -> Run:
     seed_everything(settings.seed)
     device = pick_device(settings.device)
     per_simulator = max(1, threads.simulator // settings.collector["num_collectors"])
-    return Run(config, typed_settings(config), loop, device, per_simulator, threads.learner)
+    return Run(config, typed_settings(config), device, per_simulator, threads.learner)
 
 
 def make(target: dict[str, Any]) -> Callable[..., Any]:
-    """Return the function or class that `_target_` names, with the arguments that the YAML gives."""
-    return instantiate(target, _convert_="all", _partial_=True)
+    """Return the function or class that `_target_` names, with the arguments that the YAML gives.
+
+    Raises:
+        ValueError: If it takes no such argument, or an argument is `true` or `false` and the value is not.
+    """
+    made = instantiate(target, _convert_="all", _partial_=True)
+    known = _arguments_of(made.func)
+    for name, value in made.keywords.items():
+        if name not in known and not any(argument.kind is Parameter.VAR_KEYWORD for argument in known.values()):
+            valid = [other for other in known if other not in ("self", "args", "space")]
+            raise ValueError(f"{target['_target_']} takes no {name!r}.{choices(name, valid)}")
+        if name in known and known[name].annotation in (bool, "bool") and not isinstance(value, bool):
+            raise ValueError(f"{name}={value} of {target['_target_']}: expected true or false")
+    return made
+
+
+def _arguments_of(function: Callable[..., Any]) -> dict[str, Parameter]:
+    """Return the arguments of a function; of a class or its factory also those that `**options` pass on."""
+    kind = function if isclass(function) else getattr(function, "__self__", None)
+    known = {} if isclass(function) else dict(signature(function).parameters)
+    for base in kind.__mro__ if isclass(kind) else ():
+        options = [name for name, argument in known.items() if argument.kind is Parameter.VAR_KEYWORD]
+        if known and not options:
+            break
+        for name in options:
+            del known[name]
+        known = {**signature(base.__init__).parameters, **known}
+    return known
 
 
 def make_style_reward(run: Run, factory: Callable[..., StyleReward], space: StyleSpace) -> StyleReward:
@@ -210,7 +234,7 @@ def make_description(
     )
 
 
-def open_run_dir(run: Run, env: EnvBase, replay: ReplayBuffer) -> Path:
+def open_run_dir(run: Run, env: EnvBase, replay: ReplayBuffer) -> None:
     """Make the run's folder and write the configuration into it.
 
     Args:
@@ -230,7 +254,6 @@ def open_run_dir(run: Run, env: EnvBase, replay: ReplayBuffer) -> Path:
         size = replay_bytes(env, stored_keys(run, env, replay), settings.replay_capacity)
         check_writable(run_dir, required_bytes=2 * size)
     save_config(run.config, run_dir)
-    return run_dir
 
 
 def stored_keys(run: Run, env: EnvBase, replay: ReplayBuffer) -> tuple[NestedKey, ...]:
@@ -243,23 +266,41 @@ def _has_scenario_tables(settings: Settings) -> bool:
     return settings.replay["_target_"].endswith(".for_scenarios")
 
 
-def make_trainer(run: Run, run_dir: Path, env: EnvBase, **parts: Any) -> Trainer:
+def make_trainer(
+    run: Run,
+    env: EnvBase,
+    collector: BaseCollector,
+    replay: ReplayBuffer,
+    learner: Learner,
+    evaluate: Callable[[], dict[str, float]],
+    describe: Callable[[], dict[str, Any]],
+    style_reward: StyleReward,
+) -> Trainer:
     """Make the training loop with its log and its checkpoints; a resumed run continues where it stopped.
 
     Args:
         run: The training.
-        run_dir: Its folder.
         env: One environment, which is closed.
-        **parts: Collector, replay, learner and the other arguments of `Trainer`.
+        collector: What collects transitions.
+        replay: What stores them.
+        learner: What learns from them.
+        evaluate: Returns metrics of the current actor.
+        describe: Returns what identifies the agent in a checkpoint.
+        style_reward: Its terms are among the metrics.
     """
-    settings = run.settings
+    settings, run_dir = run.settings, Path(run.settings.run_dir)
     trainer = Trainer(
-        settings=run.loop,
+        settings=settings.train,
+        collector=collector,
+        replay=replay,
+        learner=learner,
+        evaluate=evaluate,
+        describe=describe,
+        style_terms=style_reward.terms_of,
         log=MetricsLog(run_dir, wandb_logger(settings.domain, run_dir, **run.config["wandb"])),
         progress=Progress(settings.train.total_frames),
         checkpoints=CheckpointStore(run_dir / "checkpoints", **run.config["checkpoint"]),
-        replay_keys=stored_keys(run, env, parts["replay"]),
-        **parts,
+        replay_keys=stored_keys(run, env, replay),
     )
     env.close()  # now, not whenever it is collected: TorchRL raises the number of threads when it closes a SerialEnv
     torch.set_num_threads(run.learner_threads)

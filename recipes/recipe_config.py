@@ -1,26 +1,28 @@
 """From a command line to a checked, plain configuration; shared by the recipes."""
 
-import difflib
-import itertools
 import json
 import logging
 import os
 import sys
 import time
+from argparse import Namespace
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import hydra
+from configs.schema import register_schema
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
-from hydra.errors import HydraException
+from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
-from recipe_ranges import checked_numbers
+from omegaconf.errors import OmegaConfBaseException
+from recipe_checks import checked_values, choices, mistake_in
 from recipe_saved import CONFIGS, check_saved_config
 from recipe_stages import composed_stages
 
@@ -49,20 +51,7 @@ _FIXED = (
 
 _PATHS = ("run_dir", "resume", "init_from")
 
-# Options of Hydra that are followed by a value.
-_VALUED = (
-    "--cfg",
-    "-c",
-    "--package",
-    "-p",
-    "--config-path",
-    "-cp",
-    "--config-name",
-    "-cn",
-    "--config-dir",
-    "-cd",
-    "--info",
-)
+register_schema()
 
 
 def config_groups(config_name: str) -> dict[str, list[str]]:
@@ -96,8 +85,8 @@ def run_recipe(config_name: str, build: Callable[[dict[str, Any]], Trainer]) -> 
         except (CheckpointError, ValueError, ImportError) as error:
             if "HYDRA_FULL_ERROR" in os.environ:
                 raise
-            # The user's to solve: the sentence says how, a traceback would hide it.
-            raise SystemExit(f"error: {error}") from None
+            # The user's to solve: the sentence says how, a traceback would hide it. TorchRL appends that of a worker.
+            raise SystemExit(f"error: {error}".split("\n\nWorker traceback:\n")[0]) from None
         try:
             train.run()
         except (NonFiniteError, CheckpointError) as error:
@@ -116,15 +105,12 @@ def compose_config(config_name: str, arguments: list[str]) -> dict[str, Any]:
     Returns:
         Plain containers.
     """
-    arguments = checked_arguments(config_name, arguments)
-    with _configs():
-        return plain_config(hydra.compose(config_name, arguments), arguments, config_name)
+    _, given, _ = _hydra_arguments(config_name, arguments)
+    return plain_config(_composed(config_name, given), given, config_name)
 
 
 def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
-    """Checks overrides against what the configuration knows, and replaces `preset=auto` by a preset.
-
-    Hydra alone says that a key is not in a struct, not which keys there are, and takes any type.
+    """Compose what a command line asks for, so that a mistake is one sentence, and replace `preset=auto` by a preset.
 
     Args:
         config_name: file in recipes/configs, without its suffix.
@@ -136,41 +122,58 @@ def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
     Raises:
         SystemExit: naming what is misspelt or of a wrong type, and the valid choices.
     """
+    options, given, overrides = _hydra_arguments(config_name, arguments)
+    jobs = [given]
+    if options.multirun:
+        ((*jobs,),) = BasicSweeper.split_arguments(overrides, max_batch_size=None)
+    folder = [f"hydra.searchpath=[file://{Path(options.config_dir).absolute()}]"] if options.config_dir else []
+    if not options.config_path:
+        for job in jobs:
+            _composed(options.config_name or config_name, [*job, *folder])
+    flags = [argument for argument in _quoted_paths(arguments) if argument not in options.overrides]
+    return [*flags, *given]  # Hydra's parser takes overrides in one piece only, not before and after its options
+
+
+def _hydra_arguments(config_name: str, arguments: list[str]) -> tuple[Namespace, list[str], list[Override]]:
+    """Return the options of Hydra, and the overrides with the preset that this machine or the user chose."""
+    options = get_args_parser().parse_intermixed_args(_quoted_paths(arguments))
+    parser = OverridesParser.create()
     try:
-        options, given = _options_apart(_quoted_paths(arguments))
-        overrides = OverridesParser.create().parse_overrides(given)
+        overrides = parser.parse_overrides(options.overrides)
     except HydraException as error:
         raise SystemExit(f"error: {error}\nexpected KEY=VALUE, for example loss=sac or train.batch_size=256") from None
-    groups = config_groups(config_name)
-    chosen: dict[str, list[str]] = {}  # several where a sweep asks for them
-    for override in overrides:
-        group = override.key_or_group
-        if group in groups:
-            swept = override.is_sweep_override()
-            chosen[group] = list(override.sweep_string_iterator()) if swept else [str(override.value())]
-            for choice in chosen[group]:
-                if choice not in groups[group]:
-                    raise SystemExit(f"error: {group}={choice} does not exist.{_choices(choice, groups[group])}")
-    if chosen.get("preset", ["auto"]) == ["auto"]:
+    chosen = [o for o in overrides if o.key_or_group == "preset"]
+    presets = [
+        choice for o in chosen for choice in (o.sweep_string_iterator() if o.is_sweep_override() else [o.value()])
+    ]
+    if presets in ([], ["auto"]):
         automatic = OmegaConf.load(CONFIGS / "preset" / config_name / "auto.yaml")
-        chosen["preset"] = [automatic.preset_for[choose_preset(detect())]]
+        presets = [automatic.preset_for[choose_preset(detect())]]
     elif any(o.key_or_group == "resume" and o.value() for o in overrides):
         raise SystemExit("error: a resumed run keeps its preset: leave preset= out, or start anew with init_from=PATH")
-    presets = [f"{config_name}/{preset}" for preset in chosen["preset"]]
-    firsts = [f"{group}={choices[0]}" for group, choices in chosen.items() if group != "preset"]
-    checked = [o for o in overrides if o.key_or_group not in groups and not o.key_or_group.startswith("hydra")]
-    if checked:
-        known = _composed(config_name, *firsts, f"preset={presets[0]}")
-        for override in checked:
-            _check(override, known)
-    # Hydra's parser takes overrides in one piece only, not before and after its options.
-    return [*options, *(a for a in given if not a.startswith("preset=")), f"preset={','.join(presets)}"]
+    preset = "preset=" + ",".join(f"{config_name}/{preset}" for preset in presets)
+    given = [*(o.input_line or "" for o in overrides if o not in chosen), preset]
+    return options, given, parser.parse_overrides(given)
 
 
-@cache
-def _composed(config_name: str, *choices: str) -> DictConfig:
-    with _configs():
-        return hydra.compose(config_name, list(choices))
+def _composed(config_name: str, overrides: list[str]) -> DictConfig:
+    """Compose a configuration; a mistake is one sentence."""
+    try:
+        with _configs():
+            return hydra.compose(config_name, overrides)
+    except MissingConfigException as error:
+        if "HYDRA_FULL_ERROR" in os.environ or error.missing_cfg_file is None:
+            raise
+        group, _, choice = error.missing_cfg_file.removeprefix(f"preset/{config_name}/").rpartition("/")
+        valid = error.options if group else config_groups(config_name)["preset"]
+        message = f"{group or 'preset'}={choice} does not exist.{choices(choice, valid or [])}"
+    except (HydraException, ValueError) as error:
+        if "HYDRA_FULL_ERROR" in os.environ:
+            raise
+        cause = error.__cause__ or error.__context__
+        named = isinstance(cause, OmegaConfBaseException) and cause.full_key
+        message = mistake_in(cause) if named else " ".join(str(error).splitlines()[:2])
+    raise SystemExit(f"error: {message}")
 
 
 def start_training(build: Callable[[dict[str, Any]], Trainer], config: dict[str, Any]) -> Trainer | Curriculum:
@@ -241,7 +244,7 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
     config["run_dir"] = str(Path(config["run_dir"] or _new_run_dir(config["domain"])).expanduser().absolute())
     config = {str(key): value for key, value in config.items()}
     try:
-        return checked_numbers(config)
+        return checked_values(config)
     except (AttributeError, KeyError, TypeError) as error:  # of a saved one: what is composed here has the right kinds
         raise CheckpointError(f"{config['resume']} holds a configuration of another kind: {error}") from error
 
@@ -250,7 +253,7 @@ def _chosen_stage(cfg: DictConfig, stages: list[dict[str, Any]]) -> DictConfig:
     """The one stage that `stage=NAME` asks for, as a training of its own, or the first with the list of all."""
     names = [stage["stage"] for stage in stages]
     if cfg.stage is not None and cfg.stage not in names:
-        raise ValueError(f"stage={cfg.stage} does not exist.{_choices(cfg.stage, names)}")
+        raise ValueError(f"stage={cfg.stage} does not exist.{choices(cfg.stage, names)}")
     chosen = stages[0 if cfg.stage is None else names.index(cfg.stage)]
     return OmegaConf.create({**chosen, "stages": stages if cfg.stage is None else []})
 
@@ -273,52 +276,6 @@ def save_config(config: dict[str, Any], run_dir: Path) -> None:
     (run_dir / "config.json").write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")
 
 
-def _check(override: Override, known: DictConfig) -> None:
-    key = override.key_or_group
-    if override.is_add() or override.is_delete():  # +key=value and ~key say that the user knows better
-        return
-    node: Any = known
-    parts = key.split(".")
-    for depth, part in enumerate(parts):
-        names = [str(n) for n in node if n != "hydra"] if isinstance(node, DictConfig) else []
-        if part not in names:
-            where = ".".join(parts[:depth]) or "the configuration"
-            raise SystemExit(f"error: {key} does not exist: {where} has no {part!r}.{_choices(part, names)}")
-        node = node[part]
-    if override.is_sweep_override():
-        return
-    value = override.value()
-    if not _same_kind(node, value):
-        expected = {bool: "true or false", int: "a whole number", float: "a number", str: "a name or path"}
-        kind = expected.get(type(node), "a list" if OmegaConf.is_list(node) else "a group of settings")
-        raise SystemExit(f"error: {key}={value} has a wrong type: expected {kind} (it is {node} by default)")
-
-
-def _same_kind(default: Any, value: Any) -> bool:
-    if default is None or value is None:
-        return True
-    if isinstance(default, bool) or isinstance(value, bool):
-        return isinstance(default, bool) and isinstance(value, bool)
-    if isinstance(default, int):
-        return isinstance(value, int) or (isinstance(value, float) and value.is_integer())
-    if isinstance(default, float):
-        return isinstance(value, int | float)
-    if isinstance(default, str):
-        return isinstance(value, str | int | float)
-    if OmegaConf.is_list(default):
-        return isinstance(value, list)
-    return isinstance(value, dict)
-
-
-def _options_apart(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """Hydra's own options, such as `--cfg job`, with their values; and the overrides."""
-    options: list[str] = []
-    overrides: list[str] = []
-    for before, argument in itertools.pairwise(["", *arguments]):
-        (options if argument.startswith("-") or before in _VALUED else overrides).append(argument)
-    return options, overrides
-
-
 def _quoted_paths(arguments: list[str]) -> list[str]:
     """Puts paths into quotes, so that Hydra takes them as they are: a folder may be called `a=b` or `a, b`."""
     if {"-m", "--multirun"} & set(arguments):
@@ -331,12 +288,6 @@ def _quoted_paths(arguments: list[str]) -> list[str]:
             argument = f"{key}='{escaped}'"
         quoted.append(argument)
     return quoted
-
-
-def _choices(given: str, valid: list[str]) -> str:
-    close = difflib.get_close_matches(given, valid, n=1)
-    guess = f" Did you mean {close[0]}?" if close else ""
-    return f"{guess} Valid: {', '.join(valid)}" if valid else f"{guess} It is a single value"
 
 
 def _said(overrides: list[str]) -> list[str]:

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
-from configs.schema import typed_settings
 from omegaconf import DictConfig, OmegaConf
-from recipe_ranges import checked_numbers
+from omegaconf.errors import OmegaConfBaseException
+from recipe_checks import checked_values, mistake_in, typed_settings
 
 _OF_THE_RUN = ("run_dir", "resume", "init_from", "init_new_observations", "stage", "stages", "hydra")
 
@@ -22,8 +22,10 @@ def composed_stages(cfg: DictConfig, said: Mapping[str, Any]) -> list[dict[str, 
         ValueError: If a stage has no name, changes what there is not, or a number lies outside its range.
     """
     stages = []
-    current = OmegaConf.create(OmegaConf.to_container(cfg, resolve=False))
-    changes: list[dict[str, Any]] = OmegaConf.to_container(current.pop("stages"), resolve=False)  # pyright: ignore
+    changes: list[dict[str, Any]] = OmegaConf.to_container(cfg.stages, resolve=False)  # pyright: ignore
+    current = cfg.copy()
+    current.stages = []
+    OmegaConf.set_struct(current, None)  # a stage may add to what a target takes, not to what the schema declares
     for change in changes:
         name = change.pop("name", None)
         if name is None:
@@ -35,15 +37,18 @@ def composed_stages(cfg: DictConfig, said: Mapping[str, Any]) -> list[dict[str, 
             raise ValueError(
                 f"stage {name} changes {', '.join(unknown)}: expected name, total_frames, {', '.join(sorted(known))}"
             )
-        current = OmegaConf.merge(current, change)
+        try:
+            current = OmegaConf.merge(current, change)
+        except OmegaConfBaseException as error:
+            raise ValueError(f"stage {name}: {mistake_in(error)}") from None
         for key, value in said.items():
             if key.split(".")[0] not in _OF_THE_RUN:
-                OmegaConf.update(current, key, value, merge=False)
+                OmegaConf.update(current, key, value, merge=False, force_add=True)
         stage = OmegaConf.to_container(current, resolve=True, throw_on_missing=True)
         assert isinstance(stage, dict)
-        stage.pop("hydra", None)
-        stage = checked_numbers({**{str(key): value for key, value in stage.items()}, "stage": name})
-        typed_settings({**stage, "run_dir": ""})
+        config = {str(key): value for key, value in stage.items() if key not in ("hydra", "stages")}
+        stage = checked_values({**config, "stage": name})
+        typed_settings(stage)
         stages.append(stage)
         OmegaConf.update(current, "init_new_observations", 0)  # those of one stage are known to the next
     return stages

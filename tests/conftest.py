@@ -1,6 +1,8 @@
 """Fixtures that several test folders share."""
 
+import gc
 import os
+import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -10,10 +12,42 @@ import pytest
 
 # Imported inside the fixtures: a test that needs none of this should not pay for it.
 
+# Read when torch is imported. Sums are rounded as the number of threads says. TorchRL raises it, up to what it was at
+# first, whenever a `SerialEnv` is closed, and one of an earlier test may be collected in the middle of a training.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 if os.environ.get("COACHABLE_SANITIZE") == "1":  # see CONTRIBUTING.md
     from coachable.fast import native
 
     native._FLAGS += ("-fsanitize=address,undefined", "-fno-sanitize-recover=undefined", "-g")
+
+
+gc.disable()  # until everything is imported
+
+
+def pytest_collection_finish() -> None:
+    """Spare the garbage collector what was imported, and racing environments the same speeds again and again."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(7_000, 10, 10)  # a tenth as often: tests leave little behind
+    gc.enable()
+    for name in ("env", "race.driver"):
+        module = sys.modules.get(f"coachable.envs.racing.{name}")
+        if module is not None:
+            module.speed_profile = _remembering(module.speed_profile)
+
+
+def _remembering(speed_profile: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that computes the speeds of each car on each line once."""
+    known: dict[Any, Any] = {}
+
+    def remember(envelope: Any, curvature: Any, spacing: Any) -> Any:
+        key = (repr(envelope), curvature.tobytes(), getattr(spacing, "tobytes", lambda: spacing)())
+        if key not in known:
+            known[key] = speed_profile(envelope, curvature, spacing)
+        return known[key].copy()
+
+    return remember
 
 
 @pytest.fixture(scope="session", autouse=True)

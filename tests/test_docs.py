@@ -162,6 +162,13 @@ def test_mistakes_are_found(line, mistake):
     assert mistake_in(last) == mistake
 
 
+def test_every_reason_not_to_run_a_command_is_some_commands_reason():
+    from tests.printed_commands import NOT_RUN, documented_commands, reason_not_to_run
+
+    given = {reason_not_to_run(command) for command in documented_commands()}
+    assert given == set(NOT_RUN.values())
+
+
 def test_broken_links_are_found(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("# One, two\n[a](#one-two) [b](#three) ![c](none.png) [d](https://example.org) [e](page.md)\n")

@@ -35,7 +35,8 @@ def imported(path: Path, type_checking: bool = False) -> set[str]:
             assert node.level == 0, f"{path} has a relative import, line {node.lineno}: write it absolute"
             found.update(f"{node.module}.{alias.name}" for alias in node.names)
         for child in ast.iter_child_nodes(node):
-            visit(child)
+            if isinstance(child, (ast.stmt, ast.excepthandler, ast.match_case)):  # no import is in an expression
+                visit(child)
 
     visit(ast.parse(path.read_text()))
     return found

@@ -7,15 +7,12 @@ on padded, `(..., heads, widest head)`, so that six gamepad heads cost as many k
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, get_args
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from coachable.distributions.tanh_gaussian import at_least_float32
-
-RegretGradient = Literal["dpi", "du", "chain"]
 
 EPSILON = 1e-8
 """Mass shared by the values of a head, so that none has probability zero (Appendix B)."""
@@ -102,56 +99,42 @@ class _RegretMatching(torch.autograd.Function):
     """`x -> pi` whose backward returns the regret-matching gradient g', which is not the derivative."""
 
     @staticmethod
-    def forward(ctx, x: Tensor, epsilon: Tensor, mode: RegretGradient) -> Tensor:
+    def forward(ctx, x: Tensor, epsilon: Tensor) -> Tensor:
         positive = x.clamp(0.0, _LARGEST_PREFERENCE) + epsilon
-        total = positive.sum(-1, keepdim=True)
-        pi = positive / total
-        ctx.mode = mode
-        ctx.save_for_backward(pi, x < 0, total)
+        pi = positive / positive.sum(-1, keepdim=True)
+        ctx.save_for_backward(pi, x < 0)
         return pi
 
     @staticmethod
     def backward(ctx, grad_pi: Tensor):  # type: ignore[override]
-        pi, negative, total = ctx.saved_tensors
+        pi, negative = ctx.saved_tensors
         # Regret of value i: how much cheaper it is than the head's average, since g is the gradient of a loss.
         regret = (grad_pi * pi).sum(-1, keepdim=True) - grad_pi
-        if ctx.mode == "du":
-            regret = regret / total
-        elif ctx.mode == "chain":
-            g = (-regret / total).masked_fill(negative, 0.0)
-            regret = (g * pi).sum(-1, keepdim=True) - g
-        return (-regret).masked_fill_(negative & (regret < 0), 0.0), None, None
+        return (-regret).masked_fill_(negative & (regret < 0), 0.0), None
 
 
-def regret_matching_probabilities(x: Tensor, layout: HeadLayout, gradient: RegretGradient = "dpi") -> Tensor:
+def regret_matching_probabilities(x: Tensor, layout: HeadLayout) -> Tensor:
     """Probabilities of positive-part heads, `pi_i = (max(0, x_i) + eps) / sum_j (max(0, x_j) + eps)` (Appendix B).
 
     The backward pass is one regression step of regret matching instead of the derivative: with `g` the gradient of the
-    loss and `rho_i = sum_j g_j pi_j - g_i`, `x_i` receives `-rho_i`, or 0 if `x_i < 0` and `rho_i < 0`. So a value of
-    probability zero that would have been cheaper than average comes back.
+    loss with respect to the probabilities (our reading, see docs/deviations.md) and `rho_i = sum_j g_j pi_j - g_i`,
+    `x_i` receives `-rho_i`, or 0 if `x_i < 0` and `rho_i < 0`. So a value of probability zero that would have been
+    cheaper than average comes back.
 
     Args:
         x: (..., layout.total) network outputs, heads concatenated.
         layout: The heads.
-        gradient: What `g` is the gradient to. `"dpi"`: the probabilities (our reading: the true regret of every value,
-            whatever the scale of x). `"du"`: the positive parts before the division, `dpi` over their sum. `"chain"`:
-            x, literally, so that a value with x < 0 never returns.
 
     Returns:
         (..., layout.total) probabilities, float32 or wider; each head sums to 1.
-
-    Raises:
-        ValueError: If `gradient` is unknown.
 
     Example:
         >>> regret_matching_probabilities(torch.tensor([2.0, 1.0, 1.0, -1.0]), HeadLayout((4,))).tolist()
         [0.5, 0.25, 0.25, 6.2...e-10]
     """
-    if gradient not in get_args(RegretGradient):
-        raise ValueError(f"regret_gradient must be one of {get_args(RegretGradient)}, got {gradient!r}")
     x = at_least_float32(x)
     epsilon = layout.constants(x)[2]
-    return layout.concatenate(_RegretMatching.apply(layout.pad(x), epsilon, gradient))
+    return layout.concatenate(_RegretMatching.apply(layout.pad(x), epsilon))
 
 
 def exponential_noise(like: Tensor) -> Tensor:

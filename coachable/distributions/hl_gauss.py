@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, get_args
 
 import torch
 from torch import Tensor, nn
 
 from coachable.distributions.tanh_gaussian import at_least_float32
-
-Support = Literal["edges", "centres"]
 
 # The bump of `initialise_value`: its width over that of the support (40 for the paper's), and the lowest logit.
 _INITIAL_WIDTH_RATIO = 1.0 / 40.0
@@ -18,18 +15,16 @@ _INITIAL_FLOOR = -8.0
 
 
 class HLGauss:
-    """Bins over [v_min, v_max], encoding of scalars into them and decoding of logits over them.
+    """Bins whose outer edges are v_min and v_max, encoding of scalars into them and decoding of logits over them.
 
     Args:
         v_min: Smallest value represented.
         v_max: Largest value represented.
         num_atoms: Number of bins.
         sigma_ratio: Standard deviation of the Gaussian over the width of a bin.
-        support: `"edges"`: `num_atoms + 1` edges, the outer two on v_min and v_max. `"centres"`: the `num_atoms`
-            centres span [v_min, v_max], so that the outer edges lie half a bin outside.
 
     Raises:
-        ValueError: If v_min >= v_max, num_atoms < 2, sigma_ratio <= 0, or `support` is unknown.
+        ValueError: If v_min >= v_max, num_atoms < 2, or sigma_ratio <= 0.
 
     Example:
         >>> bins = HLGauss(-600.0, 1000.0, 255)
@@ -44,7 +39,6 @@ class HLGauss:
         v_max: float = 1000.0,
         num_atoms: int = 255,
         sigma_ratio: float = 0.75,
-        support: Support = "edges",
     ) -> None:
         if not (math.isfinite(v_min) and math.isfinite(v_max) and v_min < v_max):
             raise ValueError(f"v_min must be less than v_max and both finite, got v_min={v_min}, v_max={v_max}")
@@ -52,35 +46,27 @@ class HLGauss:
             raise ValueError(f"num_atoms must be an integer of at least 2, got {num_atoms}")
         if not (sigma_ratio > 0 and math.isfinite(sigma_ratio)):
             raise ValueError(f"sigma_ratio must be positive and finite, got {sigma_ratio}")
-        if support not in get_args(Support):
-            raise ValueError(f"hl_gauss_support must be one of {get_args(Support)}, got {support!r}")
         self.v_min, self.v_max, self.num_atoms = float(v_min), float(v_max), int(num_atoms)
         self.sigma_ratio = float(sigma_ratio)
-        self.support: Support = support
-        if support == "edges":
-            self.bin_width = (self.v_max - self.v_min) / self.num_atoms
-            self._first_edge = self.v_min
-        else:
-            self.bin_width = (self.v_max - self.v_min) / (self.num_atoms - 1)
-            self._first_edge = self.v_min - 0.5 * self.bin_width
+        self.bin_width = (self.v_max - self.v_min) / self.num_atoms
         self.sigma = self.sigma_ratio * self.bin_width
         self._constants: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor]] = {}
 
     def __repr__(self) -> str:
         return (
             f"HLGauss(v_min={self.v_min}, v_max={self.v_max}, num_atoms={self.num_atoms}, "
-            f"sigma_ratio={self.sigma_ratio}, support={self.support!r})"
+            f"sigma_ratio={self.sigma_ratio})"
         )
 
     def __deepcopy__(self, memo: dict) -> HLGauss:
-        return HLGauss(self.v_min, self.v_max, self.num_atoms, self.sigma_ratio, self.support)
+        return HLGauss(self.v_min, self.v_max, self.num_atoms, self.sigma_ratio)
 
     def _edges_and_centres(self, like: Tensor) -> tuple[Tensor, Tensor]:
         # Computed in float64 and rounded once; cached because a kernel launch per constant would add up.
         key = (like.device, like.dtype)
         if key not in self._constants:
             index = torch.arange(self.num_atoms + 1, dtype=torch.float64, device=like.device)
-            edges = self._first_edge + self.bin_width * index
+            edges = self.v_min + self.bin_width * index
             centres = 0.5 * (edges[1:] + edges[:-1])
             self._constants[key] = (edges.to(like.dtype), centres.to(like.dtype))
         return self._constants[key]

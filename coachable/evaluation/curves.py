@@ -7,13 +7,9 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
-
-from coachable.evaluation.figures import readable
+from coachable.evaluation.figures import drawing, readable
 from coachable.evaluation.statistics import bootstrap_interval
 
 _POINTS = 100
@@ -90,18 +86,15 @@ def draw_learning_curves(
     Returns:
         Label to the mean at the last common position.
     """
-    figure, axes = plt.subplots(figsize=(5.6, 3.8), layout="constrained")
     last = {}
-    for label, runs in groups.items():
-        grid, mean, (low, high) = summarise_runs(runs, x, y, smooth)
-        (line,) = axes.plot(grid, mean, label=f"{label} ({len(runs)} seeds)")
-        axes.fill_between(grid, low, high, color=line.get_color(), alpha=0.2, lw=0)
-        last[label] = float(mean[-1])
-    axes.set_xlabel(readable(x))
-    axes.set_ylabel(readable(y))
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
     out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out, dpi=130)
-    plt.close(figure)
+    with drawing(out, size=(5.6, 3.8)) as ((axes,),):
+        for label, runs in groups.items():
+            grid, mean, (low, high) = summarise_runs(runs, x, y, smooth)
+            (line,) = axes.plot(grid, mean, label=f"{label} ({len(runs)} seeds)")
+            axes.fill_between(grid, low, high, color=line.get_color(), alpha=0.2, lw=0)
+            last[label] = float(mean[-1])
+        axes.set_xlabel(readable(x))
+        axes.set_ylabel(readable(y))
+        axes.legend(fontsize=8)
     return last

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -17,34 +16,19 @@ from coachable.evaluation.style_grid import (
     mean_of,
     policy_sentence,
     published,
-    write_csv,
+    write_results,
 )
 from coachable.evaluation.switching import SwitchReport, evaluate_switching
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
 
-def evaluate(
-    source: str | Path,
-    out: Path,
-    *,
-    episodes: int = 20,
-    switch_episodes: int = 60,
-    steps: int | None = None,
-    seed: int = 0,
-    num_threads: int | None = None,
-    progress: bool = True,
-) -> str:
+def evaluate(source: str | Path, out: Path, **settings: Any) -> str:
     """Evaluate an agent and write `grid.csv`, `response.csv`, `report.md`, `grid.png` and `summary.json` into a folder.
 
     Args:
         source: checkpoint, run folder, weights file, or the name of a domain that ships with weights.
         out: folder for the results, created if missing.
-        episodes: per cell of the grid.
-        switch_episodes: episodes with a style that switches every 100 steps.
-        steps: length of an episode; default: the domain's.
-        seed: of initial states and switched styles. The same seed gives the same files.
-        num_threads: physics threads.
-        progress: show progress bars.
+        **settings: those of `EvaluationSettings`; styles switch every 100 steps.
 
     Returns:
         The report, Markdown.
@@ -56,22 +40,17 @@ def evaluate(
     agent = load_policy(source)
     domain = domain_of(agent)
     out.mkdir(parents=True, exist_ok=True)
-    options: dict[str, Any] = {"steps": steps, "seed": seed, "num_threads": num_threads, "progress": progress}
-    settings = EvaluationSettings(episodes=episodes, switch_episodes=switch_episodes, **options)
+    asked = EvaluationSettings(**settings)
     if domain.evaluation is not None:
-        return domain.evaluation(domain, agent, out, settings)
-    grid = evaluate_grid(domain, agent.actor, agent.space, episodes=episodes, **options)
-    switching = evaluate_switching(domain, agent.actor, agent.space, episodes=switch_episodes, **options)
+        return domain.evaluation(domain, agent, out, asked)
+    episodes, switch_episodes = asked.episodes, asked.switch_episodes
+    grid = evaluate_grid(domain, agent.actor, agent.space, episodes=episodes, **asked.rollout)
+    switching = evaluate_switching(domain, agent.actor, agent.space, episodes=switch_episodes, **asked.rollout)
     rows, response = grid.rows(), grid.response(agent.space)
-    write_csv(rows, out / "grid.csv")
-    if response:
-        write_csv(response, out / "response.csv")
     title = f"{domain.name}: {episodes} episodes of {grid.steps} steps per style, 95 % intervals"
     draw_style_grid(grid, domain, agent.space, out / "grid.png", title)
     report = _report(domain, agent, grid, rows, response, switching, switch_episodes)
-    (out / "report.md").write_text(report)
-    (out / "summary.json").write_text(json.dumps(_summary(grid, rows, switching), indent=2) + "\n")
-    return report
+    return write_results(out, report, _summary(grid, rows, switching), {"grid": rows, "response": response})
 
 
 def _summary(grid: StyleGrid, rows: list[dict[str, Any]], switching: SwitchReport) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from coachable.evaluation.rollouts import RolloutOptions
     from coachable.evaluation.sweep import WeightSweep
 
 
@@ -39,3 +40,13 @@ class EvaluationSettings:
         """Refuses what cannot be evaluated."""
         if self.episodes < 1:
             raise ValueError(f"episodes per style must be at least 1, got {self.episodes}")
+
+    @property
+    def rollout(self) -> RolloutOptions:
+        """The settings of every rollout, as keyword arguments."""
+        return {
+            "steps": self.steps,
+            "seed": self.seed,
+            "num_threads": self.num_threads,
+            "progress": self.progress,
+        }

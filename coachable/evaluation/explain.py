@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
-import matplotlib
 import torch
+from matplotlib.patches import Rectangle
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
-
 from coachable.domain import Domain
 from coachable.evaluation.attribution import Ranking, import_captum, input_groups, rank_groups
-from coachable.evaluation.figures import readable
-from coachable.evaluation.rollouts import record_episodes
+from coachable.evaluation.figures import drawing, readable
+from coachable.evaluation.rollouts import RolloutOptions, record_styles
 from coachable.evaluation.style_grid import markdown_table, write_csv
 from coachable.networks.plain import ActionOutputs
 from coachable.styles import StyleSpace
@@ -37,10 +34,7 @@ def explain(
     *,
     episodes: int = 100,
     states: int = 16,
-    steps: int | None = None,
-    seed: int = 0,
-    num_threads: int | None = None,
-    progress: bool = True,
+    **options: Unpack[RolloutOptions],
 ) -> str:
     """Rank the inputs of a policy over states of its own episodes; write `explain.csv`, `explain.md`, `explain.png`.
 
@@ -49,10 +43,7 @@ def explain(
         out: folder for the results, created if missing.
         episodes: trajectories, each under a style drawn from the training distribution (the paper has 100).
         states: per trajectory, evenly spaced.
-        steps: length of an episode; default: the domain's.
-        seed: of initial states, styles and baselines. The same seed gives the same files.
-        num_threads: physics threads.
-        progress: show progress bars.
+        **options: see `RolloutOptions`; the baselines are seeded, too.
 
     Returns:
         The two tables side by side, Markdown.
@@ -66,18 +57,9 @@ def explain(
     domain = domain_of(agent)
     outputs = ActionOutputs(agent.actor).eval()
     groups = input_groups(domain, agent.space, outputs.observation_dim)
-    trajectories = record_states(
-        domain,
-        agent.actor,
-        agent.space,
-        episodes=episodes,
-        states=states,
-        steps=steps,
-        seed=seed,
-        num_threads=num_threads,
-        progress=progress,
-    )
-    rankings = rank_groups(outputs, trajectories, groups, seed=seed, progress=progress)
+    trajectories = record_states(domain, agent.actor, agent.space, episodes=episodes, states=states, **options)
+    seed = options.get("seed", 0)
+    rankings = rank_groups(outputs, trajectories, groups, seed=seed, progress=options.get("progress", True))
     out.mkdir(parents=True, exist_ok=True)
     write_csv([row for ranking in rankings for row in ranking.rows()], out / "explain.csv")
     table = _side_by_side(rankings)
@@ -95,10 +77,7 @@ def record_states(
     *,
     episodes: int = 100,
     states: int = 16,
-    steps: int | None = None,
-    seed: int = 0,
-    num_threads: int | None = None,
-    progress: bool = True,
+    **options: Unpack[RolloutOptions],
 ) -> list[Tensor]:
     """Inputs of the network along episodes of its own, each with a style from the training distribution.
 
@@ -108,23 +87,16 @@ def record_states(
         space: its styles.
         episodes: number of trajectories.
         states: at most so many per trajectory, evenly spaced.
-        steps: length of an episode; default: the domain's.
-        seed: of the initial states and of the styles.
-        num_threads: physics threads.
-        progress: show a bar.
+        **options: see `RolloutOptions`.
 
     Returns:
         Per trajectory (S, observation + theta), the observation and the encoded style.
     """
     if episodes < 2 or states < 1:
         raise ValueError(f"expected at least 2 episodes and 1 state of each, got {episodes=}, {states=}")
-    steps = steps or domain.episode_steps
-    theta = space.sample((episodes,), torch.Generator().manual_seed(seed))
-    recorder = _Observations(max(1, steps // _RECORDED))
-    env = domain.styled_env(space, episodes, seed=seed, num_threads=num_threads)
-    label = f"{episodes} episodes" if progress else None
-    record = record_episodes(env, policy, theta, recorder, steps=steps, seed=seed, progress=label)
-    env.close()
+    theta = space.sample((episodes,), torch.Generator().manual_seed(options.get("seed", 0)))
+    recorder = _Observations(max(1, (options.get("steps") or domain.episode_steps) // _RECORDED))
+    record = record_styles(domain, policy, space, theta, f"{episodes} episodes", measures=recorder, **options)
     observed = torch.stack(recorder.observations)  # (T', N, observation)
     lengths = record.alive[:: recorder.every].sum(0).tolist()
     encoded = space.encode(theta)
@@ -169,24 +141,19 @@ def _side_by_side(rankings: Sequence[Ranking]) -> str:
 
 def _draw(rankings: Sequence[Ranking], path: Path, title: str) -> None:
     shown = min(_BARS, len(rankings[0].groups))
-    figure, axes = plt.subplots(1, len(rankings), figsize=(11, 1.2 + 0.26 * shown), layout="constrained")
-    labels = {
-        "SHAP": "mean |contribution| to the action",
-        "saliency": "mean |d action / d input|",
-    }
-    for panel, ranking in zip(axes, rankings, strict=True):
-        groups, means = ranking.groups[:shown], ranking.means[:shown]
-        colours = ["tab:orange" if group.is_style else "tab:blue" for group in groups]
-        panel.barh(range(shown), means, xerr=ranking.deviations[:shown], color=colours, ecolor="0.4", capsize=2)
-        panel.set_yticks(range(shown), [readable(group.name) for group in groups])
-        panel.invert_yaxis()
-        panel.set_xlim(left=0)
-        panel.set_xlabel(labels[ranking.method])
-        panel.set_title(ranking.method, fontsize=10)
-        panel.set_axisbelow(True)
-        panel.grid(axis="x", alpha=0.3)
-    handles = [plt.Rectangle((0, 0), 1, 1, color=colour) for colour in ("tab:orange", "tab:blue")]
-    axes[-1].legend(handles, ["style", "observation"], loc="lower right", fontsize=9)
-    figure.suptitle(title, fontsize=10)
-    figure.savefig(path, dpi=130, metadata={"Software": None})
-    plt.close(figure)
+    labels = {"SHAP": "mean |contribution| to the action", "saliency": "mean |d action / d input|"}
+    with drawing(path, 1, len(rankings), size=(11, 1.2 + 0.26 * shown), grid=False) as panels:
+        for panel, ranking in zip(panels[0], rankings, strict=True):
+            groups, means = ranking.groups[:shown], ranking.means[:shown]
+            colours = ["tab:orange" if group.is_style else "tab:blue" for group in groups]
+            panel.barh(range(shown), means, xerr=ranking.deviations[:shown], color=colours, ecolor="0.4", capsize=2)
+            panel.set_yticks(range(shown), [readable(group.name) for group in groups])
+            panel.invert_yaxis()
+            panel.set_xlim(left=0)
+            panel.set_xlabel(labels[ranking.method])
+            panel.set_title(ranking.method, fontsize=10)
+            panel.set_axisbelow(True)
+            panel.grid(axis="x", alpha=0.3)
+        handles = [Rectangle((0, 0), 1, 1, color=colour) for colour in ("tab:orange", "tab:blue")]
+        panels[0, -1].legend(handles, ["style", "observation"], loc="lower right", fontsize=9)
+        panels[0, 0].figure.suptitle(title, fontsize=10)

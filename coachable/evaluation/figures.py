@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,35 @@ from coachable.styles import Choice, StyleSpace
 MARKERS = "osD^vP*X"  # distinguishable without colour as well
 
 
+@contextlib.contextmanager
+def drawing(
+    path: Path, rows: int = 1, columns: int = 1, *, size: tuple[float, float], grid: bool = True, **options: Any
+) -> Iterator[np.ndarray]:
+    """Give the panels (rows, columns) of a figure, which is written to a file at the end of the block.
+
+    Args:
+        path: PNG, SVG or PDF file; its folder exists.
+        rows: of panels.
+        columns: of panels.
+        size: width and height [inch].
+        grid: whether the panels have grid lines.
+        **options: further arguments of `matplotlib.pyplot.subplots`.
+    """
+    with plt.rc_context({"axes.grid": grid, "grid.alpha": 0.3 if grid else 1.0}):
+        figure, panels = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained", **options)
+    try:
+        yield panels
+        # Without the version of matplotlib, the same numbers give the same file.
+        figure.savefig(path, dpi=130, metadata={"Software": None} if path.suffix == ".png" else None)
+    finally:
+        plt.close(figure)
+
+
+def shade(index: int, count: int) -> Any:
+    """Return the colour of the line `index` of `count` whose order has a meaning, such as rising weights."""
+    return plt.get_cmap("viridis")(0.9 * index / max(count - 1, 1))
+
+
 def draw_style_grid(grid: StyleGrid, domain: Domain, space: StyleSpace, path: Path, title: str) -> None:
     """Draw measured against requested style, and the domain's published metrics over the same axis.
 
@@ -35,32 +65,31 @@ def draw_style_grid(grid: StyleGrid, domain: Domain, space: StyleSpace, path: Pa
     columns = {measured_column(name, grid.cells[0]): name for name in grid.episodes}
     names = [columns[column] for column in formats if column in columns and columns[column] not in space]
     names = [name for name in ((axis,) if axis in grid.episodes else ()) + tuple(names) if name != f"{axis}_error"]
-    figure, axes = plt.subplots(1, len(names), figsize=(4.2 * len(names), 3.8), squeeze=False, layout="constrained")
-    for panel, name in zip(axes[0], names, strict=True):
-        column = measured_column(name, grid.cells[0])
-        for index, (label, cells) in enumerate((lines or {"": list(range(len(grid.cells)))}).items()):
-            x = np.array([grid.cells[i][axis] for i in cells] if axis else cells, dtype=float)
-            values = np.array([mean_of(grid.episodes[name][i]) for i in cells])
-            spread = np.array([[rows[i][f"{column}_low"], rows[i][f"{column}_high"]] for i in cells])
-            offset = (index - (len(lines) - 1) / 2) * 0.012 * np.ptp(x)  # so that intervals do not cover each other
-            error = np.abs(spread - values[:, None]).T
-            style: dict[str, Any] = {"marker": MARKERS[index], "ls": "-" if axis else "", "label": label or None}
-            panel.errorbar(x + offset, values, error, capsize=2, ms=5, **style)
-        if name == axis:
-            low, high = space[name].low, space[name].high
-            panel.plot([low, high], [low, high], color="0.6", ls="--", lw=1, label="as requested")
-            panel.set_ylabel(f"measured {_with_unit(name, space[name].unit)}")
-        else:
-            panel.set_ylabel(_with_unit(name, domain.units.get(name, "")))
-            if formats.get(column, "").endswith("%"):
-                panel.set_ylim(-0.03, 1.05)
-        panel.set_xlabel(f"requested {_with_unit(axis, space[axis].unit)}" if axis else "style, by row of the table")
-        panel.grid(alpha=0.3)
-    if axes[0, 0].get_legend_handles_labels()[1]:
-        axes[0, 0].legend(fontsize=8)
-    figure.suptitle(title, fontsize=10)
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
+    with drawing(path, 1, len(names), size=(4.2 * len(names), 3.8)) as axes:
+        for panel, name in zip(axes[0], names, strict=True):
+            column = measured_column(name, grid.cells[0])
+            for index, (label, cells) in enumerate((lines or {"": list(range(len(grid.cells)))}).items()):
+                x = np.array([grid.cells[i][axis] for i in cells] if axis else cells, dtype=float)
+                values = np.array([mean_of(grid.episodes[name][i]) for i in cells])
+                spread = np.array([[rows[i][f"{column}_low"], rows[i][f"{column}_high"]] for i in cells])
+                offset = (index - (len(lines) - 1) / 2) * 0.012 * np.ptp(x)  # so that intervals do not cover each other
+                error = np.abs(spread - values[:, None]).T
+                style: dict[str, Any] = {"marker": MARKERS[index], "ls": "-" if axis else "", "label": label or None}
+                panel.errorbar(x + offset, values, error, capsize=2, ms=5, **style)
+            if name == axis:
+                low, high = space[name].low, space[name].high
+                panel.plot([low, high], [low, high], color="0.6", ls="--", lw=1, label="as requested")
+                panel.set_ylabel(f"measured {_with_unit(name, space[name].unit)}")
+            else:
+                panel.set_ylabel(_with_unit(name, domain.units.get(name, "")))
+                if formats.get(column, "").endswith("%"):
+                    panel.set_ylim(-0.03, 1.05)
+            panel.set_xlabel(
+                f"requested {_with_unit(axis, space[axis].unit)}" if axis else "style, by row of the table"
+            )
+        if axes[0, 0].get_legend_handles_labels()[1]:
+            axes[0, 0].legend(fontsize=8)
+        axes[0, 0].figure.suptitle(title, fontsize=10)
 
 
 def grid_lines(cells: Sequence[dict[str, Any]], space: StyleSpace) -> tuple[str | None, dict[str, list[int]]]:

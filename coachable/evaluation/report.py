@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 from tqdm import tqdm
@@ -17,6 +17,7 @@ from coachable.evaluation.figures import readable
 from coachable.evaluation.outputs import complete_folder
 from coachable.evaluation.report_figures import draw_metrics, draw_requests, draw_switches, draw_tradeoffs
 from coachable.evaluation.report_page import Page, paragraph, picture, shown, table
+from coachable.evaluation.rollouts import RolloutOptions
 from coachable.evaluation.runs import (
     SWITCH_PERIOD,
     Run,
@@ -72,10 +73,7 @@ def write_report(
     episodes: int = 4,
     switch_episodes: int = 20,
     sweep_points: int = 5,
-    steps: int | None = None,
-    seed: int = 0,
-    num_threads: int | None = None,
-    progress: bool = True,
+    **options: Unpack[RolloutOptions],
 ) -> str:
     """Evaluate the agents and write `report.html` with its figures and tables.
 
@@ -91,14 +89,12 @@ def write_report(
         episodes: per run and style, and per run and value of a weight.
         switch_episodes: per run, with styles that switch.
         sweep_points: values of each weight.
-        steps: length of an episode; default: the domain's.
-        seed: of the first run; the next ones follow. The same seed gives the same files.
-        num_threads: physics threads.
-        progress: show progress bars.
+        **options: see `RolloutOptions`; the seed is that of the first run, and the next ones follow.
 
     Returns:
         A short summary, text.
     """
+    seed, steps, progress = options.get("seed", 0), options.get("steps"), options.get("progress", True)
     if len(agents) == 1:
         (only,) = agents.values()
         planned = [(f"seed {seed + i}", only, seed + i) for i in range(seeds)]
@@ -107,10 +103,10 @@ def write_report(
     if not planned:
         raise ValueError(f"seeds must be at least 1, got {seeds}")
     with complete_folder(out) as folder:
-        options: dict[str, Any] = {"steps": steps, "num_threads": num_threads, "progress": progress}
-        options |= {"episodes": episodes, "switch_episodes": switch_episodes, "sweep_points": sweep_points}
+        counts = {"episodes": episodes, "switch_episodes": switch_episodes, "sweep_points": sweep_points}
         bar = tqdm(planned, desc="evaluating", unit="run", disable=None if progress else True)
-        runs = [evaluate_run(label, domain, agent, seed=number, **options) for label, agent, number in bar]
+        asked: dict[str, Any] = {**options, **counts}
+        runs = [evaluate_run(label, domain, agent, **asked | {"seed": number}) for label, agent, number in bar]
         agent = next(iter(agents.values()))
         styles = StyleTable(runs, agent.space)
         formats = _formats(styles, domain)
@@ -120,7 +116,7 @@ def write_report(
         _switches(page, domain, runs, switch_episodes, formats, folder)
         _tradeoffs(page, styles, runs, formats, folder)
         if domain.evaluation is not None:
-            settings = EvaluationSettings(episodes, switch_episodes, steps, seed, num_threads, progress, runs[0].sweeps)
+            settings = EvaluationSettings(episodes, switch_episodes, sweeps=runs[0].sweeps, **options)
             _own(page, domain, agent, folder, settings)
         command = [f"coachable report {' '.join(agents)} --seed {seed} --episodes {episodes}"]
         command += [f"--switch-episodes {switch_episodes} --sweep-points {sweep_points}"]

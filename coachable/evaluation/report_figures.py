@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from coachable.evaluation.figures import MARKERS, grid_lines, readable
+from coachable.evaluation.figures import MARKERS, drawing, grid_lines, readable
 from coachable.evaluation.runs import Estimate, Run, StyleTable, estimate
 from coachable.evaluation.style_grid import mean_of
 from coachable.evaluation.sweep import UNIT_REWARD
@@ -36,81 +31,75 @@ def draw_metrics(
     if axis is None:
         _draw_points(table, metrics, formats, path)
         return
-    figure, panels = _panels(len(metrics))
-    for panel, metric in zip(panels, metrics, strict=False):
-        for index, (label, cells) in enumerate(lines.items()):
-            estimates = [table.of(metric, [i]) for i in cells]
-            _line(panel, [table.cells[i][axis] for i in cells], estimates, index, label, len(lines))
-        panel.set_xlabel(_named(space, axis, "requested "))
-        panel.set_ylabel(readable(metric))
-        _as_share(panel, formats.get(table.column(metric), ""))
-    _legend(figure, panels[0], len(lines))
-    _save(figure, path)
+    with _panels(path, len(metrics)) as panels:
+        for panel, metric in zip(panels, metrics, strict=False):
+            for index, (label, cells) in enumerate(lines.items()):
+                estimates = [table.of(metric, [i]) for i in cells]
+                _line(panel, [table.cells[i][axis] for i in cells], estimates, index, label, len(lines))
+            panel.set_xlabel(_named(space, axis, "requested "))
+            panel.set_ylabel(readable(metric))
+            _as_share(panel, formats.get(table.column(metric), ""))
+        _legend(panels[0], len(lines))
 
 
 def draw_requests(table: StyleTable, space: StyleSpace, parameters: Sequence[str], path: Path) -> None:
     """Requested against measured value of each measured parameter, one line per option of the first choice."""
     choice = next((p for p in space.parameters if isinstance(p, Choice) and p.name in table.cells[0]), None)
     options: Sequence[Any] = choice.options if choice else (None,)
-    figure, panels = _panels(len(parameters))
-    for panel, name in zip(panels, parameters, strict=False):
-        values = sorted({cell[name] for cell in table.cells})
-        panel.plot(values, values, color="0.6", ls="--", lw=1, label="as requested")
-        for index, option in enumerate(options):
-            members = [
-                [i for i, c in enumerate(table.cells) if c[name] == value and (not choice or c[choice.name] == option)]
-                for value in values
-            ]
-            shown = [(value, table.of(name, cells)) for value, cells in zip(values, members, strict=True) if cells]
-            label = readable(option) if choice else "measured"
-            _line(panel, [x for x, _ in shown], [y for _, y in shown], index, label, len(options))
-        panel.set_xlabel(_named(space, name, "requested "))
-        panel.set_ylabel(_named(space, name, "measured "))
-    _legend(figure, panels[0], len(options) + 1)
-    _save(figure, path)
+    with _panels(path, len(parameters)) as panels:
+        for panel, name in zip(panels, parameters, strict=False):
+            values = sorted({cell[name] for cell in table.cells})
+            panel.plot(values, values, color="0.6", ls="--", lw=1, label="as requested")
+            for index, option in enumerate(options):
+                own = [i for i, cell in enumerate(table.cells) if not choice or cell[choice.name] == option]
+                members = [[i for i in own if table.cells[i][name] == value] for value in values]
+                shown = [(value, table.of(name, cells)) for value, cells in zip(values, members, strict=True) if cells]
+                label = readable(option) if choice else "measured"
+                _line(panel, [x for x, _ in shown], [y for _, y in shown], index, label, len(options))
+            panel.set_xlabel(_named(space, name, "requested "))
+            panel.set_ylabel(_named(space, name, "measured "))
+        _legend(panels[0], len(options) + 1)
 
 
 def draw_switches(runs: Sequence[Run], period_seconds: float, path: Path) -> None:
     """Share of the switches that were complied with, over the time since the switch."""
-    figure, (panel,) = _panels(1)
-    times = np.linspace(0.0, period_seconds, _GROWTH_POINTS)
-    shares = np.array(
-        [
-            (run.switching.comply_seconds.double().numpy()[:, None] <= times + 1e-9).sum(0) / run.switching.switches
-            if run.switching.switches
-            else np.full(len(times), np.nan)
-            for run in runs
-        ]
-    )
-    estimates = [estimate(column) for column in shares.T]
-    panel.plot(times, [e.value for e in estimates])
-    panel.fill_between(times, [e.low for e in estimates], [e.high for e in estimates], alpha=0.25, lw=0)
-    panel.set_xlabel("time since the switch [s]")
-    panel.set_ylabel("switches complied with")
-    panel.set_xlim(0, period_seconds)
-    _as_share(panel, ".0%")
-    panel.grid(alpha=0.3)
-    _save(figure, path)
+    with _panels(path, 1) as (panel,):
+        times = np.linspace(0.0, period_seconds, _GROWTH_POINTS)
+        shares = np.array(
+            [
+                (run.switching.comply_seconds.double().numpy()[:, None] <= times + 1e-9).sum(0) / run.switching.switches
+                if run.switching.switches
+                else np.full(len(times), np.nan)
+                for run in runs
+            ]
+        )
+        estimates = [estimate(column) for column in shares.T]
+        panel.plot(times, [e.value for e in estimates])
+        panel.fill_between(times, [e.low for e in estimates], [e.high for e in estimates], alpha=0.25, lw=0)
+        panel.set_xlabel("time since the switch [s]")
+        panel.set_ylabel("switches complied with")
+        panel.set_xlim(0, period_seconds)
+        _as_share(panel, ".0%")
 
 
 def draw_tradeoffs(runs: Sequence[Run], success: str, form: str, path: Path) -> None:
     """Task success against the amount of style along each weight, neutral to maximum (paper, Pareto curves)."""
-    figure, panels = _panels(len(runs[0].sweeps))
-    for panel, sweeps in zip(panels, zip(*(run.sweeps for run in runs), strict=True), strict=False):
-        score = sweeps[0].score
-        x, y = ([_point(sweeps, metric, i) for i in range(len(sweeps[0].values))] for metric in (score, success))
-        panel.errorbar(
-            [e.value for e in x], [e.value for e in y], _reach(y), _reach(x), marker="o", ms=5, capsize=2, lw=1
-        )
-        for position, (value, at, height) in enumerate(zip(sweeps[0].values, x, y, strict=True)):
-            if position in (0, len(x) - 1) and not np.isnan(at.value + height.value):
-                panel.annotate(f"{value:g}", (at.value, height.value), (5, 5), textcoords="offset points", fontsize=8)
-        panel.set_title(readable(sweeps[0].weight), fontsize=10)
-        panel.set_xlabel("style reward per step at weight 1" if score == UNIT_REWARD else f"measured {readable(score)}")
-        panel.set_ylabel(readable(success))
-        _as_share(panel, form)
-        panel.grid(alpha=0.3)
-    _save(figure, path)
+    with _panels(path, len(runs[0].sweeps)) as panels:
+        for panel, sweeps in zip(panels, zip(*(run.sweeps for run in runs), strict=True), strict=False):
+            score = sweeps[0].score
+            x, y = ([_point(sweeps, metric, i) for i in range(len(sweeps[0].values))] for metric in (score, success))
+            panel.errorbar(
+                [e.value for e in x], [e.value for e in y], _reach(y), _reach(x), marker="o", ms=5, capsize=2, lw=1
+            )
+            for position, (value, at, height) in enumerate(zip(sweeps[0].values, x, y, strict=True)):
+                if position in (0, len(x) - 1) and not np.isnan(at.value + height.value):
+                    point = at.value, height.value
+                    panel.annotate(f"{value:g}", point, (5, 5), textcoords="offset points", fontsize=8)
+            panel.set_title(readable(sweeps[0].weight), fontsize=10)
+            amount = "style reward per step at weight 1" if score == UNIT_REWARD else f"measured {readable(score)}"
+            panel.set_xlabel(amount)
+            panel.set_ylabel(readable(success))
+            _as_share(panel, form)
 
 
 def _point(sweeps: Sequence[Any], metric: str, position: int) -> Estimate:
@@ -119,21 +108,17 @@ def _point(sweeps: Sequence[Any], metric: str, position: int) -> Estimate:
 
 def _draw_points(table: StyleTable, metrics: Sequence[str], formats: Mapping[str, str], path: Path) -> None:
     height = 0.9 + 0.22 * len(table.cells)
-    figure, panels = plt.subplots(
-        1, len(metrics), figsize=(2.2 + 2.6 * len(metrics), height), sharey=True, squeeze=False, layout="constrained"
-    )
-    rows = list(range(len(table.cells)))
-    for panel, metric in zip(panels[0], metrics, strict=True):
-        estimates = [table.of(metric, [i]) for i in rows]
-        panel.errorbar([e.value for e in estimates], rows, xerr=_reach(estimates), fmt="o", ms=4, capsize=2)
-        panel.set_xlabel(readable(metric))
-        panel.grid(alpha=0.3)
-        if formats.get(table.column(metric), "").endswith("%"):
-            panel.set_xlim(-0.03, 1.03)
-            panel.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-    panels[0, 0].set_yticks(rows, table.labels, fontsize=8)
-    panels[0, 0].invert_yaxis()
-    _save(figure, path)
+    with drawing(path, 1, len(metrics), size=(2.2 + 2.6 * len(metrics), height), sharey=True) as panels:
+        rows = list(range(len(table.cells)))
+        for panel, metric in zip(panels[0], metrics, strict=True):
+            estimates = [table.of(metric, [i]) for i in rows]
+            panel.errorbar([e.value for e in estimates], rows, xerr=_reach(estimates), fmt="o", ms=4, capsize=2)
+            panel.set_xlabel(readable(metric))
+            if formats.get(table.column(metric), "").endswith("%"):
+                panel.set_xlim(-0.03, 1.03)
+                panel.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+        panels[0, 0].set_yticks(rows, table.labels, fontsize=8)
+        panels[0, 0].invert_yaxis()
 
 
 def _line(panel: Axes, x: Sequence[float], estimates: Sequence[Estimate], index: int, label: str, lines: int) -> None:
@@ -151,7 +136,6 @@ def _line(panel: Axes, x: Sequence[float], estimates: Sequence[Estimate], index:
         ms=5,
         lw=1.2,
     )
-    panel.grid(alpha=0.3)
 
 
 def _reach(estimates: Sequence[Estimate]) -> np.ndarray:
@@ -159,21 +143,23 @@ def _reach(estimates: Sequence[Estimate]) -> np.ndarray:
     return np.array([[e.value - e.low for e in estimates], [e.high - e.value for e in estimates]]).clip(min=0)
 
 
-def _panels(count: int) -> tuple[Figure, list[Axes]]:
+@contextlib.contextmanager
+def _panels(path: Path, count: int) -> Iterator[list[Axes]]:
+    """Give so many panels of a figure, see `drawing`."""
     columns = 2 if count == 4 else min(count, _COLUMNS)
     rows = -(-count // columns)
     size = (4.0 * columns if count > 1 else 5.4, 3.2 * rows)
-    figure, grid = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
-    panels = list(itertools.chain.from_iterable(grid))
-    for panel in panels[count:]:
-        panel.set_visible(False)
-    return figure, panels[:count]
+    with drawing(path, rows, columns, size=size) as grid:
+        for panel in grid.flat[count:]:
+            panel.set_visible(False)
+        yield list(grid.flat[:count])
 
 
-def _legend(figure: Figure, panel: Axes, entries: int) -> None:
+def _legend(panel: Axes, entries: int) -> None:
     handles, labels = panel.get_legend_handles_labels()
     if any(labels):
-        figure.legend(handles, labels, loc="outside lower center", ncols=min(entries, 4), fontsize=8, frameon=False)
+        look = {"loc": "outside lower center", "ncols": min(entries, 4), "fontsize": 8, "frameon": False}
+        panel.figure.legend(handles, labels, **look)
 
 
 def _as_share(panel: Axes, form: str) -> None:
@@ -185,8 +171,3 @@ def _as_share(panel: Axes, form: str) -> None:
 def _named(space: StyleSpace, name: str, prefix: str) -> str:
     unit = space[name].unit
     return f"{prefix}{readable(name)}{f' [{unit}]' if unit else ''}"
-
-
-def _save(figure: Figure, path: Path) -> None:
-    figure.savefig(path, dpi=130, metadata={"Software": None})
-    plt.close(figure)

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import csv
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 import torch
 from tensordict.nn import InteractionType, TensorDictModuleBase
 
 from coachable.domain import Domain
-from coachable.evaluation.rollouts import record_episodes
+from coachable.evaluation.rollouts import RolloutOptions, record_styles
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
 from coachable.styles import Setpoint, StyleSpace
 from coachable.training.weights import LoadedPolicy
@@ -85,12 +86,9 @@ def evaluate_grid(
     space: StyleSpace,
     *,
     episodes: int = 20,
-    steps: int | None = None,
-    seed: int = 0,
     cells: Sequence[Mapping[str, Any]] | None = None,
-    num_threads: int | None = None,
-    progress: bool = True,
     env_options: Mapping[str, Any] | None = None,
+    **options: Unpack[RolloutOptions],
 ) -> StyleGrid:
     """Run `episodes` episodes in every cell, all of them in one batch.
 
@@ -99,26 +97,23 @@ def evaluate_grid(
         policy: deterministic where asked; reads `observation` and `style`.
         space: the policy's style space.
         episodes: per cell.
-        steps: length of an episode; default: the domain's.
-        seed: of the initial states, the same in every cell.
         cells: styles by parameter name; default: the domain's grid.
-        num_threads: physics threads.
-        progress: show a bar.
         env_options: further arguments of the domain's `make_env`.
+        **options: see `RolloutOptions`.
+
+    Raises:
+        ValueError: if there are no episodes.
     """
     if episodes < 1:
         raise ValueError(f"episodes per cell must be at least 1, got {episodes}")
-    steps = steps or domain.episode_steps
     cells = domain.cells() if cells is None else [dict(cell) for cell in cells]
     theta = torch.stack([space.make(strict=True, **cell) for cell in cells]).repeat_interleave(episodes, 0)
-    env = domain.styled_env(space, len(theta), seed=seed, num_threads=num_threads, **(env_options or {}))
-    label = f"{len(cells)} styles x {episodes} episodes" if progress else None
-    record = record_episodes(env, policy, theta, domain.measures, steps=steps, seed=seed, progress=label)
-    env.close()
+    label = f"{len(cells)} styles x {episodes} episodes"
+    record = record_styles(domain, policy, space, theta, label, **options, **(env_options or {}))
     values = {"survived": record.survived.float(), "steps": record.alive.sum(0).float()}
     values |= {"task_return": record.task_return, **domain.measures.summarise(record.measures, record.alive)}
     shaped = {name: value.reshape(len(cells), episodes).double().numpy() for name, value in values.items()}
-    return StyleGrid(cells, shaped, seed, steps)
+    return StyleGrid(cells, shaped, options.get("seed", 0), options.get("steps") or domain.episode_steps)
 
 
 def measured_column(name: str, cell: Mapping[str, Any]) -> str:
@@ -137,6 +132,25 @@ def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
+
+
+def write_results(
+    out: Path, report: str, summary: Mapping[str, Any], tables: Mapping[str, Sequence[Mapping[str, Any]]]
+) -> str:
+    """Write what an evaluation found into a folder, and return the report.
+
+    Args:
+        out: the folder.
+        report: Markdown, for `report.md`.
+        summary: numbers for `summary.json`.
+        tables: rows by file name without `.csv`; a table without rows is left out.
+    """
+    for name, rows in tables.items():
+        if rows:
+            write_csv(rows, out / f"{name}.csv")
+    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    (out / "report.md").write_text(report)
+    return report
 
 
 def markdown_table(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> str:

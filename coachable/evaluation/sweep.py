@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Unpack
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from coachable.domain import Domain, StyleMeasures
-from coachable.evaluation.rollouts import record_episodes
+from coachable.evaluation.rollouts import RolloutOptions, record_styles
 from coachable.keys import STYLE_FEATURES
 from coachable.styles import StyleReward, StyleSpace, Weight
 
@@ -49,10 +50,7 @@ def sweep_weights(
     *,
     points: int = 5,
     episodes: int = 4,
-    steps: int | None = None,
-    seed: int = 0,
-    num_threads: int | None = None,
-    progress: bool = True,
+    **options: Unpack[RolloutOptions],
 ) -> list[WeightSweep]:
     """Run `episodes` episodes at `points` values of every `Weight` of the space, all of them in one batch.
 
@@ -62,10 +60,7 @@ def sweep_weights(
         space: the policy's style space.
         points: values from neutral to the upper end of the range that reports sweep (the lower one if that is 0).
         episodes: per value.
-        steps: length of an episode; default: the domain's.
-        seed: of the initial states.
-        num_threads: physics threads.
-        progress: show a bar.
+        **options: see `RolloutOptions`.
 
     Returns:
         One sweep per weight; empty without weights.
@@ -82,17 +77,8 @@ def sweep_weights(
     for row, (name, _) in enumerate(rows):
         unit[row, space.slices[name]] = 1.0
     measures = _WithUnitReward(domain.measures, reward, unit.repeat_interleave(episodes, 0))
-    env = domain.styled_env(space, len(theta), seed=seed, num_threads=num_threads, reward=reward)
-    record = record_episodes(
-        env,
-        policy,
-        theta,
-        measures,
-        steps=steps or domain.episode_steps,
-        seed=seed,
-        progress=f"{len(weights)} weights x {points} values" if progress else None,
-    )
-    env.close()
+    label = f"{len(weights)} weights x {points} values"
+    record = record_styles(domain, policy, space, theta, label, measures=measures, reward=reward, **options)
     values = {"survived": record.survived.float(), "task_return": record.task_return}
     values |= measures.summarise(record.measures, record.alive)
     shape = (len(weights), points, episodes)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Unpack
 
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from coachable.domain import Domain
-from coachable.evaluation.rollouts import record_episodes
+from coachable.evaluation.rollouts import RolloutOptions, record_styles
 from coachable.styles import StyleSpace
 
 
@@ -37,10 +38,7 @@ def evaluate_switching(
     *,
     episodes: int = 60,
     period: int = 100,
-    steps: int | None = None,
-    seed: int = 0,
-    num_threads: int | None = None,
-    progress: bool = True,
+    **options: Unpack[RolloutOptions],
 ) -> SwitchReport:
     """Draw a new style from the training distribution every `period` steps.
 
@@ -50,27 +48,18 @@ def evaluate_switching(
         space: the policy's style space.
         episodes: number of episodes.
         period: env steps between switches.
-        steps: length of an episode; default: the domain's.
-        seed: of the initial states and of the styles.
-        num_threads: physics threads.
-        progress: show a bar.
+        **options: see `RolloutOptions`.
+
+    Raises:
+        ValueError: if the period is below 1.
     """
     if period < 1:
         raise ValueError(f"period must be at least 1 step, got {period}")
-    steps = steps or domain.episode_steps
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(options.get("seed", 0))
+    steps = options.get("steps") or domain.episode_steps
     styles = space.sample((-(-steps // period), episodes), generator)
-    env = domain.styled_env(space, episodes, seed=seed, num_threads=num_threads)
-    record = record_episodes(
-        env,
-        policy,
-        lambda step: styles[step // period],
-        domain.measures,
-        steps=steps,
-        seed=seed,
-        progress=f"{episodes} episodes, style switched every {period} steps" if progress else None,
-    )
-    env.close()
+    label = f"{episodes} episodes, style switched every {period} steps"
+    record = record_styles(domain, policy, space, lambda step: styles[step // period], label, **options)
     summary = {"survived": record.survived.float(), **domain.measures.summarise(record.measures, record.alive)}
     metrics = {name: value.nanmean().item() for name, value in summary.items()}
     complies = domain.measures.complies(record.measures) & record.alive

@@ -11,17 +11,14 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
-from tensordict import TensorDict
 from torch import Tensor
-from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
 from coachable.domain import Domain
 from coachable.evaluation.outputs import complete_file
+from coachable.evaluation.rollouts import Rollout
 from coachable.extras import how_to_install
-from coachable.keys import STYLE
 from coachable.styles import Choice, StyleRangeWarning, StyleSpace, Weight
-from coachable.training.rng import RandomStream
 from coachable.training.weights import domain_of, load_policy
 
 VIDEO_SUFFIXES = (".mp4", ".gif", ".png")
@@ -121,7 +118,6 @@ def write_video(frames: Iterable[np.ndarray], out: Path, fps: int) -> None:
         container.mux(stream.encode())
 
 
-@torch.no_grad()
 def _film(
     domain: Domain,
     policy: Any,
@@ -133,30 +129,25 @@ def _film(
     every: int,
 ) -> Iterator[np.ndarray]:
     """Frames of each request's `period` steps, of every `every`-th step."""
-    env = domain.styled_env(space, 1, seed=seed, num_threads=1, **domain.coached)
-    renderer = domain.make_renderer(size[0], size[1] - CAPTION)
-    chance = RandomStream(seed)
-    env.set_seed(seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", StyleRangeWarning)  # the caption says it
         thetas = [space.make(**request) for request in requests]
-    current = env.reset(TensorDict({STYLE: thetas[0][None]}, [1]))
-    failures = 0
+    env = domain.styled_env(space, 1, seed=seed, num_threads=1, **domain.coached)
+    renderer = domain.make_renderer(size[0], size[1] - CAPTION)
+    rollout, failures = Rollout(env, seed), 0
+    rollout.begin(thetas[0][None])
     try:
         for request, theta in zip(requests, thetas, strict=True):
             asked = asked_line(space, request, theta)
             recent: list[dict[str, Tensor]] = []
             for step in range(1, period + 1):
-                with chance.drawn():
-                    action = policy(current.set(STYLE, theta[None]))
-                transition = env.step(action)
+                transition = rollout.step(policy, theta[None])
                 recent.append(domain.measures.step(transition))
                 if step % every == 0:
                     yield caption(renderer.draw(env), (asked, _measured_line(domain, recent, failures)))
-                current = step_mdp(transition)
                 if transition["next", "done"].any():
                     failures += int(transition["next", "terminated"].sum())
-                    current = env.reset(TensorDict({STYLE: theta[None]}, [1]))
+                    rollout.begin(theta[None])
     finally:
         renderer.close()
         env.close()

@@ -13,10 +13,12 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.objectives import LossModule, SoftUpdate
 
+from coachable.fast.crew import crew
 from coachable.fast.ensemble import CriticEnsemble, Triple, make_plan, planned_copy, residual_networks, use_plan
 from coachable.fast.flat import FlatBuffers
 from coachable.fast.flat_adam import FlatAdam
 from coachable.fast.fused import Plan
+from coachable.fast.native import KERNEL_THREADS, load_kernels
 from coachable.training.backend import Backend
 from coachable.training.learner import Learner
 
@@ -59,8 +61,8 @@ def accelerate(learner: Learner, when: When | bool = "auto") -> bool:
 def obstacle(loss_module: LossModule) -> str | None:
     """Return why a loss cannot be accelerated, or `None` if it can.
 
-    It can if all networks are residual ones on a CPU, are trained entirely, and evaluate their critics as TorchRL's
-    `SACLoss` does.
+    It can if all networks are residual ones without dropout on a CPU, are trained entirely, and evaluate their critics
+    as TorchRL's `SACLoss` does.
     """
     loss: Any = loss_module
     if device := {p.device.type for p in loss_module.parameters()} - {"cpu"}:
@@ -77,6 +79,8 @@ def obstacle(loss_module: LossModule) -> str | None:
     if not isinstance(critic, TensorDictModule) or not isinstance(critic.module, nn.Module):
         return "the critic is not a module inside a TensorDictModule"
     for name, network in (("policy", loss.actor_network), ("critic", critic)):
+        if any(isinstance(module, nn.Dropout) for module in network.modules()):
+            return f"the {name} has dropout"
         if not residual_networks(network):
             return f"the {name} has parameters outside of residual networks"
     if not any(name.startswith("target_qvalue_network_params") for name, _ in loss_module.named_buffers()):
@@ -127,7 +131,8 @@ class Acceleration(Backend):
         for name, network in self._policies.items():
             use_plan(network, self._actor_plans[name])
         try:
-            yield
+            with crew(KERNEL_THREADS if load_kernels() else 1):
+                yield
         finally:
             loss._vmap_qnetworkN0 = ordinary
             for network in self._policies.values():

@@ -32,7 +32,6 @@ def layers_of(network: ResidualMLP) -> tuple[Layer, ...]:
             in_features=block.linear.in_features,
             out_features=block.linear.out_features,
             side=block.side,
-            narrowing=block.narrowing,
             eps=block.norm.eps if block.norm is not None else 0.0,
             norm=block.norm is not None,
         )

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import ctypes
 import itertools
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.autograd.graph import increment_version
 
+from coachable.fast.crew import crew_size, share_out
 from coachable.fast.flat import FlatBuffers
 from coachable.fast.native import KERNEL_THREADS, load_kernels
 
@@ -65,8 +67,12 @@ class FlatAdam(torch.optim.Adam):
         if single and torch.get_num_threads() <= KERNEL_THREADS and (kernels := load_kernels()):
             taken = steps[0].item() + 1.0
             rate, root = rate / (1.0 - beta1**taken), (1.0 - beta2**taken) ** -0.5
-            table = _table(flat, target, first, second, steps)
-            kernels[torch.float32].adam(table, len(tensors), rate, beta1, beta2, root, eps, self._tau)
+            tables = _tables(flat, target, first, second, crew_size())
+            adam = kernels[torch.float32].adam
+            share_out(
+                [partial(adam, table, len(tensors), rate, beta1, beta2, root, eps, self._tau) for table in tables]
+            )
+            torch._foreach_add_(steps, 1.0)
             flat.renewed()
             if target is not None:
                 target.renewed()
@@ -90,14 +96,27 @@ class FlatAdam(torch.optim.Adam):
                 state[name] = moment.copy_(state[name]) if name in state else moment
 
 
-def _table(
-    flat: FlatBuffers, target: FlatBuffers | None, first: list[Tensor], second: list[Tensor], steps: list[Tensor]
-) -> Any:
-    """Return sizes and addresses for one call of the kernel, see `Parameter` in kernels.c."""
+def _tables(
+    flat: FlatBuffers,
+    target: FlatBuffers | None,
+    first: list[Tensor],
+    second: list[Tensor],
+    shares: int,
+) -> list[Any]:
+    """Return sizes and addresses for one call of the kernel per share of the numbers, see `Parameter` in kernels.c."""
     columns = [flat.tensors, first, second, flat.grads, flat.low if flat.rounds else []]
     columns += [[], []] if target is None else [target.tensors, target.low if target.rounds else []]
-    columns += [steps]
-    nothing = [0] * len(steps)
-    addresses = [[tensor.data_ptr() for tensor in column] or nothing for column in columns]
-    rows = zip([tensor.numel() for tensor in flat.tensors], *addresses, strict=True)
-    return (ctypes.c_int64 * (len(steps) * (1 + len(columns))))(*itertools.chain.from_iterable(rows))
+    sizes = [tensor.numel() for tensor in flat.tensors]
+    tables = []
+    for share in range(shares):
+        starts = [size * share // shares for size in sizes]
+        counts = [size * (share + 1) // shares - start for size, start in zip(sizes, starts, strict=True)]
+        addresses = [
+            [tensor.data_ptr() + start * tensor.itemsize for tensor, start in zip(column, starts, strict=True)]
+            if column
+            else [0] * len(sizes)
+            for column in columns
+        ]
+        rows = zip(counts, *addresses, strict=True)
+        tables.append((ctypes.c_int64 * (len(sizes) * (1 + len(columns))))(*itertools.chain.from_iterable(rows)))
+    return tables

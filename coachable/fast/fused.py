@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from coachable.fast.crew import crew_size
 from coachable.fast.native import KERNEL_THREADS, load_kernels
 from coachable.fast.passes import Layer, Member, TorchPasses
 from coachable.fast.workspace import Workspace
@@ -23,7 +24,6 @@ from coachable.fast.workspace import Workspace
 __all__ = ["Layer", "Member", "Plan", "residual_network"]
 
 _SIZES = 4  # batch sizes for which memory is kept ready
-_ROWS = 32  # granularity of the row-sparse backward with oneDNN, whose cache of kernels few distinct sizes keep small
 
 
 class Plan:
@@ -76,7 +76,7 @@ class Plan:
         kernels = load_kernels().get(self.members[0].products[0].dtype)
         if kernels is None or torch.get_num_threads() > self._kernel_threads:
             return TorchPasses(self.layers, self.members, keep)
-        key = (rows, keep, *widths)
+        key = (crew_size(), rows, keep, *widths)
         if key not in self._spaces and len(self._spaces) >= _SIZES:
             del self._spaces[next(iter(self._spaces))]
         free = self._spaces.setdefault(key, [])
@@ -85,7 +85,7 @@ class Plan:
     def release(self, passes: Workspace | TorchPasses) -> None:
         """Take prepared memory back for the next evaluation of the same size."""
         if isinstance(passes, Workspace):
-            free = self._spaces.get((passes.rows, passes.keep, *passes.widths))
+            free = self._spaces.get((crew_size(), passes.rows, passes.keep, *passes.widths))
             if free is not None:
                 free.append(passes)
 
@@ -128,15 +128,7 @@ class _Residual(torch.autograd.Function):
         _, trained, *needs = ctx.needs_input_grad
         columns = _columns(ctx.widths, needs)
         grad = grad.reshape(len(plan.members), count, grad.shape[-1])
-        dx: Tensor | None = None
-        for k in range(len(plan.members)):
-            rows = None if trained else _active_rows(grad[k], 1 if passes.own_products else _ROWS)
-            own = passes.backward(k, grad[k], trained, plan.written, rows, columns)
-            if columns is None:
-                continue
-            if rows is not None:
-                own = own.new_zeros(count, own.shape[1]).index_copy_(0, rows, own)
-            dx = own if dx is None else dx.add_(own)
+        dx = passes.backward(grad, trained, plan.written, columns)
         ctx.passes = None
         plan.release(passes)
         plan.written = plan.written or trained
@@ -158,17 +150,3 @@ def _columns(widths: Sequence[int], needs: Sequence[bool]) -> slice | None:
             wanted += [start, start + width]
         start += width
     return slice(min(wanted), max(wanted)) if wanted else None
-
-
-def _active_rows(grad: Tensor, step: int) -> Tensor | None:
-    """Return the rows of `(rows, out)` with a gradient, filled up to a multiple of `step`; `None` if most have one.
-
-    The policy's loss uses the smaller of the critics' values, so each critic has a gradient in about half of the rows.
-    """
-    count = grad.shape[0]
-    active = (grad != 0).any(-1)
-    rows = active.nonzero().squeeze(-1)
-    wanted = -(-len(rows) // step) * step
-    if wanted > 0.8 * count:
-        return None
-    return rows if wanted == len(rows) else torch.argsort(active, descending=True)[:wanted]

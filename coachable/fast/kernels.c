@@ -41,7 +41,6 @@ typedef struct {
     uint16_t *rounded; /* or null */
     float *target; /* or null */
     uint16_t *target_rounded; /* if there is a target and a rounded copy of the parameter */
-    float *steps; /* taken so far */
 } Parameter;
 
 static inline __attribute__((always_inline)) void adam_on(
@@ -70,7 +69,6 @@ void adam(const Parameter *parameters, int64_t count, float rate, float beta1, f
           float tau) {
     for (int64_t i = 0; i < count; i++) {
         const Parameter p = parameters[i];
-        *p.steps += 1.0f;
 #define ADAM(rounds, follows)                                                                                     \
     adam_on(p.size, p.value, p.first, p.second, p.grad, p.rounded, p.target, p.target_rounded, rounds, follows, rate, \
             beta1, beta2, root, eps, tau)

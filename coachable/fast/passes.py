@@ -9,6 +9,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+_ROWS = 32  # granularity of the row-sparse backward with oneDNN, whose cache of kernels few distinct sizes keep small
+
 
 @dataclass(frozen=True)
 class Layer:
@@ -17,7 +19,6 @@ class Layer:
     in_features: int
     out_features: int
     side: str
-    narrowing: str
     eps: float
     norm: bool
 
@@ -32,7 +33,7 @@ class Layer:
         n, m = self.in_features, self.out_features
         if n <= m:
             return 0, 0 if self.side == "end" else m - n, n
-        return 0 if self.side == "end" or self.narrowing == "keep_first" else n - m, 0, m
+        return 0 if self.side == "end" else n - m, 0, m
 
     def skip(self, x: Tensor, hidden: Tensor, *, inplace: bool) -> Tensor:
         """Return `hidden + fit(x)`; `hidden` may be overwritten if `inplace`."""
@@ -79,7 +80,6 @@ class TorchPasses:
     def __init__(self, layers: Sequence[Layer], members: Sequence[Member], keep: bool) -> None:
         self._layers, self._members, self._keep = layers, members, keep
         self._kept: list[list[tuple[Tensor, ...]]] = []
-        self.own_products = False
 
     def forward(self, inputs: Sequence[Tensor], out: Sequence[Tensor]) -> None:
         """Evaluate the members on `inputs` `(rows, d_i)` into `out`, each `(rows, o)`."""
@@ -87,22 +87,33 @@ class TorchPasses:
         x = torch.cat([t.to(dtype) for t in inputs], -1)
         self._kept = [self._forward(x, member, into) for member, into in zip(self._members, out, strict=True)]
 
-    def backward(
-        self, k: int, grad: Tensor, trained: bool, add: bool, rows: Tensor | None, columns: slice | None
-    ) -> Tensor:
-        """Run the backward pass of member `k`.
+    def backward(self, grads: Tensor, trained: bool, add: bool, columns: slice | None) -> Tensor | None:
+        """Run the backward pass of all members.
 
         Args:
-            k: Which member.
-            grad: Gradient of its output, `(all rows, o)`.
-            trained: Whether to write its parameters' gradients.
+            grads: Gradients of their outputs, `(K, rows, o)`.
+            trained: Whether to write their parameters' gradients.
             add: Add them to those present instead of replacing them.
-            rows: Rows to work on, `None` for all.
             columns: Columns of the concatenated inputs whose gradient is wanted, `None` for none.
 
         Returns:
-            Gradient of the inputs, `(rows, columns)`; meaningless without `columns`.
+            Gradient of the inputs, summed over the members, `(rows, columns)`; `None` without `columns`.
         """
+        total: Tensor | None = None
+        for k, grad in enumerate(grads):
+            rows = None if trained else active_rows(grad, 0)
+            own = self._backward(k, grad, trained, add, rows, columns)
+            if columns is None:
+                continue
+            if rows is not None:
+                own = own.new_zeros(len(grad), own.shape[1]).index_copy_(0, rows, own)
+            total = own if total is None else total.add_(own)
+        return total
+
+    def _backward(
+        self, k: int, grad: Tensor, trained: bool, add: bool, rows: Tensor | None, columns: slice | None
+    ) -> Tensor:
+        """Return the gradient of the inputs of member `k` in `rows`; meaningless without `columns`."""
         member, kept = self._members[k], self._kept[k]
         own, low, into = member.parameters, member.products, member.grads
         i = len(own)
@@ -159,6 +170,25 @@ class TorchPasses:
         kept.append((hidden,))
         torch.addmm(own[i + 1], hidden, own[i].t(), out=into)
         return kept
+
+
+def active_rows(grad: Tensor, step: int) -> Tensor | None:
+    """Return the rows of `(rows, out)` with a gradient, filled up to a multiple of `step`; `None` if most have one.
+
+    The policy's loss uses the smaller of the critics' values, so each critic has a gradient in about half of the rows.
+
+    Args:
+        grad: The gradient.
+        step: 0 for the granularity of torch's products.
+    """
+    step = step or _ROWS
+    count = grad.shape[0]
+    active = (grad != 0).any(-1)
+    rows = active.nonzero().squeeze(-1)
+    wanted = -(-len(rows) // step) * step
+    if wanted > 0.8 * count:
+        return None
+    return rows if wanted == len(rows) else torch.argsort(active, descending=True)[:wanted]
 
 
 def _write(into: Tensor, value: Tensor, add: bool) -> None:

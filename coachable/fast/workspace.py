@@ -8,19 +8,25 @@ they are in memory. When they move, the backend of the learner makes new plans b
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from coachable.fast.crew import crew_size, share_out
 from coachable.fast.native import Kernels, Products
-from coachable.fast.passes import Layer, Member
+from coachable.fast.passes import Layer, Member, active_rows
 
+_FEWEST_ROWS = 32  # of a part
 _FEW_OUTPUTS = 4  # of a head; beyond, products of matrices are faster than the kernels of small heads
 
 
 class Workspace:
     """Buffers and prepared calls for one batch size of a plan.
+
+    The work is cut into parts for the threads of the crew: each part is one member on all rows or on some.
 
     Args:
         kernels: The compiled kernels.
@@ -41,64 +47,95 @@ class Workspace:
         keep: bool,
     ) -> None:
         self.rows, self.keep, self.widths = rows, keep, tuple(widths)
-        self._dtype = members[0].products[0].dtype
-        widest = max(layer.out_features for layer in layers)
-        self._scratch = torch.empty(2 * widest, dtype=torch.float32)
         width = sum(widths)
-        self._input = torch.zeros(rows, width + width % 2, dtype=self._dtype)[:, :width]
+        dtype = members[0].products[0].dtype
+        self._input = torch.zeros(rows, width + width % 2, dtype=dtype)[:, :width]
         self._slots = self._input.split(list(widths), -1)
-        if keep:
-            self._flow = [torch.empty(rows, widest, dtype=self._dtype) for _ in range(2)]
-            self._dz = torch.empty(rows, widest, dtype=self._dtype)
-            self._dw = torch.empty(max(layer.in_features for layer in layers) * widest, dtype=self._dtype)
-        shared = None if keep else self._buffers(layers)
-        self._members = [
-            _MemberSpace(self, kernels, layers, member, shared or self._buffers(layers)) for member in members
-        ]
-
-    def _buffers(self, layers: Sequence[Layer]) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
-        """Return product, output, mean and reciprocal deviation of each layer; layers share them if `keep` is false."""
-
-        def buffer(layer: Layer) -> Tensor:
-            return torch.empty(self.rows, layer.out_features, dtype=self._dtype)
-
-        def statistic() -> Tensor:
-            return torch.empty(self.rows, dtype=torch.float32)
-
-        if self.keep or len({layer.out_features for layer in layers}) > 1:
-            return [(buffer(n), buffer(n), statistic(), statistic()) for n in layers]
-        z, outs, both = buffer(layers[0]), (buffer(layers[0]), buffer(layers[0])), statistic()
-        return [(z, outs[i % 2], both, both) for i in range(len(layers))]
-
-    @property
-    def own_products(self) -> bool:
-        """Whether the kernels compute the products at the present number of threads."""
-        return self._members[0].products() is not None
+        shares = min(-(-crew_size() // len(members)), max(1, rows // _FEWEST_ROWS))
+        cuts = [rows * i // shares for i in range(shares + 1)]
+        self._slices = [slice(start, stop) for start, stop in pairwise(cuts)]
+        self._parts: list[list[_MemberSpace]] = []
+        for member in members:
+            # The first part writes the gradients, the others write their own, which are added.
+            own = [member, *(_with_own_gradients(member) for _ in self._slices[1:])]
+            inputs = [self._input[part] for part in self._slices]
+            self._parts.append([_MemberSpace(kernels, layers, m, x, keep) for m, x in zip(own, inputs, strict=True)])
 
     def forward(self, inputs: Sequence[Tensor], out: Sequence[Tensor]) -> None:
         """Evaluate the members on `inputs` `(rows, d_i)` into `out`, each `(rows, o)`."""
         for slot, value in zip(self._slots, inputs, strict=True):
             slot.copy_(value)
-        for member, into in zip(self._members, out, strict=True):
-            member.forward(into)
+        share_out(
+            [
+                partial(space.forward, into[part])
+                for parts, into in zip(self._parts, out, strict=True)
+                for space, part in zip(parts, self._slices, strict=True)
+            ]
+        )
 
-    def backward(
-        self, k: int, grad: Tensor, trained: bool, add: bool, rows: Tensor | None, columns: slice | None
-    ) -> Tensor:
-        """Run the backward pass of member `k`, see `TorchPasses.backward`."""
-        return self._members[k].backward(grad, trained, add, rows, columns)
+    def backward(self, grads: Tensor, trained: bool, add: bool, columns: slice | None) -> Tensor | None:
+        """Run the backward pass of all members, see `TorchPasses.backward`."""
+        step = 1 if self._parts[0][0].products() is not None else 0
+        dx = None if columns is None else grads.new_empty(len(grads), self.rows, columns.stop - columns.start)
+
+        def one(space: _MemberSpace, grad: Tensor, add: bool, into: Tensor | None) -> None:
+            rows = None if trained else active_rows(grad, step)
+            own = space.backward(grad, trained, add, rows, columns)
+            if into is None:
+                return
+            if rows is None:
+                into.copy_(own)
+            else:
+                into.zero_().index_copy_(0, rows, own.to(into.dtype))
+
+        share_out(
+            [
+                partial(one, space, grads[k, part], add and i == 0, None if dx is None else dx[k, part])
+                for k, parts in enumerate(self._parts)
+                for i, (space, part) in enumerate(zip(parts, self._slices, strict=True))
+            ]
+        )
+        if trained:
+            for first, *others in self._parts:
+                for other in others:
+                    torch._foreach_add_(first.gradients, other.gradients)
+        return dx if dx is None else dx.sum(0)
+
+
+def _with_own_gradients(member: Member) -> Member:
+    return Member(member.parameters, member.products, [torch.empty_like(grad) for grad in member.grads])
+
+
+def _buffers(
+    layers: Sequence[Layer], rows: int, dtype: torch.dtype, keep: bool
+) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
+    """Return product, output, mean and reciprocal deviation of each layer; layers share them if `keep` is false."""
+
+    def buffer(layer: Layer) -> Tensor:
+        return torch.empty(rows, layer.out_features, dtype=dtype)
+
+    def statistic() -> Tensor:
+        return torch.empty(rows, dtype=torch.float32)
+
+    if keep or len({layer.out_features for layer in layers}) > 1:
+        return [(buffer(n), buffer(n), statistic(), statistic()) for n in layers]
+    z, outs, both = buffer(layers[0]), (buffer(layers[0]), buffer(layers[0])), statistic()
+    return [(z, outs[i % 2], both, both) for i in range(len(layers))]
 
 
 class _MemberSpace:
-    def __init__(
-        self,
-        space: Workspace,
-        kernels: Kernels,
-        layers: Sequence[Layer],
-        member: Member,
-        buffers: Sequence[tuple[Tensor, Tensor, Tensor, Tensor]],
-    ) -> None:
-        self._space, self._layers = space, layers
+    """Buffers and prepared calls for one member and its rows of the input."""
+
+    def __init__(self, kernels: Kernels, layers: Sequence[Layer], member: Member, inputs: Tensor, keep: bool) -> None:
+        self._layers, self.gradients = layers, member.grads
+        rows, widest = len(inputs), max(layer.out_features for layer in layers)
+        self._rows = rows
+        buffers = _buffers(layers, rows, inputs.dtype, keep)
+        self._scratch = torch.empty(2 * widest, dtype=torch.float32)
+        if keep:
+            self._flow = [torch.empty(rows, widest, dtype=inputs.dtype) for _ in range(2)]
+            self._dz = torch.empty(rows, widest, dtype=inputs.dtype)
+            self._dw = torch.empty(max(layer.in_features for layer in layers) * widest, dtype=inputs.dtype)
         self._layer_forward, self._layer_backward = kernels.layer_forward, kernels.layer_backward
         even = all(layer.out_features % 2 == 0 for layer in layers)
         self._own_products = kernels.products if even else None
@@ -107,8 +144,8 @@ class _MemberSpace:
         self._forward_steps: list[tuple[Any, ...]] = []
         self._backward_steps: list[tuple[Any, ...]] = []
         self._product_steps: list[tuple[Any, ...]] = []
-        x, i, rows = space._input, 0, space.rows
-        scratch = space._scratch.data_ptr()
+        x, i = inputs, 0
+        scratch = self._scratch.data_ptr()
         for index, layer in enumerate(layers):
             z, out, mean, rstd = buffers[index]
             bias, gamma, beta = (t.data_ptr() for t in self._own[i + 1 : i + 4])
@@ -118,18 +155,18 @@ class _MemberSpace:
             arguments += (rows, layer.out_features, out.data_ptr(), *statistics, scratch)
             weight_address = self._low[i].data_ptr()
             self._forward_steps.append((x, self._low[i].t(), z, layer.in_features, weight_address, arguments))
-            if space.keep:
+            if keep:
                 n, m = layer.in_features, layer.out_features
                 # The gradient alternates between two buffers: the last layer's arrives in the first.
                 flow = len(layers) - 1 - index
-                here = space._flow[flow % 2].view(-1)[: rows * m].view(rows, m)
-                below = space._flow[(flow + 1) % 2].view(-1)[: rows * n].view(rows, n) if index else None
-                dz = space._dz.view(-1)[: rows * m].view(rows, m)
+                here = self._flow[flow % 2].view(-1)[: rows * m].view(rows, m)
+                below = self._flow[(flow + 1) % 2].view(-1)[: rows * n].view(rows, n) if index else None
+                dz = self._dz.view(-1)[: rows * m].view(rows, m)
                 grads = self._grads[i : i + 4]
                 targets = [g.data_ptr() for g in (grads[2], grads[3], grads[1])] if grads else [None] * 3
                 first = (here.data_ptr(), z.data_ptr(), bias, gamma, beta, *statistics)
                 last = (m, dz.data_ptr(), *targets, scratch)
-                dw = space._dw[: m * n].view(m, n)
+                dw = self._dw[: m * n].view(m, n)
                 weight = grads[0] if grads else None
                 self._backward_steps.append((layer, x, here, below, dz, dz.t(), dw, weight, self._low[i], first, last))
                 factors = (dz.data_ptr(), m, x.data_ptr(), n, x.stride(0), rows)
@@ -155,10 +192,10 @@ class _MemberSpace:
         self._hidden = (
             x if x.dtype == torch.float32 else torch.empty(x.shape, dtype=torch.float32)
         )  # what torch's head sees
-        self._head_gradient = torch.empty(x.shape, dtype=torch.float32) if space.keep else x
+        self._head_gradient = torch.empty(x.shape, dtype=torch.float32) if keep else x
 
     def products(self) -> Products | None:
-        return self._own_products if torch.get_num_threads() == 1 else None
+        return self._own_products if crew_size() > 1 or torch.get_num_threads() == 1 else None
 
     def forward(self, out: Tensor) -> None:
         products = self.products()
@@ -175,7 +212,7 @@ class _MemberSpace:
         if not self._small_head:  # the backward pass follows this choice
             self._head_kernels = products and (products.wide_head_forward, products.wide_head_backward)
         if self._head_kernels is not None:
-            self._head_kernels[0](*self._head_addresses, self._space.rows, *self._head_sizes, out.data_ptr())
+            self._head_kernels[0](*self._head_addresses, self._rows, *self._head_sizes, out.data_ptr())
         else:
             if self._hidden is not self._features:
                 self._hidden.copy_(self._features)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, cast
 
 import torch
@@ -52,7 +51,6 @@ class ActorCriticLoss(SACLoss):
     SUPPORTED_VALUE_ESTIMATORS = (ValueEstimators.TD0,)
     _continuous_only = False
     _policy: PolicyReader
-    _dropouts: list[nn.Module]
 
     def __init__(
         self,
@@ -98,8 +96,6 @@ class ActorCriticLoss(SACLoss):
         # In float64, as gamma: float64 losses see the rounding, and a 0-dim number does not widen float32 tensors.
         self.log_alpha = torch.tensor(math.log(alpha), dtype=torch.float64, device=cast(Tensor, self.log_alpha).device)
         self._policy = policy  # no submodule: the parameters are those of actor_network_params
-        networks = (actor_network, *critics)
-        self._dropouts = [m for net in networks for m in net.modules() if isinstance(m, nn.modules.dropout._DropoutNd)]
         self.make_value_estimator()
 
     # What a subclass defines.
@@ -115,15 +111,6 @@ class ActorCriticLoss(SACLoss):
     def _next_value(self, output: Tensor) -> Tensor:
         """Return the successor's value (...,) or quantiles (..., M) from the target critics' output (K, ..., out)."""
         return self._values(output).min(0).values
-
-    def _soft_target(
-        self, reward: Tensor, next_value: Tensor, log_prob: Tensor, terminated: Tensor, steps: Tensor | None
-    ) -> Tensor:
-        """Return the target; the successor's entropy is inside the discount, so that terminals have none."""
-        if next_value.ndim > log_prob.ndim:
-            log_prob = log_prob.unsqueeze(-1)
-        soft = next_value - self._alpha * log_prob
-        return bootstrap_target(reward, soft, terminated, self._gamma, steps)
 
     def _errors(self, output: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         """Return the losses (K, ...) of the critics against the target, and their absolute TD errors (K, ...)."""
@@ -165,20 +152,24 @@ class ActorCriticLoss(SACLoss):
 
     @torch.no_grad()
     def compute_target(self, tensordict: TensorDictBase) -> Tensor:
-        """Return the target, (...,) or (..., M), from hard actions of the present policy and the target critics."""
+        """Return the target, (...,) or (..., M), from hard actions of the present policy and the target critics.
+
+        The successor's entropy is inside the discount, so that terminals have none.
+        """
         successor = tensordict.get("next")
-        with self._without_dropout():
-            policy = self._policy_at(successor)
-            with self._full_precision():
-                action, log_prob = self._sample(policy, relaxed=False)
-            output = self._critics_at(successor, action, self.target_qvalue_network_params)
+        policy = self._policy_at(successor)
+        with self._full_precision():
+            action, log_prob = self._sample(policy, relaxed=False)
+        output = self._critics_at(successor, action, self.target_qvalue_network_params)
         with self._full_precision():
             next_value = self._next_value(at_least_float32(output))
-            return self._soft_target(
+            if next_value.ndim > log_prob.ndim:
+                log_prob = log_prob.unsqueeze(-1)
+            return bootstrap_target(
                 self._scalar(successor, self.tensor_keys.reward).to(next_value.dtype),
-                next_value,
-                log_prob,
+                next_value - self._alpha * log_prob,
                 self._scalar(successor, self.tensor_keys.terminated),
+                self._gamma,
                 self._scalar(tensordict, self.value_estimator.tensor_keys.steps_to_next_obs, required=False),
             )
 
@@ -276,15 +267,3 @@ class ActorCriticLoss(SACLoss):
 
     def _full_precision(self) -> torch.autocast:
         return torch.autocast(cast(Tensor, self.log_alpha).device.type, enabled=False)
-
-    @contextmanager
-    def _without_dropout(self) -> Iterator[None]:
-        """Switch dropout off for the target, where it would be noise in what the critics regress on."""
-        training = [m for m in self._dropouts if m.training]
-        for module in training:
-            module.training = False
-        try:
-            yield
-        finally:
-            for module in training:
-                module.training = True

@@ -8,7 +8,7 @@ from typing import Any
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
 
-from coachable.distributions.hl_gauss import HLGauss, Support
+from coachable.distributions.hl_gauss import HLGauss
 from coachable.losses.rac import RACLoss
 
 
@@ -29,7 +29,6 @@ class CatRACLoss(RACLoss):
         v_max: Largest value represented.
         num_atoms: Number of bins.
         sigma_ratio: Standard deviation of the target's Gaussian over the width of a bin.
-        hl_gauss_support: Whether the outer `"edges"` or the outer `"centres"` lie on v_min and v_max.
         **options: See `RACLoss` and `ActorCriticLoss`.
 
     Raises:
@@ -45,10 +44,9 @@ class CatRACLoss(RACLoss):
         v_max: float = 1000.0,
         num_atoms: int = 255,
         sigma_ratio: float = 0.75,
-        hl_gauss_support: Support = "edges",
         **options: Any,
     ) -> None:
-        self.bins = HLGauss(v_min, v_max, num_atoms, sigma_ratio, hl_gauss_support)
+        self.bins = HLGauss(v_min, v_max, num_atoms, sigma_ratio)
         super().__init__(actor_network, qvalue_network, **options)
 
     def _critic_width(self) -> int:

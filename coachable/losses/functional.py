@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
-
 import torch
 from torch import Tensor
-
-TargetMin = Literal["vector", "elementwise"]
-QuantileReduction = Literal["mean", "sum"]
 
 # Elements of one (rows, M, M') block of the quantile loss: 512 kB in float32 on a CPU, 64 MB on an accelerator.
 _BLOCK_ELEMENTS_CPU = 1 << 17
@@ -45,13 +40,11 @@ def bootstrap_target(
     return reward + torch.where(terminated, 0.0, discount * next_value)
 
 
-def pessimistic_quantiles(quantiles: Tensor, target_min: TargetMin = "vector") -> Tensor:
-    """Combine the quantiles of several critics into the more pessimistic ones.
+def pessimistic_quantiles(quantiles: Tensor) -> Tensor:
+    """Return all quantiles of the critic with the lowest mean, of the first one at ties.
 
     Args:
         quantiles: (K, ..., M) quantiles of K critics.
-        target_min: `"vector"`: all quantiles of the critic with the lowest mean, the first one at ties.
-            `"elementwise"`: the minimum of each quantile.
 
     Returns:
         (..., M).
@@ -59,13 +52,7 @@ def pessimistic_quantiles(quantiles: Tensor, target_min: TargetMin = "vector") -
     Example:
         >>> pessimistic_quantiles(torch.tensor([[0.0, 4.0], [1.0, 2.0]])).tolist()
         [1.0, 2.0]
-        >>> pessimistic_quantiles(torch.tensor([[0.0, 4.0], [1.0, 2.0]]), "elementwise").tolist()
-        [0.0, 2.0]
     """
-    if target_min not in get_args(TargetMin):
-        raise ValueError(f"target_min must be one of {get_args(TargetMin)}, got {target_min!r}")
-    if target_min == "elementwise":
-        return quantiles.amin(0)
     best = quantiles[0]
     for candidate in quantiles[1:]:  # not argmin: which index that returns at ties is undefined
         lower = candidate.mean(-1, keepdim=True) < best.mean(-1, keepdim=True)
@@ -79,33 +66,23 @@ def quantile_midpoints(num_quantiles: int, like: Tensor) -> Tensor:
     return (index + 0.5) / num_quantiles
 
 
-def quantile_huber_loss(
-    prediction: Tensor,
-    target: Tensor,
-    quantile_fractions: Tensor | None = None,
-    *,
-    kappa: float = 1.0,
-    quantile_reduction: QuantileReduction = "mean",
-    divide_by_kappa: bool = True,
-) -> Tensor:
+def quantile_huber_loss(prediction: Tensor, target: Tensor, *, kappa: float = 1.0) -> Tensor:
     """Return the quantile Huber loss of every prediction against every target (QR-DQN, IQN).
 
-    `|tau_i - 1{u_ij < 0}| L_kappa(u_ij) / kappa` with `u_ij = target_j - prediction_i`.
+    The mean over predictions and targets of `|tau_i - 1{u_ij < 0}| L_kappa(u_ij) / kappa` with
+    `u_ij = target_j - prediction_i` and the midpoints `tau_i = (2i - 1) / (2M)`. The sum over predictions, which other
+    libraries use, is M times larger; Adam does not see that, and gradient clipping does.
 
     Args:
         prediction: (..., M) predicted quantiles; may have leading dimensions that `target` lacks.
         target: (..., M') samples or quantiles of the target; no gradient.
-        quantile_fractions: (M,) or (..., M) levels of the predictions, by default the midpoints `(2i - 1) / (2M)`.
         kappa: Where the loss turns from quadratic to linear; 0 for the pinball loss `|tau - 1{u < 0}| |u|`.
-        quantile_reduction: `"mean"` over predictions and targets, or `"sum"` over predictions, mean over targets; the
-            latter is M times larger, which Adam does not see and gradient clipping does.
-        divide_by_kappa: Whether to divide by kappa (IQN) or not (QR-DQN); without effect at 0 and 1.
 
     Returns:
         (...,) losses.
 
     Raises:
-        ValueError: If `kappa` is negative or `quantile_reduction` unknown.
+        ValueError: If `kappa` is negative.
 
     Example:
         >>> quantile_huber_loss(torch.zeros(10), torch.ones(10)).item()
@@ -113,17 +90,10 @@ def quantile_huber_loss(
     """
     if kappa < 0:
         raise ValueError(f"kappa must not be negative, got {kappa}")
-    if quantile_reduction not in get_args(QuantileReduction):
-        raise ValueError(f"quantile_reduction must be one of {get_args(QuantileReduction)}, got {quantile_reduction!r}")
-    if quantile_fractions is None:
-        quantile_fractions = quantile_midpoints(prediction.shape[-1], prediction)
-    scale = 1.0 / target.shape[-1]
-    if quantile_reduction == "mean":
-        scale /= prediction.shape[-1]
-    if divide_by_kappa and kappa > 0:
-        scale /= kappa
+    fractions = quantile_midpoints(prediction.shape[-1], prediction)
+    scale = 1.0 / target.shape[-1] / prediction.shape[-1] / (kappa or 1.0)
     needs_gradient = torch.is_grad_enabled() and prediction.requires_grad
-    return _QuantileHuber.apply(prediction, target.detach(), quantile_fractions, float(kappa), scale, needs_gradient)
+    return _QuantileHuber.apply(prediction, target.detach(), fractions, float(kappa), scale, needs_gradient)
 
 
 class _QuantileHuber(torch.autograd.Function):

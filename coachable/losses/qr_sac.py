@@ -3,23 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, get_args
+from typing import Any
 
-import torch
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
 
+from coachable.distributions.tanh_gaussian import at_least_float32
 from coachable.losses.actor_critic import ActorCriticLoss
-from coachable.losses.functional import (
-    QuantileReduction,
-    TargetMin,
-    bootstrap_target,
-    pessimistic_quantiles,
-    quantile_huber_loss,
-)
+from coachable.losses.functional import pessimistic_quantiles, quantile_huber_loss
 from coachable.ranges import COUNT, NOT_NEGATIVE
-
-EntropyInTarget = Literal["inside", "outside"]
 
 
 class QRSACLoss(ActorCriticLoss):
@@ -35,14 +27,10 @@ class QRSACLoss(ActorCriticLoss):
         qvalue_network: List of critics with `num_quantiles` outputs.
         num_quantiles: Quantiles per critic, M, at the levels `(2i - 1) / (2M)`.
         kappa: Where the Huber loss turns linear; 0 for the pinball loss.
-        target_min: `"vector"`: all quantiles of the critic of lower mean. `"elementwise"`: minimum of each quantile.
-        entropy_in_target: `"inside"`: in the bracket above. `"outside"`: `R + gamma^k (1 - d) Z_j - alpha log pi`,
-            undiscounted and also at terminals, whose next observation must then be valid.
-        quantile_reduction: `"mean"` over predictions and targets; `"sum"` over predictions, mean over targets.
         **options: See `ActorCriticLoss`.
 
     Raises:
-        ValueError: If a number is out of range, an option unknown, or the actor has categorical heads.
+        ValueError: If a number is out of range or the actor has categorical heads.
     """
 
     _continuous_only = True
@@ -54,44 +42,23 @@ class QRSACLoss(ActorCriticLoss):
         *,
         num_quantiles: int = 32,
         kappa: float = 1.0,
-        target_min: TargetMin = "vector",
-        entropy_in_target: EntropyInTarget = "inside",
-        quantile_reduction: QuantileReduction = "mean",
         **options: Any,
     ) -> None:
         COUNT.check("num_quantiles", num_quantiles)
         NOT_NEGATIVE.check("kappa", kappa)
-        for name, value, choices in (
-            ("target_min", target_min, get_args(TargetMin)),
-            ("entropy_in_target", entropy_in_target, get_args(EntropyInTarget)),
-            ("quantile_reduction", quantile_reduction, get_args(QuantileReduction)),
-        ):
-            if value not in choices:
-                raise ValueError(f"{name} must be one of {choices}, got {value!r}")
         self.num_quantiles = int(num_quantiles)
         self.kappa = float(kappa)
-        self.target_min: TargetMin = target_min
-        self.entropy_in_target: EntropyInTarget = entropy_in_target
-        self.quantile_reduction: QuantileReduction = quantile_reduction
         super().__init__(actor_network, qvalue_network, **options)
 
     def _critic_width(self) -> int:
         return self.num_quantiles
 
     def _values(self, output: Tensor) -> Tensor:
-        return output.to(torch.promote_types(output.dtype, torch.float32)).mean(-1)
+        return at_least_float32(output).mean(-1)
 
     def _next_value(self, output: Tensor) -> Tensor:
-        return pessimistic_quantiles(output, self.target_min)
-
-    def _soft_target(
-        self, reward: Tensor, next_value: Tensor, log_prob: Tensor, terminated: Tensor, steps: Tensor | None
-    ) -> Tensor:
-        if self.entropy_in_target == "inside":
-            return super()._soft_target(reward, next_value, log_prob, terminated, steps)
-        target = bootstrap_target(reward, next_value, terminated, self._gamma, steps)
-        return target - self._alpha * log_prob.unsqueeze(-1)
+        return pessimistic_quantiles(output)
 
     def _errors(self, output: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-        losses = quantile_huber_loss(output, target, kappa=self.kappa, quantile_reduction=self.quantile_reduction)
+        losses = quantile_huber_loss(output, target, kappa=self.kappa)
         return losses, (target.mean(-1) - output.detach().mean(-1)).abs()

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Protocol
 
 import torch
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Bounded
@@ -29,7 +30,54 @@ class StyleEncoding(Protocol):
         ...
 
 
-class GaussianPolicy(nn.Module):
+class TensorModule(TensorDictModule):
+    """A `TensorDictModule` whose network returns tensors, which are written as they are.
+
+    The base class first sees whether an output has to be converted, and looks for pandas on disk each time: a twentieth
+    of an update.
+    """
+
+    def _write_to_tensordict(
+        self,
+        tensordict: TensorDictBase,
+        tensors: Sequence[Tensor],
+        tensordict_out: TensorDictBase | None = None,
+        out_keys: Iterable[NestedKey] | None = None,
+    ) -> TensorDictBase:
+        written = tensordict if tensordict_out is None else tensordict_out
+        for key, tensor in zip(self.out_keys_source if out_keys is None else out_keys, tensors, strict=True):
+            written.set(key, tensor)
+        return written
+
+
+class StyleNetwork(nn.Module):
+    """A residual network of `cat(observation, encode(theta), further inputs)`.
+
+    Args:
+        space: Style space whose `encode` is applied to theta; `None` makes a network without style.
+        inputs: Width of the other inputs.
+        outputs: Width of the head.
+        widths: Widths of the residual layers.
+        **trunk: Further arguments of :class:`~coachable.networks.residual.ResidualMLP`.
+    """
+
+    def __init__(
+        self, space: StyleEncoding | None, inputs: int, outputs: int, widths: Sequence[int], **trunk: Any
+    ) -> None:
+        super().__init__()
+        self.space = space
+        self.trunk = ResidualMLP(inputs + (0 if space is None else space.dim), outputs, widths, **trunk)
+
+    def head(self, observation: Tensor, style: Tensor | None, *further: Tensor) -> Tensor:
+        """Return the output `(..., outputs)` of the head for raw (not encoded) `style`."""
+        if self.space is None:
+            return self.trunk(observation, *further)
+        if style is None:
+            raise ValueError("this network is conditioned on a style: pass theta as its last argument")
+        return self.trunk(observation, self.space.encode(style), *further)
+
+
+class GaussianPolicy(StyleNetwork):
     """Mean and scale of a diagonal Gaussian over pre-tanh actions, given observation and style.
 
     The trunk sees `cat(observation, encode(theta))`. The scale is `exp(l + (h - l)/2 (tanh(raw) + 1))` with
@@ -54,23 +102,15 @@ class GaussianPolicy(nn.Module):
         log_scale_range: tuple[float, float] = (-5.0, 2.0),
         **trunk: Any,
     ) -> None:
-        super().__init__()
+        super().__init__(space, obs_dim, 2 * action_dim, widths, **trunk)
         low, high = log_scale_range
         if not low < high:
             raise ValueError(f"log_scale_range must be (low, high) with low < high, got {log_scale_range}")
-        self.space = space
         self.log_scale_range = (float(low), float(high))
-        self.trunk = ResidualMLP(obs_dim + (space.dim if space is not None else 0), 2 * action_dim, widths, **trunk)
 
     def forward(self, observation: Tensor, style: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return location and scale, both `(..., action_dim)` float32, for raw (not encoded) `style`."""
-        if self.space is None:
-            out = self.trunk(observation)
-        elif style is None:
-            raise ValueError("this policy is conditioned on a style: pass theta as the second argument")
-        else:
-            out = self.trunk(observation, self.space.encode(style))
-        loc, raw = out.chunk(2, -1)
+        loc, raw = self.head(observation, style).chunk(2, -1)
         low, high = self.log_scale_range
         return loc, torch.exp(torch.tanh(raw) * (0.5 * (high - low)) + 0.5 * (high + low))
 
@@ -82,8 +122,6 @@ def make_gaussian_actor(
     widths: Sequence[int] = (512, 512, 512),
     *,
     log_scale_range: tuple[float, float] = (-5.0, 2.0),
-    observation_key: str = "observation",
-    action_spec: Bounded | None = None,
     **trunk: Any,
 ) -> ProbabilisticActor:
     """Build a tanh-Gaussian policy over actions in [-1, 1].
@@ -94,19 +132,17 @@ def make_gaussian_actor(
         space: Style space; theta is read from the key `style` and encoded inside. `None` for no style.
         widths: Widths of the residual layers.
         log_scale_range: Bounds of the logarithm of the scale, see :class:`GaussianPolicy`.
-        observation_key: Key of the observation.
-        action_spec: Spec of the action; default [-1, 1] in every dimension.
         **trunk: Further arguments of :class:`~coachable.networks.residual.ResidualMLP`.
 
     Returns:
         A `ProbabilisticActor` reading `observation` and `style`, writing `loc`, `scale` and `action`.
     """
     policy = GaussianPolicy(obs_dim, action_dim, space, widths, log_scale_range=log_scale_range, **trunk)
-    in_keys: list[Any] = [observation_key] if space is None else [observation_key, STYLE]
-    module = TensorDictModule(policy, in_keys=in_keys, out_keys=["loc", "scale"])  # pyright: ignore[reportArgumentType]
+    in_keys: list[Any] = ["observation"] if space is None else ["observation", STYLE]
+    module = TensorModule(policy, in_keys=in_keys, out_keys=["loc", "scale"])  # pyright: ignore[reportArgumentType]
     return ProbabilisticActor(
         module,
         in_keys=["loc", "scale"],
-        spec=Bounded(-1.0, 1.0, torch.Size([action_dim]), dtype=torch.float32) if action_spec is None else action_spec,
+        spec=Bounded(-1.0, 1.0, torch.Size([action_dim]), dtype=torch.float32),
         distribution_class=TanhGaussian,
     )

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.modules import ValueOperator
 
 from coachable.keys import STYLE
-from coachable.networks.actors import StyleEncoding
-from coachable.networks.residual import ResidualMLP
+from coachable.networks.actors import StyleEncoding, StyleNetwork, TensorModule
 
 
-class StyleCritic(nn.Module):
+class StyleCritic(StyleNetwork):
     """Action value (or its quantiles, or logits over its bins) of `cat(observation, encode(theta), action)`.
 
     Args:
@@ -35,18 +34,15 @@ class StyleCritic(nn.Module):
         num_outputs: int = 1,
         **trunk: Any,
     ) -> None:
-        super().__init__()
-        self.space = space
-        style_dim = space.dim if space is not None else 0
-        self.trunk = ResidualMLP(obs_dim + style_dim + action_dim, num_outputs, widths, **trunk)
+        super().__init__(space, obs_dim + action_dim, num_outputs, widths, **trunk)
 
     def forward(self, observation: Tensor, action: Tensor, style: Tensor | None = None) -> Tensor:
         """Return `(..., num_outputs)` float32, for raw (not encoded) `style`."""
-        if self.space is None:
-            return self.trunk(observation, action)
-        if style is None:
-            raise ValueError("this critic is conditioned on a style: pass theta as the third argument")
-        return self.trunk(observation, self.space.encode(style), action)
+        return self.head(observation, style, action)
+
+
+class CriticModule(TensorModule, ValueOperator):
+    """A `ValueOperator` that writes its tensor as it is."""
 
 
 def make_critic(
@@ -56,8 +52,6 @@ def make_critic(
     widths: Sequence[int] = (512, 512, 512),
     *,
     num_outputs: int = 1,
-    observation_key: str = "observation",
-    action_key: str = "action",
     **trunk: Any,
 ) -> ValueOperator:
     """Build one critic.
@@ -71,13 +65,11 @@ def make_critic(
         space: Style space; theta is read from the key `style` and encoded inside. `None` for no style.
         widths: Widths of the residual layers.
         num_outputs: 1 for a scalar value, else the number of quantiles or logits.
-        observation_key: Key of the observation.
-        action_key: Key of the action.
         **trunk: Further arguments of :class:`~coachable.networks.residual.ResidualMLP`.
 
     Returns:
         A `ValueOperator` reading `observation`, `action`, `style` and writing `state_action_value`.
     """
     critic = StyleCritic(obs_dim, action_dim, space, widths, num_outputs=num_outputs, **trunk)
-    in_keys = [observation_key, action_key] if space is None else [observation_key, action_key, STYLE]
-    return ValueOperator(critic, in_keys=in_keys, out_keys=["state_action_value"])
+    in_keys = ["observation", "action"] if space is None else ["observation", "action", STYLE]
+    return CriticModule(critic, in_keys=in_keys, out_keys=["state_action_value"])

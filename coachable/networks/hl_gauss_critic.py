@@ -7,7 +7,7 @@ from typing import Any
 
 from torchrl.modules import ValueOperator
 
-from coachable.distributions.hl_gauss import HLGauss, Support, initialise_value
+from coachable.distributions.hl_gauss import HLGauss, initialise_value
 from coachable.networks.actors import StyleEncoding
 from coachable.networks.critics import make_critic
 
@@ -21,7 +21,6 @@ def make_hl_gauss_critic(
     v_min: float = -600.0,
     v_max: float = 1000.0,
     num_atoms: int = 255,
-    hl_gauss_support: Support = "edges",
     initial_value: float | None = 0.0,
     **options: Any,
 ) -> ValueOperator:
@@ -32,10 +31,9 @@ def make_hl_gauss_critic(
         action_dim: Width of the action (for mixed actions `ActionHeads.action_dim`).
         space: Style space; theta is read from the key `style`. None for no style.
         widths: Widths of the residual layers.
-        v_min: Smallest value represented; as in the loss, like the next three.
+        v_min: Smallest value represented; as in the loss, like the next two.
         v_max: Largest value represented.
         num_atoms: Number of bins.
-        hl_gauss_support: What lies on v_min and v_max, see `HLGauss`.
         initial_value: What the critic predicts before training, see `initialise_value`; None for the plain
             initialisation, which predicts the middle of the support.
         **options: Further arguments of `make_critic`.
@@ -46,7 +44,7 @@ def make_hl_gauss_critic(
     Raises:
         ValueError: If the support is empty, or `initial_value` lies outside it.
     """
-    bins = HLGauss(v_min, v_max, num_atoms, support=hl_gauss_support)
+    bins = HLGauss(v_min, v_max, num_atoms)
     critic = make_critic(obs_dim, action_dim, space, widths, num_outputs=bins.num_atoms, **options)
     initialise_value(critic, bins, initial_value)
     return critic

@@ -3,39 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, get_args
+from typing import Any
 
 import torch
-from tensordict.nn import InteractionType, TensorDictModule
-from torch import Tensor, nn
-from torchrl.data import TensorSpec
+from tensordict.nn import InteractionType
+from torch import Tensor
 from torchrl.modules import ProbabilisticActor
 
 from coachable.distributions.action_heads import ActionHeads
-from coachable.distributions.categorical import RegretGradient, regret_matching_probabilities
+from coachable.distributions.categorical import regret_matching_probabilities
 from coachable.distributions.mixed_action import MixedAction
 from coachable.distributions.tanh_gaussian import at_least_float32
 from coachable.keys import STYLE
-from coachable.networks.actors import StyleEncoding
-from coachable.networks.residual import ResidualMLP
-
-MeanBound = Literal["post_tanh", "location"]
+from coachable.networks.actors import StyleEncoding, StyleNetwork, TensorModule
 
 
-class MixedPolicy(nn.Module):
+class MixedPolicy(StyleNetwork):
     """Probabilities of the categorical heads, location and scale of the axes, given observation and style.
 
     The trunk sees `cat(observation, encode(theta))`. Heads run in float32, also under autocast. The scale of the axes
-    is `exp(2 tanh(raw))` (paper).
+    is `exp(2 tanh(raw))` (paper), their location is unbounded and its tanh is the deterministic action.
 
     Args:
         obs_dim: Width of the observation.
         heads: Components of the action.
         space: Style space whose `encode` is applied to theta; None for a policy without style.
         widths: Widths of the residual layers.
-        regret_gradient: Reading of the regret gradient, see `regret_matching_probabilities`.
-        mean_bound: `"post_tanh"`: the location is unbounded and its tanh, the deterministic action, covers (-1, 1).
-            `"location"`: the location itself is tanh(raw), so that the deterministic action stops at tanh(1) = 0.76.
         **trunk: Further arguments of `ResidualMLP`.
     """
 
@@ -45,39 +38,19 @@ class MixedPolicy(nn.Module):
         heads: ActionHeads,
         space: StyleEncoding | None,
         widths: Sequence[int] = (512, 512, 512),
-        *,
-        regret_gradient: RegretGradient = "dpi",
-        mean_bound: MeanBound = "post_tanh",
         **trunk: Any,
     ) -> None:
-        super().__init__()
-        for name, value, options in (
-            ("regret_gradient", regret_gradient, get_args(RegretGradient)),
-            ("mean_bound", mean_bound, get_args(MeanBound)),
-        ):
-            if value not in options:
-                raise ValueError(f"{name} must be one of {options}, got {value!r}")
+        super().__init__(space, obs_dim, heads.num_parameters, widths, **trunk)
         self.heads = heads
-        self.space = space
-        self.regret_gradient: RegretGradient = regret_gradient
-        self.mean_bound: MeanBound = mean_bound
-        style_dim = space.dim if space is not None else 0
-        self.trunk = ResidualMLP(obs_dim + style_dim, heads.num_parameters, widths, **trunk)
 
     def forward(self, observation: Tensor, style: Tensor | None = None) -> tuple[Tensor, ...]:
         """Return `probs` if there are categorical heads, then `loc` and `scale` if there are axes, float32."""
-        inputs = (observation,)
-        if self.space is not None:
-            if style is None:
-                raise ValueError("this policy is conditioned on a style: pass theta as the second argument")
-            inputs = (observation, self.space.encode(style))
-        raw = at_least_float32(self.trunk(*inputs))
+        raw = at_least_float32(self.head(observation, style))
         preferences, loc, raw_scale = raw.split((self.heads.num_categorical, self.heads.axes, self.heads.axes), -1)
         outputs: tuple[Tensor, ...] = ()
         if self.heads.categorical:
-            outputs += (regret_matching_probabilities(preferences, self.heads.layout, self.regret_gradient),)
+            outputs += (regret_matching_probabilities(preferences, self.heads.layout),)
         if self.heads.axes:
-            loc = torch.tanh(loc) if self.mean_bound == "location" else loc
             outputs += (loc, torch.exp(2.0 * torch.tanh(raw_scale)))
         return outputs
 
@@ -87,11 +60,7 @@ def make_mixed_actor(
     heads: ActionHeads | Mapping[str, Any],
     space: StyleEncoding | None,
     widths: Sequence[int] = (512, 512, 512),
-    *,
-    observation_key: str = "observation",
-    action_key: str = "action",
-    action_spec: TensorSpec | None = None,
-    **policy: Any,
+    **trunk: Any,
 ) -> ProbabilisticActor:
     """Build the policy of RAC and Cat-RAC.
 
@@ -101,10 +70,7 @@ def make_mixed_actor(
             works with only axes or only categorical heads.
         space: Style space; theta is read from the key `style` and encoded inside. None for no style.
         widths: Widths of the residual layers.
-        observation_key: Key of the observation.
-        action_key: Key of the action.
-        action_spec: Spec of the action, by default `heads.spec()`.
-        **policy: `regret_gradient`, `mean_bound` and arguments of `ResidualMLP`, see `MixedPolicy`.
+        **trunk: Further arguments of `ResidualMLP`.
 
     Returns:
         A `ProbabilisticActor` reading `observation` and `style`, writing `probs`, `loc`, `scale` (those that exist)
@@ -119,12 +85,11 @@ def make_mixed_actor(
     """
     heads = heads if isinstance(heads, ActionHeads) else ActionHeads(**heads)
     names: list[Any] = (["probs"] if heads.categorical else []) + (["loc", "scale"] if heads.axes else [])
-    in_keys: list[Any] = [observation_key] if space is None else [observation_key, STYLE]
+    in_keys: list[Any] = ["observation"] if space is None else ["observation", STYLE]
     return ProbabilisticActor(
-        TensorDictModule(MixedPolicy(obs_dim, heads, space, widths, **policy), in_keys=in_keys, out_keys=names),
+        TensorModule(MixedPolicy(obs_dim, heads, space, widths, **trunk), in_keys=in_keys, out_keys=names),
         in_keys=names,
-        out_keys=[action_key],
-        spec=heads.spec() if action_spec is None else action_spec,
+        spec=heads.spec(),
         distribution_class=MixedAction,
         distribution_kwargs={"heads": heads},
         default_interaction_type=InteractionType.RANDOM if heads.categorical else InteractionType.DETERMINISTIC,

@@ -51,7 +51,6 @@ class _PlainPolicy(nn.Module):
             return torch.tanh(raw.chunk(2, -1)[0]), ()
         heads = self.policy.heads
         preferences, loc, _ = raw.split((heads.num_categorical, heads.axes, heads.axes), -1)
-        loc = torch.tanh(loc) if self.policy.mean_bound == "location" else loc
         probabilities = ()
         if heads.categorical:
             positive = [

@@ -2,31 +2,34 @@
 
 Every layer is `block(x) = ReLU(LayerNorm(W x + b)) + fit(x)`, where `fit` has no parameters: it pads the input with
 zeros, or cuts it, to the width of the layer. Heads are linear. Source: the paper, network appendix (arXiv 2607.00642).
+
+Dropout, which the racing policies of Wurman et al. 2022 have, is on only while a gradient is asked for. A policy that
+acts, is evaluated or gives the action of a target does so without gradients, and therefore without dropout, also where
+a collector holds a copy of it that nobody has put into evaluation mode.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from coachable.ranges import Range
+
 Side = Literal["end", "beginning"]
-Padding = Literal["alternate", "end", "beginning"]
-Narrowing = Literal["padded_side", "keep_first"]
 
 
-def fit_features(x: Tensor, width: int, side: Side = "end", narrowing: Narrowing = "padded_side") -> Tensor:
+def fit_features(x: Tensor, width: int, side: Side = "end") -> Tensor:
     """Pad or cut the last dimension of `x` to `width` (the identity path of a residual layer).
 
     Args:
         x: Features, `(..., n)`.
         width: Wanted size of the last dimension.
-        side: Where zeros go when `x` is narrower: `"end"` gives `[x, 0]`, `"beginning"` gives `[0, x]`.
-        narrowing: What is dropped when `x` is wider. `"padded_side"` drops from `side`, as padding by a negative
-            amount would; `"keep_first"` always keeps the first `width` features.
+        side: Where zeros go when `x` is narrower: `"end"` gives `[x, 0]`, `"beginning"` gives `[0, x]`. Where `x` is
+            wider, features are dropped from there, as padding by a negative amount would.
 
     Returns:
         `(..., width)`; `x` itself where nothing changes, a view where it is cut.
@@ -42,9 +45,7 @@ def fit_features(x: Tensor, width: int, side: Side = "end", narrowing: Narrowing
         return x
     if missing > 0:
         return F.pad(x, (0, missing) if side == "end" else (missing, 0))
-    if side == "end" or narrowing == "keep_first":
-        return x[..., :width]
-    return x[..., -width:]
+    return x[..., :width] if side == "end" else x[..., -width:]
 
 
 class ResidualBlock(nn.Module):
@@ -54,9 +55,8 @@ class ResidualBlock(nn.Module):
         in_features: Width of the input.
         out_features: Width of the output.
         side: Padding side of the identity path, see :func:`fit_features`.
-        narrowing: What the identity path drops when it narrows.
         layer_norm: Without it the layer is `ReLU(W x + b) + fit(x)`.
-        eps: Epsilon of the layer norm.
+        dropout: Probability with which a unit is dropped after the ReLU, in training mode and where gradients are on.
     """
 
     def __init__(
@@ -65,15 +65,14 @@ class ResidualBlock(nn.Module):
         out_features: int,
         *,
         side: Side = "end",
-        narrowing: Narrowing = "padded_side",
         layer_norm: bool = True,
-        eps: float = 1e-5,
+        dropout: float = 0.0,
     ) -> None:
         super().__init__()
         self.linear = nn.Linear(in_features, out_features)
-        self.norm = nn.LayerNorm(out_features, eps=eps) if layer_norm else None
+        self.norm = nn.LayerNorm(out_features) if layer_norm else None
         self.side: Side = side
-        self.narrowing: Narrowing = narrowing
+        self.dropout = nn.Dropout(dropout) if dropout else None
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
@@ -88,30 +87,32 @@ class ResidualBlock(nn.Module):
         hidden = self.linear(x)
         if self.norm is not None:
             hidden = self.norm(hidden)
-        return F.relu(hidden) + fit_features(x, hidden.shape[-1], self.side, self.narrowing)
+        hidden = F.relu(hidden)
+        if self.dropout is not None and torch.is_grad_enabled():
+            hidden = self.dropout(hidden)
+        return hidden + fit_features(x, hidden.shape[-1], self.side)
 
     def extra_repr(self) -> str:
         """Padding of the identity path."""
-        return f"side={self.side!r}, narrowing={self.narrowing!r}"
+        return f"side={self.side!r}"
 
 
 class ResidualMLP(nn.Module):
     """Stack of residual layers with a linear head.
 
+    Layers pad their input at the end and at the beginning in turns, which makes no difference between equal widths.
+
     Args:
         in_features: Width of the input.
         out_features: Width of the head; `None` leaves the head out.
         widths: Widths of the layers. The paper uses three of 512 (humanoid), 4096, 2048, 1024, 512 (combat).
-        padding: Padding side of the layers: `"alternate"` (end, beginning, end, … as in combat), one side for all, or
-            one side per layer. Irrelevant between layers of equal width.
-        narrowing: What the identity path drops when it narrows, see :func:`fit_features`.
         layer_norm: Layer norm before the activation of every layer.
-        eps: Epsilon of the layer norms.
         head_gain: Factor on the head's initial weights. With the paper's Glorot weights (1) and inputs of unit size the
             outputs have a standard deviation of about 2, where tanh is nearly flat: a policy may want less.
+        dropout: Probability with which a layer's unit is dropped while learning; see the module.
 
     Raises:
-        ValueError: If a width is not positive, or `padding` or `narrowing` is unknown.
+        ValueError: If a width is not positive, or `dropout` is not in [0, 1).
 
     Example:
         >>> ResidualMLP(10, 2, widths=(64, 64))(torch.zeros(5, 10)).shape
@@ -124,25 +125,21 @@ class ResidualMLP(nn.Module):
         out_features: int | None,
         widths: Sequence[int] = (512, 512, 512),
         *,
-        padding: Padding | Sequence[Side] = "alternate",
-        narrowing: Narrowing = "padded_side",
         layer_norm: bool = True,
-        eps: float = 1e-5,
         head_gain: float = 1.0,
+        dropout: float = 0.0,
     ) -> None:
         super().__init__()
         if not widths or min(in_features, *widths) < 1:
             raise ValueError(f"widths must be positive and at least one, got in_features={in_features}, {widths=}")
-        if narrowing not in get_args(Narrowing):
-            raise ValueError(f"narrowing must be one of {get_args(Narrowing)}, got {narrowing!r}")
-        sides = _sides(padding, len(widths))
+        Range("[0, 1)").check("dropout", dropout)
         self.in_features = in_features
         self.out_features = out_features
         ins = (in_features, *widths[:-1])
         self.blocks = nn.Sequential(
             *(
-                ResidualBlock(i, o, side=side, narrowing=narrowing, layer_norm=layer_norm, eps=eps)
-                for i, o, side in zip(ins, widths, sides, strict=True)
+                ResidualBlock(ins[k], o, side="beginning" if k % 2 else "end", layer_norm=layer_norm, dropout=dropout)
+                for k, o in enumerate(widths)
             )
         )
         self.head = None if out_features is None else nn.Linear(widths[-1], out_features)
@@ -173,7 +170,7 @@ def with_new_inputs(weights: Mapping[str, Tensor], seen: int, new: int) -> dict[
 
     Args:
         weights: `blocks.0.linear.weight` and so on, with any leading dimensions (a stack of critics), of a network
-            whose first layer pads at the end, as it does by default.
+            whose first layer pads at the end.
         seen: Inputs before the new ones.
         new: How many there are.
 
@@ -205,15 +202,3 @@ def with_new_inputs(weights: Mapping[str, Tensor], seen: int, new: int) -> dict[
             value = value.index_select(-1, order)
         wide[name] = value
     return wide
-
-
-def _sides(padding: Padding | Sequence[Side], layers: int) -> tuple[Side, ...]:
-    alternate: tuple[Side, Side] = ("end", "beginning")
-    if padding == "alternate":
-        return tuple(alternate[i % 2] for i in range(layers))
-    sides = (padding,) * layers if isinstance(padding, str) else tuple(padding)
-    if len(sides) != layers or any(side not in get_args(Side) for side in sides):
-        raise ValueError(
-            f"padding must be 'alternate', 'end', 'beginning' or one side per layer ({layers}), got {padding!r}"
-        )
-    return sides  # pyright: ignore[reportReturnType]  # checked above

@@ -7,7 +7,6 @@ from coachable.replay.routing import (
     KeyEvents,
     KeyRoute,
     PredicateEvents,
-    PredicateRoute,
     Route,
     StyleEvents,
 )
@@ -21,7 +20,6 @@ __all__ = [
     "KeyRoute",
     "NStep",
     "PredicateEvents",
-    "PredicateRoute",
     "Route",
     "StratifiedSampler",
     "StyleEvents",

@@ -10,11 +10,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from coachable.files import load_state, save_state
 from coachable.ranges import NOT_NEGATIVE, Range
 from coachable.replay.n_step import NStep
-from coachable.replay.records import read_records, write_records
-from coachable.replay.routing import EventPredicate, KeyRoute, Route, StyleEvents
+from coachable.replay.replay_files import read_replay, write_replay
+from coachable.replay.routing import EventPredicate, KeyRoute, Route
 from coachable.replay.stratified import StratifiedSampler, allot
 from coachable.replay.table_settings import checked_horizon, checked_proportions, make_regions
 from coachable.replay.table_writer import TableWriter
@@ -32,9 +31,8 @@ class EventTableBuffer(TensorDictReplayBuffer):
 
     Batches `(steps,)` are read as time-major (all environments at one time, then at the next), batches `(num_envs,
     time)` as TorchRL's collectors yield them. Trajectory numbers, `("collector", "traj_ids")`, override both. Episodes
-    may span any number of `extend` calls; batches of several workers may be interleaved (`extend(data, worker=i)`,
-    needed only where trajectory numbers are not unique across workers). All of it runs in the process that calls
-    `extend`.
+    may span any number of `extend` calls, and batches of several workers may be interleaved if they carry trajectory
+    numbers. All of it runs in the process that calls `extend`.
 
     Samples carry `index` and `table`, the number of the table in `names`.
 
@@ -163,34 +161,6 @@ class EventTableBuffer(TensorDictReplayBuffer):
         """
         return cls(dict.fromkeys(scenarios, capacity // len(scenarios)), route=KeyRoute(scenarios), **kwargs)
 
-    @classmethod
-    def for_styles(
-        cls,
-        space: Any,
-        *,
-        capacity: int,
-        event_capacity: int,
-        event_horizon: int,
-        extra: Sequence[str] = (),
-        event_admission: str = "nonzero",
-        **kwargs: Any,
-    ) -> "EventTableBuffer":
-        """A default table and one event table per weight of a `StyleSpace` (paper, combat).
-
-        Args:
-            space: `coachable.styles.StyleSpace`; its weights, in order, are the columns of `("next", "events")`.
-            capacity: Records of the default table.
-            event_capacity: Records of each event table.
-            event_horizon: H_max.
-            extra: Names of further event columns, admitted whatever the style.
-            event_admission: "nonzero" or "positive".
-            **kwargs: As for the class.
-        """
-        events = StyleEvents.of(space, extra, event_admission)
-        return cls.for_events(
-            events, capacity=capacity, event_capacity=event_capacity, event_horizon=event_horizon, **kwargs
-        )
-
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the tables; `table` in a sample is an index into them."""
@@ -227,12 +197,11 @@ class EventTableBuffer(TensorDictReplayBuffer):
         tables = {f"tables/{name}/{key}": v for name, row in self.statistics().items() for key, v in row.items()}
         return {**super().stats(), **tables}
 
-    def extend(self, tensordicts: TensorDictBase, *, worker: int = 0, update_priority: bool | None = None) -> Tensor:
+    def extend(self, tensordicts: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
         """Add steps; the input is left as it is.
 
         Args:
             tensordicts: `(steps,)`, time-major, or `(num_envs, time)`, as collectors yield them.
-            worker: Number of the worker that collected them.
             update_priority: Not used: new records get the largest priority seen so far.
 
         Returns:
@@ -245,7 +214,7 @@ class EventTableBuffer(TensorDictReplayBuffer):
         if tensordicts is None:
             return torch.zeros(0, dtype=torch.long)
         with self._replay_lock, self._write_lock:
-            index = self._writer.extend(tensordicts, worker)
+            index = self._writer.extend(tensordicts)
             self._sampler.extend(index)
         return index
 
@@ -282,8 +251,16 @@ class EventTableBuffer(TensorDictReplayBuffer):
 
     def state_dict(self) -> dict[str, Any]:
         """Return the whole state as tensors and plain containers."""
+        rng = None if self._rng is None else {"state": self._rng.get_state().clone(), "device": str(self._rng.device)}
         with self._replay_lock:
-            return {"_storage": self._storage.state_dict(), "_batch_size": self._batch_size, **self._light_state()}
+            return {
+                "_storage": self._storage.state_dict(),
+                "_writer": self._writer.state_dict(),
+                "_sampler": self._sampler.state_dict(),
+                "_transforms": dict(self._transform.state_dict()),
+                "_rng": rng,
+                "_batch_size": self._batch_size,
+            }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         """Restore `state_dict`; the tables must be the same.
@@ -295,47 +272,26 @@ class EventTableBuffer(TensorDictReplayBuffer):
             self._writer.load_state_dict(state_dict["_writer"])  # checks the tables before anything is overwritten
             if state_dict["_storage"]["initialized"]:
                 self._storage.load_state_dict(state_dict["_storage"])
-            self._load_light_state(state_dict)
+            self._storage._len = self.regions.used_prefix
+            self._sampler.load_state_dict(state_dict["_sampler"])
+            self._transform.load_state_dict(state_dict["_transforms"])
             self._batch_size = state_dict["_batch_size"]
+            if state_dict["_rng"] is not None:
+                generator = torch.Generator(device=state_dict["_rng"]["device"])
+                generator.set_state(state_dict["_rng"]["state"].cpu())
+                self.set_rng(generator)
 
     def dumps(self, path: Path | str) -> None:
-        """Save the buffer to a folder, as `.npy` files and tensors, without pickle."""
-        path = Path(path).absolute()
-        path.mkdir(parents=True, exist_ok=True)
+        """Save the buffer to a folder, as checkpoints do; see `write_replay`."""
         with self._replay_lock:
-            write_records(self._storage, path, self.regions.unused())
-            save_state({"_batch_size": self._batch_size, **self._light_state()}, path / "state.pt")
+            write_replay(self, Path(path))
 
     def loads(self, path: Path | str) -> None:
-        """Restore what `dumps` saved, executing nothing from it; the tables must be the same.
+        """Restore what `dumps` saved; see `read_replay`. The tables must be the same.
 
         Raises:
-            CheckpointError: If files are missing, damaged or of another kind.
-            ValueError: If tables, horizon or prioritisation differ.
+            CheckpointError: If files are missing, damaged or of another kind, or tables, horizon or prioritisation
+                differ.
         """
-        path = Path(path).absolute()
-        state = load_state(path / "state.pt")
         with self._replay_lock:
-            self._writer.load_state_dict(state["_writer"])
-            read_records(self._storage, path)
-            self._load_light_state(state)
-            self._batch_size = state["_batch_size"]
-
-    def _light_state(self) -> dict[str, Any]:
-        """Return the state without the records."""
-        rng = None if self._rng is None else {"state": self._rng.get_state().clone(), "device": str(self._rng.device)}
-        return {
-            "_writer": self._writer.state_dict(),
-            "_sampler": self._sampler.state_dict(),
-            "_transforms": dict(self._transform.state_dict()),
-            "_rng": rng,
-        }
-
-    def _load_light_state(self, state: Mapping[str, Any]) -> None:
-        self._storage._len = self.regions.used_prefix
-        self._sampler.load_state_dict(state["_sampler"])
-        self._transform.load_state_dict(state["_transforms"])
-        if state["_rng"] is not None:
-            generator = torch.Generator(device=state["_rng"]["device"])
-            generator.set_state(state["_rng"]["state"].cpu())
-            self.set_rng(generator)
+            read_replay(self, Path(path))

@@ -9,7 +9,6 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 
 from coachable.files import load_state, refusing, save_state
-from coachable.replay import EventTableBuffer
 from coachable.replay.records import read_records, write_records
 
 __all__ = ["read_replay", "replay_bytes", "write_replay"]
@@ -19,22 +18,23 @@ def write_replay(replay: ReplayBuffer, folder: Path) -> None:
     """Write the filled part of a buffer over a `LazyTensorStorage`, with the state of its writer, sampler, transforms.
 
     Args:
-        replay: the buffer.
-        folder: created.
+        replay: the buffer; of an `EventTableBuffer`, slots that were never written are zeros in the files.
+        folder: created if missing.
 
     Raises:
         OSError: if writing fails.
     """
-    folder.mkdir()
-    write_records(replay.storage, folder, replay.regions.unused() if isinstance(replay, EventTableBuffer) else None)
+    folder.mkdir(parents=True, exist_ok=True)
+    regions = getattr(replay, "regions", None)
+    write_records(replay.storage, folder, None if regions is None else regions.unused())
     save_state({name: value for name, value in replay.state_dict().items() if name != "_storage"}, folder / "state.pt")
 
 
 def read_replay(replay: ReplayBuffer, folder: Path) -> int:
-    """Fill an empty buffer from `write_replay`'s files.
+    """Fill a buffer from `write_replay`'s files, executing nothing from them.
 
     Args:
-        replay: a new buffer, made like the saved one.
+        replay: a buffer made like the saved one; a ring buffer has to be empty.
         folder: written by `write_replay`.
 
     Returns:
@@ -45,8 +45,8 @@ def read_replay(replay: ReplayBuffer, folder: Path) -> int:
             it).
     """
     storage: Any = replay.storage  # typed too narrowly in TorchRL: it takes slices and tensors
-    filled = read_records(storage, folder)
     state = load_state(folder / "state.pt")  # of a buffer without records, too: it may hold steps back
+    filled = read_records(storage, folder)
     with refusing(folder / "state.pt", "the state of a replay buffer"):
         # The records are in place already: the storage gets its own state.
         replay.load_state_dict({**state, "_storage": storage.state_dict()})

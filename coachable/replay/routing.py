@@ -12,11 +12,9 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from coachable.keys import EVENTS, STYLE
+from coachable.keys import EVENTS, SCENARIO, STYLE
 
-__all__ = ["EventPredicate", "KeyEvents", "KeyRoute", "PredicateEvents", "PredicateRoute", "Route", "StyleEvents"]
-
-Key = str | tuple[str, ...]
+__all__ = ["EventPredicate", "KeyEvents", "KeyRoute", "PredicateEvents", "Route", "StyleEvents"]
 
 
 @runtime_checkable
@@ -42,18 +40,15 @@ class Route(Protocol):
 
 
 class StyleEvents:
-    """Admit event i if the trajectory's weight w_i is set and the event fired (paper, Appendix B, Stratified Sampling).
+    """Admit event i if it fired and the trajectory's weight w_i is not 0 (paper, Appendix B, Stratified Sampling).
 
     Args:
         names: Names of the styles, in the order of the event columns; the tables are named after them.
         columns: Entry of theta that holds each weight.
         extra: Names of event columns after these, admitted whatever the style (such as a kill table).
-        event_admission: "nonzero" admits when w_i != 0, "positive" when w_i > 0 (our choice).
-        events: Key of the booleans, `(steps, len(names) + len(extra))`.
-        style: Key of the raw theta, `(steps, d_theta)`.
 
     Raises:
-        ValueError: If lengths differ, a name repeats or `event_admission` is unknown.
+        ValueError: If lengths differ or a name repeats.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -64,52 +59,37 @@ class StyleEvents:
         tensor([[ True, False]])
     """
 
-    def __init__(
-        self,
-        names: Sequence[str],
-        columns: Sequence[int],
-        extra: Sequence[str] = (),
-        event_admission: str = "nonzero",
-        events: Key = ("next", EVENTS),
-        style: Key = STYLE,
-    ) -> None:
+    def __init__(self, names: Sequence[str], columns: Sequence[int], extra: Sequence[str] = ()) -> None:
         if len(names) != len(columns):
             raise ValueError(
                 f"StyleEvents got {len(names)} names for {len(columns)} columns of theta: expected one each"
             )
-        if event_admission not in ("nonzero", "positive"):
-            raise ValueError(f"event_admission is {event_admission!r}: expected 'nonzero' or 'positive'")
         self.names = _distinct((*names, *extra))
         self.columns = torch.tensor(list(columns), dtype=torch.long)
-        self.event_admission = event_admission
-        self.events = events
-        self.style = style
 
     @classmethod
-    def of(cls, space: "object", extra: Sequence[str] = (), event_admission: str = "nonzero") -> "StyleEvents":
+    def of(cls, space: "object", extra: Sequence[str] = ()) -> "StyleEvents":
         """Return events for each `Weight` of a `StyleSpace`, in the space's order.
 
         Args:
             space: A `coachable.styles.StyleSpace`.
             extra: As above.
-            event_admission: As above.
         """
         slices = space.slices  # type: ignore[attr-defined]
         weights = [p.name for p in space.parameters if p.kind == "weight"]  # type: ignore[attr-defined]
-        return cls(weights, [slices[name].start for name in weights], extra, event_admission)
+        return cls(weights, [slices[name].start for name in weights], extra)
 
     def __call__(self, steps: TensorDictBase) -> Tensor:
         """Booleans `(steps, len(names))`."""
-        fired = steps.get(self.events)
+        fired = steps.get(("next", EVENTS))
         if fired.shape[-1] != len(self.names):
             raise ValueError(
-                f"{self.events} has shape {tuple(fired.shape)}: expected {len(self.names)} events, one for each of "
-                f"{', '.join(self.names)} (names and extra of StyleEvents)"
+                f"('next', 'events') has shape {tuple(fired.shape)}: expected {len(self.names)} events, one for each "
+                f"of {', '.join(self.names)} (names and extra of StyleEvents)"
             )
-        weight = steps.get(self.style).index_select(-1, self.columns.to(fired.device))
-        wanted = weight != 0 if self.event_admission == "nonzero" else weight > 0
+        weight = steps.get(STYLE).index_select(-1, self.columns.to(fired.device))
         admitted = fired.clone()
-        admitted[..., : len(self.columns)] &= wanted
+        admitted[..., : len(self.columns)] &= weight != 0
         return admitted
 
 
@@ -117,17 +97,15 @@ class KeyEvents:
     """Events exactly as the environment reports them, whatever the style.
 
     Args:
-        names: One per column.
-        events: Key of the booleans, `(steps, len(names))`.
+        names: One per column of `("next", "events")`.
     """
 
-    def __init__(self, names: Sequence[str], events: Key = ("next", EVENTS)) -> None:
+    def __init__(self, names: Sequence[str]) -> None:
         self.names = _distinct(names)
-        self.events = events
 
     def __call__(self, steps: TensorDictBase) -> Tensor:
         """Booleans `(steps, len(names))`."""
-        return steps.get(self.events)
+        return steps.get(("next", EVENTS))
 
 
 class PredicateEvents:
@@ -160,44 +138,19 @@ class PredicateEvents:
 
 
 class KeyRoute:
-    """Routes by an integer that the data carries, such as the scenario's number.
+    """Route by the number of the scenario, integers `(steps,)` or `(steps, 1)` under the key `scenario`.
 
     Args:
         names: Table of each number.
-        key: Key of the integers, `(steps,)` or `(steps, 1)`.
     """
 
-    def __init__(self, names: Sequence[str], key: Key = "scenario") -> None:
+    def __init__(self, names: Sequence[str]) -> None:
         self.names = _distinct(names)
-        self.key = key
 
     def __call__(self, steps: TensorDictBase) -> Tensor:
         """Table numbers `(steps,)`."""
-        number = steps.get(self.key)
+        number = steps.get(SCENARIO)
         return number.squeeze(-1) if number.shape == (*steps.shape, 1) else number
-
-
-class PredicateRoute:
-    """Routes to the first table whose predicate holds.
-
-    Args:
-        predicates: By table name, each mapping transitions `(steps,)` to booleans `(steps,)`, in order of precedence.
-        otherwise: Table of the steps for which none holds; comes first in the order of the tables.
-
-    Raises:
-        ValueError: If a name repeats.
-    """
-
-    def __init__(
-        self, predicates: Mapping[str, Callable[[TensorDictBase], Tensor]], otherwise: str = "default"
-    ) -> None:
-        self.names = _distinct((otherwise, *predicates))
-        self.predicates = PredicateEvents(predicates)
-
-    def __call__(self, steps: TensorDictBase) -> Tensor:
-        """Table numbers `(steps,)`."""
-        held = self.predicates(steps)
-        return torch.where(held.any(-1), held.int().argmax(-1) + 1, 0)
 
 
 def checked_events(predicate: EventPredicate, steps: TensorDictBase) -> Tensor:

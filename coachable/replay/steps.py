@@ -12,15 +12,13 @@ __all__ = ["Steps", "flatten_time_major", "read_steps"]
 
 TRAJECTORY = ("collector", "traj_ids")
 _MASK = ("collector", "mask")
-# Stream numbers are worker * 2^40 + trajectory or slot.
-_WORKER_SHIFT = 40
 
 
 @dataclass
 class Steps:
     """Bookkeeping of consecutive steps of many streams, on the CPU: rows of one stream are in the order of time.
 
-    A stream is one environment slot of one worker, or one trajectory where the collector numbers them.
+    A stream is one trajectory where the collector numbers them, otherwise one environment.
     """
 
     stream: np.ndarray  # (steps,) int64
@@ -118,13 +116,12 @@ def flatten_time_major(data: TensorDictBase) -> tuple[TensorDictBase, int | None
     return data, num_envs
 
 
-def read_steps(data: TensorDictBase, num_envs: int | None, worker: int, arrived: int) -> Steps:
+def read_steps(data: TensorDictBase, num_envs: int | None, arrived: int) -> Steps:
     """Read streams and episode ends; events and routes are left empty.
 
     Args:
         data: `(steps,)`.
         num_envs: Environments in the batch; needed if the data carries no trajectory numbers.
-        worker: Number of the worker that sent the data.
         arrived: Steps received before.
 
     Returns:
@@ -147,7 +144,7 @@ def read_steps(data: TensorDictBase, num_envs: int | None, worker: int, arrived:
     else:
         stream = np.arange(n) % num_envs
     steps = Steps.unrelated(n)
-    steps.stream = stream + (worker << _WORKER_SHIFT)
+    steps.stream = stream
     steps.begins = _flag(data.get("is_init", None), n)
     steps.ends = _flag(_done(data), n)
     steps.arrival = arrived + np.arange(n)

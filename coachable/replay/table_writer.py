@@ -67,12 +67,11 @@ class TableWriter(Writer):
         """Write one step."""
         return self.extend(data.unsqueeze(0))
 
-    def extend(self, data: TensorDictBase, worker: int = 0) -> Tensor:
+    def extend(self, data: TensorDictBase) -> Tensor:
         """Write a batch of steps.
 
         Args:
             data: `(steps,)`, time-major, or `(num_envs, time)`.
-            worker: Which worker sent it; histories of different workers are apart.
 
         Returns:
             Slots written to, those of the steps themselves before those of their copies in event tables.
@@ -87,7 +86,7 @@ class TableWriter(Writer):
         if self.history is None and self.n_step is None:
             steps = Steps.unrelated(len(rows))
         else:
-            steps = read_steps(rows, found_envs if found_envs is not None else self.num_envs, worker, self._arrived)
+            steps = read_steps(rows, found_envs if found_envs is not None else self.num_envs, self._arrived)
         self._arrived += len(rows)
         # Events and routes are those of the step itself, hence evaluated before n-step assembly replaces its future.
         if self.events is not None:

@@ -10,6 +10,8 @@ from coachable.replay.steps import Episodes, Steps
 
 __all__ = ["Copies", "WindowHistory"]
 
+Array = np.ndarray
+
 
 @dataclass
 class Copies:
@@ -79,15 +81,8 @@ class WindowHistory:
         self._remember(cut, table, at, position, kept, known, first, slot, serial, steps)
         return copies
 
-    def _windows(
-        self,
-        cut: Episodes,
-        table: np.ndarray,
-        at: np.ndarray,
-        position: np.ndarray,
-        kept: np.ndarray,
-        before: np.ndarray,
-    ) -> Copies:
+    def _windows(self, cut: Episodes, table: Array, at: Array, position: Array, kept: Array, before: Array) -> Copies:
+        """Return the steps that each event sends to its table; it fired at the sorted position `at`."""
         place = kept[cut.number[at]]
         previous = np.where(place >= 0, self.last_event[place, table], -1)
         again = (table[1:] == table[:-1]) & (cut.number[at[1:]] == cut.number[at[:-1]])
@@ -115,16 +110,17 @@ class WindowHistory:
     def _remember(
         self,
         cut: Episodes,
-        table: np.ndarray,
-        at: np.ndarray,
-        position: np.ndarray,
-        kept: np.ndarray,
-        known: np.ndarray,
-        first: np.ndarray,
-        slot: np.ndarray,
-        serial: np.ndarray,
+        table: Array,
+        at: Array,
+        position: Array,
+        kept: Array,
+        known: Array,
+        first: Array,
+        slot: Array,
+        serial: Array,
         steps: Steps,
     ) -> None:
+        """Take note of the episodes that are open after the batch."""
         streams = len(first)
         stream_of = np.cumsum(cut.first_of_stream) - 1
         last = np.append(first[1:] - 1, len(position) - 1)

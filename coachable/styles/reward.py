@@ -6,33 +6,9 @@ from typing import Any
 from torch import Tensor, nn
 
 from coachable.styles.space import StyleSpace
-from coachable.styles.terms import (
-    ChoiceTolerance,
-    Features,
-    SetpointTolerance,
-    StyleTerm,
-    Term,
-    WeightedFeature,
-    WeightedSum,
-    feature,
-    scalar_feature,
-    weighted_sum,
-)
-from coachable.styles.tolerance import tolerance
+from coachable.styles.terms import Features, StyleTerm, WeightedFeature, WeightedSum
 
-__all__ = [
-    "ChoiceTolerance",
-    "SetpointTolerance",
-    "StyleReward",
-    "StyleTerm",
-    "Term",
-    "WeightedFeature",
-    "WeightedSum",
-    "feature",
-    "scalar_feature",
-    "tolerance",
-    "weighted_sum",
-]
+__all__ = ["StyleReward"]
 
 
 class StyleReward(nn.Module):
@@ -72,11 +48,6 @@ class StyleReward(nn.Module):
         self.modules_of_terms = nn.ModuleDict({n: f for n, f in functions.items() if isinstance(f, nn.Module)})
 
     @property
-    def term_names(self) -> tuple[str, ...]:
-        """Names of the terms, in the order in which they are added."""
-        return tuple(self.scales)
-
-    @property
     def terms(self) -> dict[str, StyleTerm]:
         """The terms by name, in the order in which they are added."""
         return {name: term for name, term, _ in self._terms}
@@ -99,7 +70,7 @@ class StyleReward(nn.Module):
         Raises:
             ValueError: If a term returns another shape than one number per style.
         """
-        style = self.space.lazy_view(theta)
+        style = self.space.view(theta)
         total: Tensor | None = None
         for name, term, scale in self._terms:
             value = self._checked(name, term(features, style), theta)
@@ -111,7 +82,7 @@ class StyleReward(nn.Module):
 
     def terms_of(self, features: Features, theta: Tensor) -> dict[str, Tensor]:
         """Return each term before its scale, `(...,)`, for logging and reports."""
-        style = self.space.lazy_view(theta)
+        style = self.space.view(theta)
         return {name: self._checked(name, term(features, style), theta) for name, term, _ in self._terms}
 
     @staticmethod

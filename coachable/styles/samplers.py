@@ -5,7 +5,7 @@ device (on `device` without one) and the result is moved to `device`. How many r
 its batch shape only, never on what was drawn, so runs with one seed stay aligned.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -38,6 +38,13 @@ def _check_finite(who: str, values: tuple[float, ...]) -> None:
         FINITE.check(f"a value of {who}", value)
 
 
+def _bounds_of(samplers: Iterable[Sampler]) -> tuple[list[tuple[float, ...]], list[tuple[float, ...]]] | None:
+    """Return the lower and the upper bounds of several samplers, or None if those of one are not known."""
+    supports = [sampler.support() for sampler in samplers]
+    known = [bounds for bounds in supports if bounds is not None]
+    return None if len(known) < len(supports) else ([low for low, _ in known], [high for _, high in known])
+
+
 def _rand(shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
     return torch.rand(shape, generator=generator, device=device, dtype=torch.float32)
 
@@ -65,7 +72,7 @@ class PointMass(Sampler):
 
     def __init__(self, values: float | Sequence[float]) -> None:
         object.__setattr__(self, "values", numbers(values))
-        _check_finite("PointMass", self.values)
+        _check_finite(type(self).__name__, self.values)
 
     @property
     def dim(self) -> int:
@@ -98,7 +105,7 @@ class Uniform(Sampler):
     def __init__(self, low: float | Sequence[float], high: float | Sequence[float]) -> None:
         object.__setattr__(self, "low", numbers(low))
         object.__setattr__(self, "high", numbers(high))
-        _check_bounds("Uniform", self.low, self.high)
+        _check_bounds(type(self).__name__, self.low, self.high)
 
     @property
     def dim(self) -> int:
@@ -167,11 +174,10 @@ class Mixture(Sampler):
 
     def support(self) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
         """Hull of the components with a positive weight."""
-        parts = [c.support() for c, w in zip(self.components, self.weights, strict=True) if w > 0]
-        known = [p for p in parts if p is not None]
-        if len(known) < len(parts):
+        bounds = _bounds_of(c for c, w in zip(self.components, self.weights, strict=True) if w > 0)
+        if bounds is None:
             return None
-        lows, highs = zip(*known, strict=True)
+        lows, highs = bounds
         return tuple(map(min, zip(*lows, strict=True))), tuple(map(max, zip(*highs, strict=True)))
 
 
@@ -205,11 +211,8 @@ class Product(Sampler):
 
     def support(self) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
         """Supports of the components, concatenated."""
-        parts = [c.support() for c in self.components]
-        known = [p for p in parts if p is not None]
-        if len(known) < len(parts):
-            return None
-        return sum((p[0] for p in known), ()), sum((p[1] for p in known), ())
+        bounds = _bounds_of(self.components)
+        return None if bounds is None else (sum(bounds[0], ()), sum(bounds[1], ()))
 
 
 @dataclass(frozen=True)
@@ -238,8 +241,8 @@ class UniformChoice(Sampler):
         return (0.0,) * self.n, (1.0,) * self.n
 
 
-@dataclass(frozen=True)
-class ContinuousOneHot(Sampler):
+@dataclass(frozen=True, init=False)
+class ContinuousOneHot(Uniform):
     """One uniformly drawn entry k is uniform over `[low_k, high_k]`, the rest are zero (paper, combat).
 
     Args:
@@ -249,19 +252,6 @@ class ContinuousOneHot(Sampler):
     Raises:
         ValueError: If lengths differ or a lower bound exceeds its upper bound.
     """
-
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-
-    def __init__(self, low: float | Sequence[float], high: float | Sequence[float]) -> None:
-        object.__setattr__(self, "low", numbers(low))
-        object.__setattr__(self, "high", numbers(high))
-        _check_bounds("ContinuousOneHot", self.low, self.high)
-
-    @property
-    def dim(self) -> int:
-        """Number of entries."""
-        return len(self.low)
 
     def _draw(self, shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
         hot = _one_hot(self.dim, shape, generator, device)
@@ -275,24 +265,13 @@ class ContinuousOneHot(Sampler):
         return tuple(min(a, 0.0) for a in self.low), tuple(max(b, 0.0) for b in self.high)
 
 
-@dataclass(frozen=True)
-class OneHot(Sampler):
+@dataclass(frozen=True, init=False)
+class OneHot(PointMass):
     """One uniformly drawn entry k takes the value `values_k`, the rest are zero (ablation of `ContinuousOneHot`).
 
     Args:
         values: Value of each entry when it is chosen.
     """
-
-    values: tuple[float, ...]
-
-    def __init__(self, values: float | Sequence[float]) -> None:
-        object.__setattr__(self, "values", numbers(values))
-        _check_finite("OneHot", self.values)
-
-    @property
-    def dim(self) -> int:
-        """Number of entries."""
-        return len(self.values)
 
     def _draw(self, shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
         return torch.where(_one_hot(self.dim, shape, generator, device), constant(self.values, device), 0.0)

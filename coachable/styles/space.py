@@ -217,12 +217,8 @@ class StyleSpace:
         if clauses:
             raise ValueError(f"style {'; '.join(clauses)}.")
 
-    def view(self, theta: Tensor) -> dict[str, Tensor]:
-        """Named blocks of theta: `(...,)` for a `Weight` or `Setpoint`, `(..., n_options)` for a `Choice`."""
-        return {name: theta[..., column] for name, column in self.columns.items()}
-
-    def lazy_view(self, theta: Tensor) -> StyleView:
-        """Like `view`, but each block is sliced only when read."""
+    def view(self, theta: Tensor) -> StyleView:
+        """Return theta `(..., dim)` by name; each block is sliced only when it is read."""
         return StyleView(self.columns, self.columns_of, theta)
 
     def columns_of(self, names: tuple[str, ...]) -> slice | list[int] | None:

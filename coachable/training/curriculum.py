@@ -1,5 +1,6 @@
 """A training in stages: each stage starts from the actor and critics of the one before, in one run folder."""
 
+import gc
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -66,6 +67,10 @@ class Curriculum:
             if self.train.frames < self.train.settings.total_frames or self.number + 1 == len(self.stages):
                 return latest
             self.number += 1
+            # The next stage needs the memory of this one's replay buffer. And TorchRL raises the number of threads when
+            # it closes a forgotten SerialEnv: now, before the next stage sets the number.
+            del self.train
+            gc.collect()
             self.train = self._start(None)
 
     def folder(self, number: int) -> Path:

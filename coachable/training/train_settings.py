@@ -1,28 +1,15 @@
 """When the training loop does what."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 
 from coachable.ranges import AMOUNT, COUNT, NOT_NEGATIVE, SHARE, Range
 
 __all__ = ["TrainSettings"]
 
-_RANGES = {
-    "total_frames": COUNT,
-    "batch_size": COUNT,
-    "warmup_frames": AMOUNT,
-    "utd_ratio": Range("[0, inf)", optional=True),
-    "throttle": Range("(0, inf)", optional=True),
-    "anneal": SHARE,
-    "anneal_entropy": Range("(0, 1]"),
-    "eval_interval": AMOUNT,
-    "log_interval": NOT_NEGATIVE,
-    "checkpoint_interval": NOT_NEGATIVE,
-}
-
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """When the loop does what.
+    """When the loop does what; the metadata of each field holds its range.
 
     Attributes:
         total_frames: [env-steps] of the whole training, resumed parts included.
@@ -38,21 +25,22 @@ class TrainSettings:
         checkpoint_interval: [s] between checkpoints.
     """
 
-    total_frames: int
-    batch_size: int = 256
-    warmup_frames: int = 0
-    utd_ratio: float | None = 1.0
-    throttle: float | None = None
-    anneal: float = 0.0
-    anneal_entropy: float = 1.0
-    eval_interval: int = 0
-    log_interval: float = 20.0
-    checkpoint_interval: float = 300.0
+    total_frames: int = field(metadata={"range": COUNT})
+    batch_size: int = field(default=256, metadata={"range": COUNT})
+    warmup_frames: int = field(default=0, metadata={"range": AMOUNT})
+    utd_ratio: float | None = field(default=1.0, metadata={"range": Range("[0, inf)", optional=True)})
+    throttle: float | None = field(default=None, metadata={"range": Range("(0, inf)", optional=True)})
+    anneal: float = field(default=0.0, metadata={"range": SHARE})
+    anneal_entropy: float = field(default=1.0, metadata={"range": Range("(0, 1]")})
+    eval_interval: int = field(default=0, metadata={"range": AMOUNT})
+    log_interval: float = field(default=20.0, metadata={"range": NOT_NEGATIVE})
+    checkpoint_interval: float = field(default=300.0, metadata={"range": NOT_NEGATIVE})
 
     def __post_init__(self) -> None:
-        """Refuses what cannot work."""
-        for name, expected in _RANGES.items():
-            expected.check(name, getattr(self, name))
+        """Refuse numbers outside of their ranges, and as many updates as fit where collection has no throttle."""
+        for entry in fields(self):
+            if "range" in entry.metadata:
+                entry.metadata["range"].check(entry.name, getattr(self, entry.name))
         if self.utd_ratio is None and self.throttle is None:
             raise ValueError("utd_ratio=null (as many updates as fit) needs a throttle: set train.throttle=RATE")
 

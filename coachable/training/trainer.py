@@ -297,24 +297,19 @@ class Trainer:
         state = read_state(path)
         require_same_agent(state, self.describe(), path)
         with refusing(path, "the state of a training"):
-            self.load_state_dict(state, path / "replay" if (path / "replay").is_dir() else None)
+            self._restore(state, path / "replay")
         self.log.rewind(self.frames)
         return path
 
-    def load_state_dict(self, state: Mapping[str, Any], replay: Path | None = None) -> None:
-        """Continues from a checkpoint.
-
-        Args:
-            state: contains what `state_dict` returned.
-            replay: folder of the saved replay buffer; None starts with an empty one, and says so.
-        """
+    def _restore(self, state: Mapping[str, Any], replay: Path) -> None:
+        """Continue from what `state_dict` returned; without a saved replay buffer, warn and start it empty."""
         self.learner.load_state_dict(state["learner"])
         self.frames = int(state["loop"]["frames"])
         self.owed = float(state["loop"]["owed"])
         self._evaluations = int(state["loop"]["evaluations"])
         self._evaluated_frames = int(state["loop"].get("evaluated_frames", -1))
         self._filled_from = int(state["loop"]["filled_from"])
-        if replay is not None:
+        if replay.is_dir():
             read_replay(self.replay, replay)
         else:
             self._filled_from = self.frames

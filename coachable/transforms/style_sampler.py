@@ -5,12 +5,12 @@ import zlib
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 
-from coachable import keys
+from coachable.keys import STYLE
 from coachable.styles.reward import StyleReward
 from coachable.styles.samplers import Sampler
 from coachable.styles.space import StyleSpace
@@ -37,10 +37,8 @@ class StyleSampler(Transform):
     Args:
         space: What theta means; gives the spec its bounds.
         sampler: Distribution to draw from; the space's own if None.
-        key: Where the style is written.
         seed: Seed of this transform's generator; taken from the operating system if None, so that workers differ. With
             `CoachableEnv`, `env.set_seed` reaches it.
-        device: Where styles are drawn; they are then moved to the environment's device.
 
     Raises:
         ValueError: If the sampler's dimension is not the space's.
@@ -50,19 +48,16 @@ class StyleSampler(Transform):
         self,
         space: StyleSpace,
         sampler: Sampler | None = None,
-        key: NestedKey = keys.STYLE,
         seed: int | None = None,
-        device: torch.device | str = "cpu",
     ) -> None:
-        super().__init__(in_keys=[], out_keys=[key])
+        super().__init__(in_keys=[], out_keys=[STYLE])
         self.space = space
         self.sampler = space.sampler if sampler is None else sampler
         if self.sampler.dim != space.dim:
             raise ValueError(
                 f"sampler has dimension {self.sampler.dim}, the style space {list(space.names)} has {space.dim}."
             )
-        self.key = key
-        self.generator = torch.Generator(device)
+        self.generator = torch.Generator()
         self._held: Tensor | None = None
         self._seeded = False
         self.set_seed(seed)
@@ -71,7 +66,7 @@ class StyleSampler(Transform):
         """Restarts the random stream; from the operating system's entropy if None."""
         self._seeded = seed is not None
         # Salted: an environment seeded with the same number would otherwise draw start states that match the styles.
-        self.generator.manual_seed(secrets.randbits(63) if seed is None else derive_seed(seed, f"style:{self.key}"))
+        self.generator.manual_seed(secrets.randbits(63) if seed is None else derive_seed(seed, f"style:{STYLE}"))
 
     def hold(self, theta: Tensor, strict: bool = False) -> None:
         """Uses this style at every reset, automatic ones included, until `release`. Running episodes keep theirs.
@@ -91,7 +86,7 @@ class StyleSampler(Transform):
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         # Styles for all rows: TorchRL keeps only those that are being reset.
-        given = tensordict.get(self.key, None)
+        given = tensordict.get(STYLE, None)
         shape, device = tensordict_reset.batch_size, tensordict_reset.device
         if given is not None:
             style = self._checked(given)
@@ -99,7 +94,7 @@ class StyleSampler(Transform):
             style = self._held.to(device).expand(*shape, self.space.dim).clone()
         else:
             style = self.sampler.sample(shape, self.generator, device)
-        return tensordict_reset.set(self.key, style)
+        return tensordict_reset.set(STYLE, style)
 
     def _checked(self, given: Tensor) -> Tensor:
         """A copy of the caller's style, which may lie outside the trained range: such tests are legitimate."""
@@ -112,7 +107,7 @@ class StyleSampler(Transform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         # A copy: writing into the next style in place must not rewrite the style of the transition before it.
-        return next_tensordict.set(self.key, tensordict.get(self.key).clone())
+        return next_tensordict.set(STYLE, tensordict.get(STYLE).clone())
 
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -127,7 +122,7 @@ class StyleSampler(Transform):
         shape = torch.Size((*observation_spec.shape, self.space.dim))
         device = observation_spec.device
         low, high = self.space.low.to(device).expand(shape), self.space.high.to(device).expand(shape)
-        observation_spec[self.key] = Bounded(low, high, shape=shape, dtype=torch.float32, device=device)
+        observation_spec[STYLE] = Bounded(low, high, shape=shape, dtype=torch.float32, device=device)
         return observation_spec
 
     def transform_state_spec(self, state_spec: Composite) -> Composite:
@@ -145,14 +140,13 @@ class StyleSampler(Transform):
 
     def __getstate__(self) -> dict[str, Any]:
         state = super().__getstate__()
-        generator = state.pop("generator")
-        state["generator"] = (str(generator.device), generator.get_state())
+        state["generator"] = state["generator"].get_state()
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        device, generator_state = state.pop("generator")
+        generator_state = state.pop("generator")
         super().__setstate__(state)
-        self.generator = torch.Generator(device)
+        self.generator = torch.Generator()
         if self._seeded:
             self.generator.set_state(generator_state)
         else:  # copies sent to workers must not draw the same styles
@@ -197,7 +191,6 @@ def coachable_env(
     *transforms: Transform,
     sampler: Sampler | None = None,
     seed: int | None = None,
-    sampler_device: torch.device | str = "cpu",
     **kwargs: Any,
 ) -> CoachableEnv:
     """Add styles to a domain: `StyleSampler`, then `StyleRewardTransform`, then any further transforms.
@@ -209,13 +202,12 @@ def coachable_env(
         *transforms: Further transforms, such as `StepCounter` or `RewardSum`.
         sampler: Distribution of styles; the space's own if None.
         seed: Seeds the environment and its transforms, if given.
-        sampler_device: Where styles are drawn.
         **kwargs: For `TransformedEnv`.
 
     Returns:
         The environment, ready for a collector.
     """
-    styles = StyleSampler(space, sampler, seed=seed, device=sampler_device)
+    styles = StyleSampler(space, sampler, seed=seed)
     chain = Compose(styles, StyleRewardTransform(style_reward), *transforms)  # pyright: ignore[reportCallIssue]
     env = CoachableEnv(base_env=base_env, transform=chain, **kwargs)
     if seed is not None:

@@ -3,11 +3,11 @@
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import Transform
 
-from coachable import keys
+from coachable.keys import STYLE, STYLE_FEATURES, STYLE_REWARD, TASK_REWARD
 from coachable.ranges import AMOUNT
 from coachable.styles.reward import StyleReward
 from coachable.styles.samplers import Sampler
@@ -19,9 +19,9 @@ class TaskImpersonation(Transform):
 
     Column 0 keeps the stored label and reward. Columns 1 to n get a style each, drawn independently for every
     transition from the training distribution, and `reward = task_reward + style_reward(style_features, style)` by the
-    StyleReward that the environment uses. `style` and `("next", "style")` are both written; nothing else depends on the
-    style, and nothing is filtered, weighted or written back (paper). Everything else is expanded without a copy, so do
-    not write to it in place. With n = 0 the sample passes through untouched, and no random number is drawn.
+    StyleReward that the environment uses. `style` and `("next", "style")` are both written, and `style_reward` if the
+    data has it. Nothing is filtered, weighted or written back (paper). Everything else is expanded without a copy, so
+    do not write to it in place. With n = 0 the sample passes through untouched, and no random number is drawn.
 
     TorchRL expands what a sample carries besides, `index`, `table` and `priority_weight`, over the columns, and a
     priority update takes the largest over a transition's columns (`EventTableBuffer`, or the default reduction of
@@ -36,11 +36,6 @@ class TaskImpersonation(Transform):
         n: Further styles per transition (paper: 4).
         sampler: Distribution of styles if not the one the space trains with.
         seed: Of the transform's own generator, whose state is in the state dict.
-        style_key: Key of the raw theta, here and in `next`.
-        features_key: Key of the features in `next`.
-        task_reward_key: Key of the task reward in `next`.
-        reward_key: Key of the reward in `next`.
-        style_reward_key: Key of the style part in `next`; kept up to date if the data has it.
 
     Raises:
         ValueError: If n is negative, or the sampler draws styles of another size.
@@ -64,11 +59,6 @@ class TaskImpersonation(Transform):
         n: int = 4,
         sampler: Sampler | None = None,
         seed: int = 0,
-        style_key: NestedKey = keys.STYLE,
-        features_key: NestedKey = keys.STYLE_FEATURES,
-        task_reward_key: NestedKey = keys.TASK_REWARD,
-        reward_key: NestedKey = "reward",
-        style_reward_key: NestedKey = keys.STYLE_REWARD,
     ) -> None:
         super().__init__(in_keys=[], out_keys=[])
         AMOUNT.check("n of TaskImpersonation", n)
@@ -81,12 +71,6 @@ class TaskImpersonation(Transform):
                 f"the sampler of TaskImpersonation draws styles of {self.sampler.dim} numbers: expected "
                 f"{self.space.dim} ({', '.join(self.space.names)})"
             )
-        self.style_key = style_key
-        self.next_style_key = _in_next(style_key)
-        self.features_key = _in_next(features_key)
-        self.task_reward_key = _in_next(task_reward_key)
-        self.reward_key = _in_next(reward_key)
-        self.style_reward_key = _in_next(style_reward_key)
         self.generator = torch.Generator().manual_seed(seed)
 
     def set_seed(self, seed: int) -> None:
@@ -123,20 +107,27 @@ class TaskImpersonation(Transform):
             lambda x: x.unsqueeze(dim).expand(*shape, columns, *x.shape[dim:]), batch_size=[*shape, columns]
         )
         assert out is not None  # only an in-place apply returns nothing
-        out.set(self.style_key, torch.cat([stored.unsqueeze(dim), drawn], dim))
-        following = tensordict.get(self.next_style_key, None)
+        out.set(STYLE, torch.cat([stored.unsqueeze(dim), drawn], dim))
+        following = tensordict.get(("next", STYLE), None)
         following = stored if following is None else following
-        out.set(self.next_style_key, torch.cat([following.unsqueeze(dim), drawn], dim))
+        out.set(("next", STYLE), torch.cat([following.unsqueeze(dim), drawn], dim))
         relabelled = task_reward.unsqueeze(dim) + style_reward
-        out.set(self.reward_key, torch.cat([reward.unsqueeze(dim), relabelled], dim))
-        logged = tensordict.get(self.style_reward_key, None)
+        out.set(("next", "reward"), torch.cat([reward.unsqueeze(dim), relabelled], dim))
+        logged = tensordict.get(("next", STYLE_REWARD), None)
         if logged is not None:
-            out.set(self.style_reward_key, torch.cat([logged.unsqueeze(dim), style_reward], dim))
+            out.set(("next", STYLE_REWARD), torch.cat([logged.unsqueeze(dim), style_reward], dim))
         return out
 
     def _refuse_sums(self, tensordict: TensorDictBase) -> None:
         steps = tensordict.get("steps_to_next_obs", None)
-        if steps is None or self.style_reward.is_linear or steps.max() <= 1:
+        if steps is None or steps.max() <= 1:
+            return
+        if self.style_reward.is_linear and ("next", "original_reward") in tensordict.keys(True):
+            raise ValueError(
+                f"TaskImpersonation got sums over up to {int(steps.max())} steps from TorchRL's MultiStep, which sums "
+                "no style features: let EventTableBuffer sum rewards and features (n_steps, discounted_keys)"
+            )
+        if self.style_reward.is_linear:
             return
         raise ValueError(
             f"TaskImpersonation got sums over up to {int(steps.max())} steps: the style reward is not linear in its "
@@ -145,18 +136,18 @@ class TaskImpersonation(Transform):
         )
 
     def _entries(self, tensordict: TensorDictBase) -> tuple[Tensor, Any, Tensor, Tensor]:
-        wanted = (self.style_key, self.features_key, self.task_reward_key, self.reward_key)
+        wanted = (STYLE, ("next", STYLE_FEATURES), ("next", TASK_REWARD), ("next", "reward"))
         found = [tensordict.get(key, None) for key in wanted]
         missing = [key for key, value in zip(wanted, found, strict=True) if value is None]
         if missing:
             raise KeyError(
-                f"TaskImpersonation found no {', '.join(map(repr, missing))} in the sample: store them, or name yours "
-                "in its arguments. An n-step buffer keeps features only if discounted_keys lists them."
+                f"TaskImpersonation found no {', '.join(map(repr, missing))} in the sample: store them. "
+                "An n-step buffer keeps features only if discounted_keys lists them."
             )
         stored, features, task_reward, reward = found
         if stored.shape[-1] != self.space.dim:
             raise ValueError(
-                f"the sampled {self.style_key!r} has shape {tuple(stored.shape)}: expected {self.space.dim} numbers "
+                f"the sampled {STYLE!r} has shape {tuple(stored.shape)}: expected {self.space.dim} numbers "
                 f"({', '.join(self.space.names)}). Give TaskImpersonation the space that the data was collected with."
             )
         return stored, features, task_reward, reward
@@ -178,7 +169,3 @@ class TaskImpersonation(Transform):
     def extra_repr(self) -> str:
         """Number of styles per transition."""
         return f"n={self.n}"
-
-
-def _in_next(key: NestedKey) -> NestedKey:
-    return ("next", *((key,) if isinstance(key, str) else key))

@@ -1,23 +1,42 @@
-"""What a configuration contains, and of which type; recipe_ranges.py says in which range its numbers make sense.
+"""What a configuration contains: the types that Hydra composes against, and the ranges of the numbers.
 
-Groups whose YAML names a `_target_` (loss, replay, sampler, collector, environment) have whatever entries it takes.
+`register_schema` makes them known to Hydra; the YAML file of a recipe names its class first in its list of defaults. A
+key that is not declared, or a value of another type, is then an error wherever it comes from. Groups whose YAML names a
+`_target_` (loss, replay, sampler, collector, environment) have whatever entries the target takes: recipe_checks.py
+lists the ranges of those, and `make` in recipe_boxes.py compares the names with the target's arguments.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass
 from typing import Any
 
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING
+
+from coachable.ranges import AMOUNT, COUNT, NOT_NEGATIVE, POSITIVE, SHARE, Range
+from coachable.training.train_settings import TrainSettings
 
 Target = dict[str, Any]
 """A function or class under `_target_`, and its arguments."""
+
+
+def within(expected: Range) -> Any:
+    """Return a field that holds a number of a range."""
+    return field(metadata={"range": expected})
 
 
 @dataclass
 class Impersonation:
     """Relabelling of sampled transitions."""
 
-    n: int
+    n: int = within(AMOUNT)
+
+
+@dataclass
+class Support:
+    """Range of the returns that categorical critics tell apart."""
+
+    v_min: float
+    v_max: float
 
 
 @dataclass
@@ -26,7 +45,7 @@ class Network:
 
     actor: Target
     critic: Target
-    num_critics: int
+    num_critics: int = within(COUNT)
 
 
 @dataclass
@@ -35,46 +54,36 @@ class Learner:
 
     _target_: str
     update_order: str
-    actor_lr: float
-    critic_lr: float
-    adam_eps: float
-    tau: float
-    max_grad_norm: float | None
     precision: str
     compile: bool
+    actor_lr: float = within(NOT_NEGATIVE)
+    critic_lr: float = within(NOT_NEGATIVE)
+    adam_eps: float = within(POSITIVE)
+    tau: float = within(Range("(0, 1]"))
+    max_grad_norm: float | None = within(Range("(0, inf)", optional=True))
 
 
-@dataclass
-class Loop:
-    """When the training does what; the fields are those of `TrainSettings`."""
+@dataclass(frozen=True)
+class Loop(TrainSettings):
+    """When the training does what: `TrainSettings`, with its ranges."""
 
-    _target_: str
-    total_frames: int
-    batch_size: int
-    warmup_frames: int
-    utd_ratio: float | None
-    throttle: float | None
-    anneal: float
-    anneal_entropy: float
-    eval_interval: int
-    log_interval: float
-    checkpoint_interval: float
+    _target_: str = ""
 
 
 @dataclass
 class Evaluation:
     """Episodes of each evaluation."""
 
-    num_envs: int
-    max_steps: int
+    num_envs: int = within(COUNT)
+    max_steps: int = within(COUNT)
 
 
 @dataclass
 class Checkpoints:
     """How many to keep, and whether the newest one holds the replay buffer."""
 
-    keep: int
     replay: bool
+    keep: int = within(COUNT)
 
 
 @dataclass
@@ -89,72 +98,78 @@ class Wandb:
 class Threads:
     """Numbers of threads; None takes what is free."""
 
-    simulator: int | None
-    learner: int | None
+    simulator: int | None = within(Range("[1, inf)", whole=True, optional=True))
+    learner: int | None = within(Range("[1, inf)", whole=True, optional=True))
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Settings:
-    """Configuration of a recipe, resolved."""
+    """Configuration of a recipe."""
 
     summary: str
     domain: str
     preset: str
-    seed: int
     device: str
-    run_dir: str
+    fast: Any  # hand-written passes of the learner: on, off or auto
+    run_dir: str | None
     resume: str | None
     init_from: str | None
-    init_new_observations: int
+    init_new_observations: int = within(AMOUNT)
+    seed: int = within(Range("[0, 4e9]", whole=True))
+    stages: list[dict[str, Any]]
+    stage: str | None
     env: Target
     style_reward: dict[str, Any]
     sampler: Target
-    gamma: float
-    alpha: float
-    entropy_samples: int
+    gamma: float = within(SHARE)
+    alpha: float = within(POSITIVE)
+    entropy_samples: int = within(COUNT)
+    n_steps: int = within(COUNT)
+    replay_capacity: int = within(COUNT)
+    events: Target | None
+    event_capacity: int = within(COUNT)
+    event_share: float = within(Range("(0, 1)"))
+    event_horizon: int = within(COUNT)
+    critic_support: Support
+    mirror: float = within(SHARE)
+    impersonation: Impersonation
+    learner: Learner
     network: Network
     loss: Target
-    learner: Learner
-    n_steps: int
     replay: Target
-    replay_capacity: int
-    events: Target | None
-    event_capacity: int
-    event_share: float
-    event_horizon: int
-    critic_support: dict[str, float]
-    mirror: float
-    impersonation: Impersonation
     collector: Target
     train: Loop
-    init_random_frames: int
+    init_random_frames: int = within(AMOUNT)
     eval: Evaluation
     checkpoint: Checkpoints
     wandb: Wandb
     threads: Threads
-    family: str | None = None  # of racing
-    fast: Any = "auto"  # hand-written passes of the learner
-    stage: str | None = None
-    stages: list[dict[str, Any]] = field(default_factory=list)
-    preset_for: dict[str, str] | None = None
-    extra: dict[str, Any] = field(default_factory=dict)  # entries that the command line adds with +KEY=VALUE
 
 
-def typed_settings(config: dict[str, Any]) -> Settings:
-    """Return a plain configuration as typed settings.
+@dataclass(kw_only=True)
+class RacingSettings(Settings):
+    """Configuration of racing."""
 
-    Args:
-        config: Plain containers, resolved.
+    family: str
 
-    Raises:
-        ValueError: If a key is missing or unknown, or a value has another type.
+
+def register_schema() -> None:
+    """Make the classes known to Hydra under the names that the lists of defaults give."""
+    store = ConfigStore.instance()
+    store.store("settings", composed_type(Settings))
+    store.store("racing_settings", composed_type(RacingSettings))
+
+
+def composed_type(kind: Any) -> Any:
+    """Return the type of values while they are composed: each field is missing at first.
+
+    OmegaConf takes 1e6 for no `int`, and 2 for a `bool`: `checked_values` in recipe_checks.py decides on those.
     """
-    known = Settings.__dataclass_fields__
-    sorted_out = {key: value for key, value in config.items() if key in known}
-    sorted_out["extra"] = {key: value for key, value in config.items() if key not in known}
-    try:
-        settings = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Settings), sorted_out))
-    except OmegaConfBaseException as error:
-        raise ValueError(f"the configuration is wrong at {error.full_key}: {str(error).splitlines()[0]}") from None
-    assert isinstance(settings, Settings)
-    return settings
+    if not is_dataclass(kind):
+        return {int: int | float, int | None: int | float | None, bool: Any}.get(kind, kind)
+    entries = []
+    for entry in fields(kind):
+        composed = composed_type(entry.type)
+        start = field(default_factory=composed) if is_dataclass(composed) else field(default=MISSING)
+        entries.append((entry.name, composed, start))
+    return make_dataclass(kind.__name__, entries)  # pyright: ignore[reportAttributeAccessIssue]

@@ -24,10 +24,10 @@ F64 = torch.float64
 GAMEPAD = HeadLayout((4, 6, 3, 3, 2, 2))
 
 
-def regret_gradient(x: list[float], g: list[float], mode: str = "dpi") -> list[float]:
+def regret_gradient(x: list[float], g: list[float]) -> list[float]:
     """Gradient that arrives at x when the loss has gradient g with respect to pi."""
     leaf = torch.tensor(x, dtype=F64, requires_grad=True)
-    pi = regret_matching_probabilities(leaf, HeadLayout((len(x),)), mode)  # type: ignore[arg-type]
+    pi = regret_matching_probabilities(leaf, HeadLayout((len(x),)))
     pi.backward(torch.tensor(g, dtype=F64))
     assert leaf.grad is not None
     return leaf.grad.tolist()
@@ -76,42 +76,33 @@ def test_regret_gradient_by_hand(x: list[float], g: list[float], expected: list[
     np.testing.assert_allclose(regret_gradient(x, g), expected, atol=3e-8)  # epsilon moves pi by 1e-8
 
 
-def slow_regret_gradient(x: np.ndarray, g: np.ndarray, mode: str) -> np.ndarray:
-    """Independent scalar-by-scalar version of the three readings."""
+def slow_regret_gradient(x: np.ndarray, g: np.ndarray) -> np.ndarray:
+    """Independent scalar-by-scalar version."""
     d = len(x)
     u = [max(0.0, xi) + 1e-8 / d for xi in x]
     total = sum(u)
     pi = [ui / total for ui in u]
-    mean = sum(gi * pi_i for gi, pi_i in zip(g, pi, strict=True))
-    if mode == "du":
-        g = np.array([(gi - mean) / total for gi in g])
-    elif mode == "chain":
-        g = np.array([(gi - mean) / total if xi >= 0 else 0.0 for gi, xi in zip(g, x, strict=True)])
     rho = [sum(gj * pj for gj, pj in zip(g, pi, strict=True)) - gi for gi in g]
     return np.array([0.0 if xi < 0 and ri < 0 else -ri for xi, ri in zip(x, rho, strict=True)])
 
 
-@pytest.mark.parametrize("mode", ["dpi", "du", "chain"])
-def test_regret_gradient_against_scalars(mode: str) -> None:
+def test_regret_gradient_against_scalars() -> None:
     rng = np.random.default_rng(1)
     for _ in range(30):
         d = rng.integers(2, 7)
         x, g = rng.normal(size=d), rng.normal(size=d)
         x[rng.integers(d)] = 0.0
         np.testing.assert_allclose(
-            regret_gradient(x.tolist(), g.tolist(), mode), slow_regret_gradient(x, g, mode), rtol=1e-10, atol=1e-10
+            regret_gradient(x.tolist(), g.tolist()), slow_regret_gradient(x, g), rtol=1e-10, atol=1e-10
         )
 
 
-def test_readings_differ_as_documented() -> None:
+def test_regret_gradient_does_not_depend_on_the_scale() -> None:
     x, g = [2.0, 1.0, 1.0, -1.0], [1.0, 2.0, 0.0, -2.0]
-    np.testing.assert_allclose(np.array(regret_gradient(x, g, "du")) * 4, regret_gradient(x, g), rtol=1e-7)
-    assert abs(regret_gradient(x, g, "chain")[3]) < 3e-7  # literal autograd: the dead value never returns
-    # dpi does not depend on the scale of x, du does.
     np.testing.assert_allclose(regret_gradient([20.0, 10.0, 10.0, -10.0], g), regret_gradient(x, g), atol=1e-7)
 
 
-def test_dead_value_revives_under_dpi() -> None:
+def test_dead_value_revives() -> None:
     x = torch.tensor([1.0, 0.2, -0.5])
     for _ in range(400):
         leaf = x.requires_grad_()
@@ -226,12 +217,12 @@ PREFERENCES = st.one_of(
 
 
 @settings(max_examples=100, deadline=None)
-@given(st.lists(PREFERENCES, min_size=6, max_size=6), st.integers(0, 2**31), st.sampled_from(["dpi", "du", "chain"]))
-def test_no_nan_for_any_preferences(values: list[float], seed: int, mode: str) -> None:
+@given(st.lists(PREFERENCES, min_size=6, max_size=6), st.integers(0, 2**31))
+def test_no_nan_for_any_preferences(values: list[float], seed: int) -> None:
     torch.manual_seed(seed)
     layout = HeadLayout((2, 4))
     x = torch.tensor(values, dtype=torch.float32, requires_grad=True)
-    pi = regret_matching_probabilities(x, layout, mode)  # type: ignore[arg-type]
+    pi = regret_matching_probabilities(x, layout)
     relaxed = relaxed_one_hots(pi, layout)
     torch.testing.assert_close(layout.pad(relaxed).sum(-1), torch.ones(2))
     torch.testing.assert_close(layout.pad(pi).sum(-1), torch.ones(2))
@@ -249,11 +240,6 @@ def test_noise_is_bounded_away_from_zero(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_heads_too_small(sizes: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="at least 2 values"):
         HeadLayout(sizes)
-
-
-def test_unknown_reading() -> None:
-    with pytest.raises(ValueError, match="regret_gradient must be one of"):
-        regret_matching_probabilities(torch.ones(2), HeadLayout((2,)), "dx")  # type: ignore[arg-type]
 
 
 def test_layout_copies() -> None:

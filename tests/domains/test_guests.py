@@ -19,15 +19,20 @@ SOURCES = Path(__file__).parent / "guests"
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
+def install(site, *, package, domain):
+    """Write what pip writes about a package that registers a domain of a module of the same name."""
+    metadata = site / f"{package}-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+    (metadata / "entry_points.txt").write_text(f"[coachable.domains]\n{domain} = {domain}:DOMAIN\n")
+
+
 @pytest.fixture(scope="module", params=GUESTS)
 def guest(request, tmp_path_factory):
     """Name of a domain of a package that is installed in a temporary folder."""
     name, site = request.param, tmp_path_factory.mktemp("site")
-    metadata = site / f"{name}-1.0.dist-info"
-    metadata.mkdir()
     (site / f"{name}.py").write_text((SOURCES / f"{name}.py").read_text())
-    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
-    (metadata / "entry_points.txt").write_text(f"[coachable.domains]\n{name} = {name}:DOMAIN\n")
+    install(site, package=name, domain=name)
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(site)
         yield name
@@ -129,3 +134,11 @@ def test_the_documentation_shows_the_files_as_they_are(name):
     source = (SOURCES / f"{name}.py").read_text()
     assert any(f"```python\n{source}```" in page.read_text() for page in DOCS.rglob("*.md"))
     assert source.count("\n") < 60
+
+
+def test_two_packages_with_one_name_of_a_domain_are_refused(monkeypatch, tmp_path):
+    for package in ("hill_walkers", "city_walkers"):
+        install(tmp_path, package=package, domain="walker")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ValueError, match="the packages city_walkers and hill_walkers register a domain 'walker' each"):
+        load_domain("walker")

@@ -9,7 +9,7 @@ from torchrl.objectives import SACLoss
 
 from coachable.fast import accelerate, native
 from coachable.fast.accelerate import Acceleration, obstacle
-from coachable.networks import make_gaussian_actor
+from coachable.networks import make_critic, make_gaussian_actor
 from coachable.training import Learner
 from coachable.training.backend import Backend
 from tests.sac_problem import ACT, OBS, WIDTHS, ScaledStyle, cat_rac, make_batch, make_learner, make_loss, qr_sac
@@ -156,6 +156,13 @@ def test_networks_that_are_trained_in_part_are_left_to_torch():
     assert obstacle(loss) is None
     next(iter(loss.actor_network_params.values(True, True))).requires_grad_(False)
     assert obstacle(loss) == "some parameters of actor_network_params are frozen"
+
+
+def test_networks_with_dropout_are_left_to_torch():
+    actor = make_gaussian_actor(OBS, ACT, ScaledStyle(), WIDTHS, dropout=0.1)
+    critics = [make_critic(OBS, ACT, ScaledStyle(), WIDTHS) for _ in range(2)]
+    loss = SACLoss(actor, critics, loss_function="l2", fixed_alpha=True, alpha_init=0.01)
+    assert obstacle(loss) == "the policy has dropout"
 
 
 def test_a_residual_network_beside_other_parameters_is_left_to_torch():

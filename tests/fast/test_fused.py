@@ -4,14 +4,15 @@ import torch
 from coachable.fast import fused, native
 from coachable.fast.ensemble import make_plan
 from coachable.fast.flat import FlatBuffers
+from coachable.fast.passes import active_rows
 from coachable.fast.workspace import Workspace
 from coachable.networks.residual import ResidualMLP
 
 SHAPES = {
     "equal": (70, (64, 64, 64), {}),
     "padded": (40, (96, 64, 32), {}),
-    "keep_first": (200, (96, 64, 32), {"narrowing": "keep_first"}),
-    "all_beginning": (40, (64, 80, 64), {"padding": "beginning"}),
+    "narrowing": (200, (96, 64, 32), {}),
+    "beginning": (40, (64, 80, 64), {}),
     "no_norm": (40, (64, 64), {"layer_norm": False}),
     "no_head": (40, (64, 64), {}),
     "wide_head": (40, (64, 64), {}),
@@ -179,13 +180,13 @@ def test_frozen_critics_pass_the_gradient_of_the_smaller_one(low):
 def test_rows_without_gradient_are_found():
     grad = torch.zeros(100, 2)
     grad[[3, 50, 51], [0, 1, 0]] = 1.0
-    assert fused._active_rows(grad, 1).tolist() == [3, 50, 51]
-    rows = fused._active_rows(grad, 32)
+    assert active_rows(grad, 1).tolist() == [3, 50, 51]
+    rows = active_rows(grad, 0)
     assert len(rows) == 32
     assert {3, 50, 51} <= set(rows.tolist())
     assert len(set(rows.tolist())) == 32
-    assert fused._active_rows(torch.ones(100, 2), 32) is None
-    assert len(fused._active_rows(torch.zeros(100, 2), 32)) == 0
+    assert active_rows(torch.ones(100, 2), 0) is None
+    assert len(active_rows(torch.zeros(100, 2), 0)) == 0
 
 
 def test_nothing_is_kept_without_gradients():
@@ -225,8 +226,8 @@ def test_memory_is_kept_for_a_few_batch_sizes_only():
         fused.residual_network(plan, inputs_of("equal", rows)).sum().backward()
     assert len(plan._spaces) == fused._SIZES
     assert all(len(free) == 1 for free in plan._spaces.values())
-    (first,) = plan._spaces[9, True, 63, 7]
+    (first,) = plan._spaces[1, 9, True, 63, 7]
     out = fused.residual_network(plan, inputs_of("equal", 9))
-    assert plan._spaces[9, True, 63, 7] == []
+    assert plan._spaces[1, 9, True, 63, 7] == []
     out.sum().backward()
-    assert plan._spaces[9, True, 63, 7] == [first]
+    assert plan._spaces[1, 9, True, 63, 7] == [first]

@@ -15,9 +15,7 @@ from coachable.losses.functional import (
 F64 = torch.float64
 
 
-def slow_quantile_loss(
-    z: np.ndarray, y: np.ndarray, tau: np.ndarray, kappa: float, reduction: str, divide: bool
-) -> tuple[float, np.ndarray]:
+def slow_quantile_loss(z: np.ndarray, y: np.ndarray, tau: np.ndarray, kappa: float) -> tuple[float, np.ndarray]:
     """One sample at a time, one pair at a time: value and gradient with respect to the predictions."""
     value, gradient = 0.0, np.zeros_like(z)
     for i in range(len(z)):
@@ -30,65 +28,43 @@ def slow_quantile_loss(
                 huber, slope = 0.5 * u * u, u
             else:
                 huber, slope = kappa * (abs(u) - 0.5 * kappa), kappa * np.sign(u)
-            if divide and kappa > 0:
+            if kappa > 0:
                 huber, slope = huber / kappa, slope / kappa
             value += weight * huber
             gradient[i] -= weight * slope
-    scale = 1 / len(y) / (len(z) if reduction == "mean" else 1)
+    scale = 1 / len(y) / len(z)
     return value * scale, gradient * scale
 
 
 @pytest.mark.parametrize("kappa", [0.0, 0.3, 1.0, 2.0])
-@pytest.mark.parametrize("reduction", ["mean", "sum"])
-@pytest.mark.parametrize("divide", [True, False])
-def test_quantile_loss_against_a_slow_loop(kappa: float, reduction: str, divide: bool) -> None:
+def test_quantile_loss_against_a_slow_loop(kappa: float) -> None:
     torch.manual_seed(0)
     z = (2 * torch.randn(2, 3, 4, 5, dtype=F64)).requires_grad_()  # critics, batch, labels, quantiles
     y = 2 * torch.randn(3, 4, 7, dtype=F64)
     tau = quantile_midpoints(5, z)
-    loss = quantile_huber_loss(
-        z,
-        y,
-        kappa=kappa,
-        quantile_reduction=reduction,  # type: ignore[arg-type]
-        divide_by_kappa=divide,
-    )
+    loss = quantile_huber_loss(z, y, kappa=kappa)
     assert loss.shape == (2, 3, 4)
     loss.sum().backward()
     for c, b, n in np.ndindex(2, 3, 4):
-        value, gradient = slow_quantile_loss(
-            z.detach()[c, b, n].numpy(), y[b, n].numpy(), tau.numpy(), kappa, reduction, divide
-        )
+        value, gradient = slow_quantile_loss(z.detach()[c, b, n].numpy(), y[b, n].numpy(), tau.numpy(), kappa)
         assert loss[c, b, n].item() == pytest.approx(value, abs=1e-10)
         np.testing.assert_allclose(z.grad[c, b, n].numpy(), gradient, atol=1e-10)  # type: ignore[index]
     single = z.detach().float().requires_grad_()
-    quantile_huber_loss(
-        single,
-        y.float(),
-        kappa=kappa,
-        quantile_reduction=reduction,  # type: ignore[arg-type]
-        divide_by_kappa=divide,
-    ).sum().backward()
+    quantile_huber_loss(single, y.float(), kappa=kappa).sum().backward()
     torch.testing.assert_close(single.grad.double(), z.grad, rtol=1e-5, atol=1e-6)  # type: ignore[union-attr]
 
 
 def test_ten_zeros_against_ten_ones() -> None:
     zeros, ones = torch.zeros(10, dtype=F64), torch.ones(10, dtype=F64)
     assert quantile_huber_loss(zeros, ones).item() == pytest.approx(0.25, abs=1e-15)
-    assert quantile_huber_loss(zeros, ones, quantile_reduction="sum").item() == pytest.approx(2.5, abs=1e-15)
 
 
 def test_two_predictions_three_targets() -> None:
-    """Fractions (.2, .7): pinball (1.6 + 1 + .6 + 1.8 + .7 + .3)/3 = 2; fractions (0, .4) likewise."""
-    z = torch.tensor([[-1.0, 3.0], [-1.0, 3.0]], dtype=F64)
-    y = torch.tensor([-3.0, 4.0, 2.0], dtype=F64)
-    tau = torch.tensor([[0.2, 0.7], [0.0, 0.4]], dtype=F64)
-    pinball = quantile_huber_loss(z, y, tau, kappa=0.0, quantile_reduction="sum")
-    np.testing.assert_allclose(pinball.numpy(), [2.0, 2.2], atol=1e-12)
-    huber = quantile_huber_loss(z, y, tau, kappa=2.0, quantile_reduction="sum", divide_by_kappa=False)
-    np.testing.assert_allclose(huber.numpy(), [2.5, 8.5 / 3], atol=1e-12)
-    divided = quantile_huber_loss(z, y, tau, kappa=2.0, quantile_reduction="sum")
-    torch.testing.assert_close(divided, huber / 2)
+    """Levels (1/4, 3/4): pinball (1.5 + 1.25 + .75)/3 + (1.5 + .75 + .25)/3 = 2, and half of it on average."""
+    z, y = torch.tensor([-1.0, 3.0], dtype=F64), torch.tensor([-3.0, 4.0, 2.0], dtype=F64)
+    assert quantile_huber_loss(z, y, kappa=0.0).item() == pytest.approx(1.0, abs=1e-12)
+    # Huber of (-2, 5, 3) at 2: (2, 8, 4), of (-6, 1, -1): (10, .5, .5); weighted, divided by 2, on average.
+    assert quantile_huber_loss(z, y, kappa=2.0).item() == pytest.approx((1.5 + 2 + 1 + 2.5 + 0.375 + 0.125) / 12)
 
 
 def test_block_size_does_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,7 +87,6 @@ def test_midpoints() -> None:
 def test_pessimism_takes_a_whole_vector() -> None:
     two = torch.tensor([[0.0, 4.0], [1.0, 2.0]])
     assert pessimistic_quantiles(two).tolist() == [1.0, 2.0]
-    assert pessimistic_quantiles(two, "elementwise").tolist() == [0.0, 2.0]
     tied = torch.tensor([[0.0, 4.0], [1.0, 3.0], [2.0, 2.0]])
     assert pessimistic_quantiles(tied).tolist() == [0.0, 4.0]  # the first at ties
     batch = torch.randn(3, 5, 6, 7, dtype=F64)
@@ -143,7 +118,7 @@ def test_terminal_values_are_selected_out() -> None:
     assert target.tolist() == pytest.approx([1.0, 1.0, 2.8])
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     st.lists(st.floats(-1e15, 1e15), min_size=4, max_size=4),
     st.lists(st.floats(-1e15, 1e15), min_size=3, max_size=3),
@@ -160,7 +135,3 @@ def test_bad_arguments() -> None:
     z = torch.zeros(2)
     with pytest.raises(ValueError, match="kappa must not be negative"):
         quantile_huber_loss(z, z, kappa=-1.0)
-    with pytest.raises(ValueError, match="quantile_reduction must be one of"):
-        quantile_huber_loss(z, z, quantile_reduction="median")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="target_min must be one of"):
-        pessimistic_quantiles(torch.zeros(2, 2), "mean")  # type: ignore[arg-type]

@@ -34,7 +34,7 @@ LOSSES: dict[str, tuple[Callable[..., LossModule], Callable[..., Any], dict[str,
     "sac_categorical": (CategoricalSACLoss, make_hl_gauss_critic, {"alpha": 0.2, **BINS}, "policy_first"),
 }
 ONLY_AXES = ("sac", "qr_sac")
-UPDATES = {"sac": 130, "qr_sac": 130, "rac": 200, "cat_rac": 300, "sac_categorical": 300}  # more for binned critics
+UPDATES = {"sac": 90, "qr_sac": 90, "rac": 200, "cat_rac": 180, "sac_categorical": 180}
 # Mixed actions have both kinds of component: where a loss serves them, actions of one kind are left to the slow tests.
 SERVED = [
     pytest.param(loss, kind, marks=() if loss in ONLY_AXES or kind == "mixed" else pytest.mark.slow)
@@ -52,9 +52,9 @@ def train(name: str, heads: ActionHeads, updates: int, seed: int = 0) -> Any:
     kind, make, options, order = LOSSES[name]
     space = echo_space(heads)
     critic_options: dict[str, Any] = {}
-    network = SCALAR
+    network, rate = SCALAR, 3e-3
     if make is make_hl_gauss_critic:
-        critic_options, network = BINS, BINNED
+        critic_options, network, rate = BINS, BINNED, 5e-3
     elif "num_quantiles" in options:
         critic_options = {"num_outputs": options["num_quantiles"]}
     actor = make_mixed_actor(1, heads, space, **network)
@@ -62,7 +62,7 @@ def train(name: str, heads: ActionHeads, updates: int, seed: int = 0) -> Any:
     loss = kind(actor, critics, **options)
     loss.make_value_estimator(gamma=0.5)
     learner = Learner(
-        loss, actor_lr=3e-3, critic_lr=3e-3, tau=0.05, max_grad_norm=10.0, update_order=order, precision="fp32"
+        loss, actor_lr=rate, critic_lr=rate, tau=0.05, max_grad_norm=10.0, update_order=order, precision="fp32"
     )
     env = make_style_echo_env(heads, num_envs=64, seed=seed)
     replay = TensorDictReplayBuffer(storage=LazyTensorStorage(4096), batch_size=128)

@@ -147,33 +147,26 @@ def test_cat_rac_by_hand() -> None:
 
 
 def test_qr_sac_by_hand() -> None:
-    """Critics (0, 4) and (1, 2): the vector of lower mean, or elementwise (0, 2); entropy inside or outside."""
+    """Critics (0, 4) and (1, 2): the vector of lower mean counts; the entropy is inside the discount."""
     case = Case("QR-SAC", QRSACLoss, ("axes",), 2, {"num_quantiles": 2})
     batch = make_batch(AXES, (2,), F64)
     batch["next", "reward"] = torch.ones(2, 1, dtype=F64)
     batch["next", "terminated"] = torch.tensor([[False], [True]])
     batch["steps_to_next_obs"] = torch.tensor([[2], [2]])
-    # y = 1 + 0.25 (z + 0.1 * 3), or 1 + 0.25 z + 0.3 with the entropy outside.
-    for options, expected in (
-        ({}, [[1.325, 1.575], [1.0, 1.0]]),
-        ({"target_min": "elementwise"}, [[1.075, 1.575], [1.0, 1.0]]),
-        ({"entropy_in_target": "outside"}, [[1.55, 1.8], [1.3, 1.3]]),
-    ):
-        loss: Any = constant_loss(case, (0.0, 0.0), gamma=0.5, alpha=0.1, **options)
-        with torch.no_grad():
-            output = loss.target_qvalue_network_params["module", "output"]
-            output.copy_(torch.tensor([[0.0, 4.0], [1.0, 2.0]], dtype=F64))
-        loss._sample = lambda policy, relaxed: (policy.hard_action(), torch.full(policy.batch_shape, -3.0, dtype=F64))
-        np.testing.assert_allclose(loss.compute_target(batch).numpy(), expected, rtol=1e-8)
+    loss: Any = constant_loss(case, (0.0, 0.0), gamma=0.5, alpha=0.1)
+    with torch.no_grad():
+        output = loss.target_qvalue_network_params["module", "output"]
+        output.copy_(torch.tensor([[0.0, 4.0], [1.0, 2.0]], dtype=F64))
+    loss._sample = lambda policy, relaxed: (policy.hard_action(), torch.full(policy.batch_shape, -3.0, dtype=F64))
+    # y = 1 + 0.25 (z + 0.1 * 3)
+    np.testing.assert_allclose(loss.compute_target(batch).numpy(), [[1.325, 1.575], [1.0, 1.0]], rtol=1e-8)
 
 
-def test_quantile_reduction_reaches_the_loss() -> None:
-    """Summed over predictions the loss is M = 4 times larger."""
+def test_kappa_reaches_the_loss() -> None:
+    """At kappa 0 it is the pinball loss, whose mean over symmetric levels is half the distance."""
     case = next(c for c in OURS if c.name == "QR-SAC")
     batch = make_batch(AXES, (5,), F64)
     batch["next", "terminated"] = torch.ones(5, 1, dtype=torch.bool)
-    losses = {r: constant_loss(case, quantile_reduction=r).qvalue_loss(batch)[0].item() for r in ("mean", "sum")}
-    assert losses["sum"] == pytest.approx(4 * losses["mean"])
     pinball = constant_loss(case, kappa=0.0).qvalue_loss(batch)[0].item()
     reward = batch["next", "reward"]
     assert pinball == pytest.approx(sum(0.5 * (reward - v).abs().mean().item() for v in (10.0, 8.0)))

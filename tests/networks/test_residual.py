@@ -16,12 +16,6 @@ def test_fit_features_equals_padding_by_a_possibly_negative_amount(side, width):
     torch.testing.assert_close(fit_features(x, width, side), F.pad(x, pad), rtol=0, atol=0)
 
 
-def test_keep_first_narrowing_ignores_the_side():
-    x = torch.arange(5.0)
-    assert fit_features(x, 3, "beginning", "keep_first").tolist() == [0.0, 1.0, 2.0]
-    assert fit_features(x, 3, "beginning").tolist() == [2.0, 3.0, 4.0]
-
-
 def test_block_is_relu_of_layer_norm_plus_skip():
     block = ResidualBlock(3, 4)
     x = torch.randn(7, 3)
@@ -48,8 +42,6 @@ def test_initialisation_is_glorot_uniform_with_zero_bias():
         (1500, {}, 0),
         (2048, {}, 0),
         (2600, {}, 40),
-        (2600, {"padding": "end"}, 512),
-        (2600, {"narrowing": "keep_first"}, 512),
     ],
 )
 def test_identity_paths_of_the_padded_network(in_features, options, paths):
@@ -58,7 +50,7 @@ def test_identity_paths_of_the_padded_network(in_features, options, paths):
     out = x
     net_sides = ResidualMLP(4, None, (4, 4, 4, 4), **options).blocks
     for block, width in zip(net_sides, COMBAT, strict=True):
-        out = fit_features(out, width, block.side, block.narrowing)
+        out = fit_features(out, width, block.side)
     assert int((out > 0).sum()) == paths
 
 
@@ -93,10 +85,10 @@ def test_head_is_float32_under_autocast():
 
 @pytest.mark.parametrize(
     "options",
-    [{"widths": ()}, {"widths": (4, 0)}, {"padding": "left"}, {"padding": ("end",)}, {"narrowing": "middle"}],
+    [{"widths": ()}, {"widths": (4, 0)}, {"dropout": 1.0}],
 )
 def test_bad_options_raise(options):
-    with pytest.raises(ValueError, match="must be"):
+    with pytest.raises(ValueError, match=r"must be|dropout is 1.0: expected a number in \[0, 1\)"):
         ResidualMLP(3, 1, **{"widths": (4, 4), **options})
 
 
@@ -104,6 +96,22 @@ def test_without_layer_norm():
     block = ResidualBlock(4, 4, layer_norm=False)
     x = torch.randn(3, 4)
     torch.testing.assert_close(block(x), F.relu(block.linear(x)) + x)
+
+
+def test_dropout_is_on_only_where_a_gradient_is_asked_for():
+    torch.manual_seed(0)
+    net = ResidualMLP(6, None, (2000,), dropout=0.25)
+    plain = ResidualMLP(6, None, (2000,))
+    plain.load_state_dict(net.state_dict())
+    x = torch.randn(6)
+    own = net(x)[6:] / plain(x)[6:].clamp_min(1e-30)  # behind the identity path
+    active = plain(x)[6:] > 0
+    torch.testing.assert_close(own[active], torch.where(own[active] > 0, 1 / 0.75, 0.0))
+    assert 0.2 < (own[active] == 0).float().mean() < 0.3
+    torch.testing.assert_close(net(x)[:6].clamp_max(0), plain(x)[:6].clamp_max(0))  # of the input nothing is dropped
+    with torch.no_grad():
+        torch.testing.assert_close(net(x), plain(x), rtol=0, atol=0)
+    torch.testing.assert_close(net.eval()(x), plain(x), rtol=0, atol=0)
 
 
 def test_head_gain_scales_the_initial_head():

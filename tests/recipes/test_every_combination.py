@@ -13,12 +13,15 @@ from tensordict import TensorDict
 from coachable.domains.racing.families import racing_family
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
 from coachable.training.trainer import REPLAY_KEYS
+from coachable.training.weights import load_policy
 
 RECIPES = sorted(file.stem for file in (Path(__file__).resolve().parents[2] / "recipes" / "configs").glob("*_*.yaml"))
 TINY = ["preset=smoke", "env.num_envs=2", "threads.simulator=1", "threads.learner=1", "train.eval_interval=0"]
 TINY += ["init_random_frames=8", "train.warmup_frames=8", "train.batch_size=12", "eval.max_steps=3"]
 TINY += ["train.total_frames=28", "train.utd_ratio=0.125", "impersonation.n=0", "eval.num_envs=1"]
+TINY += ["replay_capacity=100", "event_capacity=60"]
 BRIEF = ["train.utd_ratio=0", "train.total_frames=3"]
+FULLY = ("humanoid_sac", "combat_cat_rac")  # continuous actions, and mixed ones
 POLICY_FIRST = {"qr_sac", "rac", "cat_rac", "sac_categorical"}  # paper, Appendix B
 
 
@@ -38,11 +41,19 @@ def _has_tables(recipe, replay):
 
 
 def _losses_and_buffers():
-    """Every loss with one buffer, so that every recipe is trained with every loss and with every buffer."""
+    """Every loss with one buffer for each kind of action; the other recipes share the losses, with every buffer each.
+
+    Their losses differ in nothing but their numbers: what a recipe gives to one, it gives to all of them.
+    """
+    losses = itertools.cycle(config_groups("humanoid_sac")["loss"])
     for recipe in RECIPES:
         groups = config_groups(recipe)
-        buffers = itertools.cycle([name for name in groups["replay"] if _has_tables(recipe, name)])
-        yield from ((recipe, loss, next(buffers)) for loss in groups["loss"] if _is_served(recipe, loss))
+        buffers = [name for name in groups["replay"] if _has_tables(recipe, name)]
+        if recipe in FULLY:
+            served = [loss for loss in groups["loss"] if _is_served(recipe, loss)]
+            yield from ((recipe, loss, buffer) for loss, buffer in zip(served, itertools.cycle(buffers), strict=False))
+        else:
+            yield from ((recipe, next(losses), buffer) for buffer in buffers)
 
 
 def test_recipes_were_found():
@@ -63,6 +74,27 @@ def test_every_loss_and_every_replay_buffer_train(recipe, loss, replay, tmp_path
         assert train.replay.names == ("solo", "recovery") and "scenario" in set(sample.keys())
         return
     assert train.replay.names[:1] == ("default",) and (len(train.replay.names) > 1) == (replay == "event_tables")
+
+
+def test_the_papers_racing_learns_with_dropout_and_acts_without(tmp_path):
+    tiny = ["preset=paper", "device=cpu", "env.num_envs=3", "network.actor.widths=[8,8]", "network.critic.widths=[8]"]
+    tiny += ["replay_capacity=300", "init_random_frames=0", "train.warmup_frames=3", "train.total_frames=18"]
+    tiny += ["train.utd_ratio=0.25", "n_steps=2", "train.batch_size=8", "threads.learner=1"]
+    train = import_module("racing_qr_sac").build(compose_config("racing_qr_sac", [*TINY, *tiny, f"run_dir={tmp_path}"]))
+    policy = train.collector.policy
+    dropped = []
+    for module in policy.modules():
+        if isinstance(module, torch.nn.Dropout):
+            assert module.p == 0.1
+            module.register_forward_hook(lambda *_: dropped.append(train.learner.updates))
+    acted = next(iter(train.collector)).select("observation", "style", "loc")
+    assert not dropped
+    train.run()
+    assert train.learner.updates == 2 and dropped == [0, 0, 1, 1]  # two layers, in the policy's loss alone
+    loaded = load_policy(tmp_path).actor
+    with torch.no_grad():
+        again, mode = policy(acted.clone())["loc"], loaded(acted.clone())["loc"]
+    assert torch.equal(again, mode) and torch.equal(loaded(acted.clone())["loc"], mode)
 
 
 def test_returns_over_several_steps_are_relabelled_by_the_sum_of_their_features(tmp_path):

@@ -3,12 +3,14 @@
 import multiprocessing
 import os
 import signal
+import sys
 from importlib import import_module
 
 import pytest
 import torch
-from recipe_config import compose_config
+from recipe_config import compose_config, run_recipe
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 
 from coachable.training.collection import _ray_options, make_collector
 from tests.recipes.test_every_combination import RECIPES, TINY
@@ -95,6 +97,21 @@ def test_workers_start_as_by_default(sync, tmp_path):
     if sync:
         require_trained(train, distances)
     assert not multiprocessing.active_children()
+
+
+def refuse(seed):
+    raise ValueError("num_envs is 2: expected a multiple of three")
+
+
+def test_an_error_of_the_environment_in_a_worker_is_one_sentence(monkeypatch, quick_starts, tmp_path):
+    def build(config):
+        actor = TensorDictModule(torch.nn.Linear(1, 1), in_keys=["observation"], out_keys=["action"])
+        return make_collector(refuse, actor, frames_per_batch=2, backend="process")
+
+    monkeypatch.setattr(sys, "argv", ["rare_targets.py", "preset=smoke", f"run_dir={tmp_path}"])
+    with pytest.raises(SystemExit) as refused:
+        run_recipe("rare_targets", build)
+    assert refused.value.code == "error: num_envs is 2: expected a multiple of three"
 
 
 def test_without_ray_the_error_names_the_extra(monkeypatch):

@@ -13,6 +13,7 @@ from tests.random_kills import RECIPES, differences
 TINY = ["preset=smoke", "env.num_envs=2", "threads.simulator=1", "threads.learner=1", "train.eval_interval=16"]
 TINY += ["init_random_frames=8", "train.warmup_frames=8", "train.batch_size=12", "eval.max_steps=3"]
 TINY += ["train.total_frames=48", "train.utd_ratio=0.25", "eval.num_envs=1"]
+TINY += ["replay_capacity=60", "event_capacity=60"]
 
 
 @pytest.mark.parametrize("recipe", sorted(file.stem for file in (RECIPES / "configs").glob("*_*.yaml")))

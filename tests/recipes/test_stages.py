@@ -1,7 +1,9 @@
 """A training in stages: one run folder, resumed in any stage, bit for bit."""
 
-import os
+import shutil
+import weakref
 from importlib import import_module
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -14,7 +16,7 @@ from tests.random_kills import differences
 
 TINY = ["preset=smoke", "threads.simulator=1", "threads.learner=1", "train.eval_interval=16", "eval.max_steps=3"]
 TINY += ["init_random_frames=8", "train.warmup_frames=8", "train.batch_size=12", "train.utd_ratio=0.25"]
-TINY += ["train.checkpoint_interval=0"]
+TINY += ["train.checkpoint_interval=0", "replay_capacity=64", "event_capacity=40"]  # small: saved at every step
 STAGES = "stages=[{name: first, total_frames: 24}, {name: second, total_frames: 40, alpha: 0.2, env: {num_envs: 4}}]"
 
 
@@ -26,39 +28,78 @@ def start(*arguments):
     return start_training(import_module("rare_targets").build, compose_config("rare_targets", list(arguments)))
 
 
-@pytest.mark.parametrize("at", [("first", 16), ("second", 4), ("second", 24)])
-def test_a_training_that_is_killed_in_a_stage_ends_like_an_uninterrupted_one(at, tmp_path, monkeypatch):
-    monkeypatch.setattr(os, "fsync", lambda _: None)
-    start(*TINY, STAGES, f"run_dir={tmp_path / 'whole'}").run()
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The run of a training in two stages that nobody interrupted."""
+    run = tmp_path_factory.mktemp("stages") / "whole"
+    start(*TINY, STAGES, f"run_dir={run}").run()
+    return run
+
+
+def test_a_training_that_is_killed_in_its_stages_ends_like_an_uninterrupted_one(whole, tmp_path, monkeypatch):
+    run = tmp_path / "killed"
     store = Trainer._store
+    begin = [*TINY, STAGES, f"run_dir={run}"]
+    for at in (("first", 16), ("second", 4), ("second", 24)):
 
-    def die(train, data):
-        if (train.describe()["config"]["stage"], train.frames) == at:
-            raise Killed
-        store(train, data)
+        def die(train, data, at=at):
+            if (train.describe()["config"]["stage"], train.frames) == at:
+                raise Killed
+            store(train, data)
 
-    monkeypatch.setattr(Trainer, "_store", die)
-    with pytest.raises(Killed):
-        start(*TINY, STAGES, f"run_dir={tmp_path / 'killed'}").run()
+        monkeypatch.setattr(Trainer, "_store", die)
+        with pytest.raises(Killed):
+            start(*begin).run()
+        begin = [f"resume={run}"]
     monkeypatch.setattr(Trainer, "_store", store)
-    start(f"resume={tmp_path / 'killed'}").run()
+    start(*begin).run()
     for stage in ("1_first", "2_second"):
-        found = differences(tmp_path / "killed" / "stages" / stage, tmp_path / "whole" / "stages" / stage)
+        found = differences(run / "stages" / stage, whole / "stages" / stage)
         assert [name for name in found if name != "metrics/episodes"] == [], stage
 
 
 def test_a_stage_starts_from_the_weights_of_the_one_before(tmp_path):
-    curriculum = start(*TINY, STAGES, f"run_dir={tmp_path}", "train.utd_ratio=0")
+    tiny = [argument for argument in TINY if not argument.startswith("train.utd_ratio")]
+    tiny += ["train.checkpoint_interval=300", "train.eval_interval=0", f"run_dir={tmp_path}"]
+    curriculum = start(*tiny, STAGES.replace("alpha: 0.2", "alpha: 0.2, train: {utd_ratio: 0}"))
     curriculum.run()
     states = [read_state(find_checkpoint(tmp_path / "stages" / name)) for name in ("1_first", "2_second")]
     for part in ("actor", "critics"):
         for name, value in states[0][part].items():
             assert torch.equal(value, states[1][part][name]), name
+    assert states[0]["learner"]["updates"] > states[1]["learner"]["updates"] == 0
     assert [state["loop"]["frames"] for state in states] == [24, 40]
     assert states[1]["config"]["loss"]["alpha_init"] == 0.2 and states[0]["config"]["loss"]["alpha_init"] == 0.01
     assert find_checkpoint(tmp_path).parents[1].name == "2_second"
     with pytest.raises(CheckpointError, match="holds a run already"):
         start(*TINY, STAGES, f"run_dir={tmp_path}")
+
+
+def test_a_stage_is_forgotten_before_the_next_one_is_built(tmp_path):
+    """Its replay buffer takes memory, and TorchRL raises the number of threads when its environments are closed."""
+
+    class Stage:
+        frames, settings = 1, SimpleNamespace(total_frames=1)
+
+        def __init__(self):
+            self.cycle = self
+
+        def run(self):
+            return {}
+
+    remembered, built = weakref.WeakSet(), []
+
+    def build(config):
+        assert not remembered
+        stage = Stage()
+        remembered.add(stage)
+        built.append(config["stage"])
+        return stage
+
+    threads = {"simulator": 1, "learner": 1}
+    stages = [{"stage": name, "threads": threads} for name in ("first", "second", "third")]
+    Curriculum({"run_dir": str(tmp_path), "stages": stages, "init_from": None, "resume": None}, build).run()
+    assert built == ["first", "second", "third"]
 
 
 def test_what_the_command_line_says_holds_in_all_stages():
@@ -95,9 +136,16 @@ def test_the_name_of_a_stage_leads_nowhere_else(name, tmp_path):
         Curriculum(config, build=None)
 
 
-@pytest.mark.parametrize("harm", [{"_target_": "builtins.print"}, "${oc.env:HOME}", 7])
-def test_a_saved_stage_names_nothing_that_the_recipe_does_not(harm, tmp_path):
-    start(*TINY, STAGES, f"run_dir={tmp_path / 'run'}").run()
+@pytest.mark.parametrize(
+    "harm, message",
+    [
+        ({"_target_": "builtins.print"}, r"names 'builtins.print' as its env.nested._target_: expected none"),
+        ("${oc.env:HOME}", r"as its env.nested: expected a plain value"),
+        (7, r"frames_0*40"),
+    ],
+)
+def test_a_saved_stage_names_nothing_that_the_recipe_does_not(harm, message, whole, tmp_path):
+    shutil.copytree(whole, tmp_path / "run")
     file = find_checkpoint(tmp_path / "run") / "state.pt"
     state = torch.load(file, weights_only=True)
     if harm == 7:
@@ -105,5 +153,5 @@ def test_a_saved_stage_names_nothing_that_the_recipe_does_not(harm, tmp_path):
     else:
         state["config"]["stages"][1]["env"]["nested"] = harm
     torch.save(state, file)
-    with pytest.raises(CheckpointError):
+    with pytest.raises(CheckpointError, match=message):
         start(f"resume={tmp_path / 'run'}")

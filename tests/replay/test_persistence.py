@@ -9,7 +9,6 @@ from torchrl.checkpoint import Checkpoint
 from torchrl.data import LazyMemmapStorage
 
 from coachable.replay import EventTableBuffer, KeyEvents, KeyRoute
-from coachable.replay.replay_files import read_replay, write_replay
 from coachable.styles import StyleReward, StyleSpace, Weight, WeightedFeature
 from coachable.transforms import TaskImpersonation
 
@@ -62,7 +61,7 @@ def use(buffer: EventTableBuffer, start: int, stop: int) -> list[TensorDict]:
     """Extends, samples and updates priorities, as a training does."""
     samples = []
     for seed in range(start, stop):
-        buffer.extend(batch(seed), worker=seed % 2)
+        buffer.extend(batch(seed))
         samples.append(buffer.sample())
         if buffer.sampler.prioritized:
             samples[-1]["td_error"] = samples[-1]["next", "reward"].squeeze(-1)
@@ -97,12 +96,7 @@ def by_checkpoint(saved, fresh, folder):
     Checkpoint(replay=fresh).load(folder / "checkpoint")
 
 
-def by_replay_files(saved, fresh, folder):
-    write_replay(saved, folder / "replay")
-    read_replay(fresh, folder / "replay")
-
-
-@pytest.mark.parametrize("way", [by_state_dict, by_torch_file, by_dumps, by_checkpoint, by_replay_files])
+@pytest.mark.parametrize("way", [by_state_dict, by_torch_file, by_dumps, by_checkpoint])
 @pytest.mark.parametrize(
     "kwargs",
     [{}, {"n_steps": 4}, {"prioritized": True}, {"n_steps": 3, "prioritized": True, "relabel": True}],
@@ -150,7 +144,7 @@ def test_a_loaded_buffer_shares_no_memory_with_what_it_was_loaded_from(tmp_path)
     assert_same(again, saved)
 
 
-@pytest.mark.parametrize("way", [by_state_dict, by_dumps, by_replay_files])
+@pytest.mark.parametrize("way", [by_state_dict, by_dumps])
 def test_a_buffer_whose_steps_are_all_held_back_round_trips(way, tmp_path):
     """Before the first return over `n_steps` is complete, the writer has steps and the storage has no record."""
     saved, fresh = make(n_steps=4), make(n_steps=4)
@@ -165,7 +159,7 @@ def test_a_buffer_whose_steps_are_all_held_back_round_trips(way, tmp_path):
     assert_same(saved, fresh)
 
 
-@pytest.mark.parametrize("way", [by_state_dict, by_dumps, by_replay_files])
+@pytest.mark.parametrize("way", [by_state_dict, by_dumps])
 def test_an_empty_buffer_round_trips(way, tmp_path):
     saved, fresh = make(n_steps=3, relabel=True), make(n_steps=3, relabel=True)
     way(saved, fresh, tmp_path)
@@ -244,7 +238,7 @@ def test_equal_buffers_have_equal_files_whatever_was_in_memory(tmp_path):
         buffer.storage._storage["style"][: len(used)][~used] = stray
         buffer.storage._storage["next", "done"][: len(used)][~used] = stray == 3.0
         before = {table: buffer.table(table).clone() for table in buffer.names if len(buffer.table(table))}
-        write_replay(buffer, tmp_path / name)
+        buffer.dumps(tmp_path / name)
         assert all((buffer.table(table) == rows).all() for table, rows in before.items())
     files = sorted((tmp_path / "one").glob("*.npy"))
     assert len(files) == len(buffer.storage[:1].keys(True, True))

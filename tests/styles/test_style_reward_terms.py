@@ -245,7 +245,7 @@ def test_reward_is_the_scaled_sum_of_its_terms():
     reward = mixed_reward()
     features, theta = torch.randn(8, 12), reward.space.sample((8,))
     terms = reward.terms_of(features, theta)
-    assert tuple(terms) == reward.term_names == ("pose", "length", "own", "costs")
+    assert tuple(terms) == tuple(reward.terms) == ("pose", "length", "own", "costs")
     total = 0.5 * terms["pose"] + terms["length"] + (1 / 3) * terms["own"] + terms["costs"]
     torch.testing.assert_close(reward(features, theta).squeeze(-1), total)
     assert reward.scales == {"pose": 0.5, "length": 1.0, "own": 1 / 3, "costs": 1.0}

@@ -6,7 +6,8 @@ import pytest
 import torch
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from coachable.training import Learner, NonFiniteLossError, resolve_precision
+from coachable.training.learner import Learner, NonFiniteLossError
+from coachable.training.precision import resolve_precision
 from tests import sac_problem
 from tests.sac_problem import ACT, make_batch, make_loss
 
@@ -314,11 +315,11 @@ def test_two_learners_may_share_a_loss_one_after_the_other(make_learner):
 
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 def test_both_precisions_learn_to_follow_the_style(make_learner, precision):
-    """A bandit, reward -|a - style / 2|: after 200 updates the policy's action follows the style."""
+    """A bandit, reward -|a - style / 2|: after 100 updates the policy's action follows the style."""
     loss = make_loss(width=64)
-    learner = make_learner(loss, precision=precision, actor_lr=2e-3, critic_lr=4e-3)
+    learner = make_learner(loss, precision=precision, actor_lr=4e-3, critic_lr=8e-3)
     gen = torch.Generator().manual_seed(0)
-    for _ in range(200):
+    for _ in range(100):
         batch = make_batch(128, seed=int(torch.randint(1 << 30, (), generator=gen)))
         batch["style"] = batch["next", "style"] = torch.rand(128, 2, generator=gen) * 2 - 1
         batch["action"] = torch.rand(128, 3, generator=gen) * 2 - 1

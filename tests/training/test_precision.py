@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from coachable.training import resolve_precision, supports_bf16
+from coachable.training.precision import resolve_precision, supports_bf16
 
 
 def test_auto_is_bf16_where_the_hardware_has_it(monkeypatch):

@@ -33,15 +33,16 @@ def test_the_test_environment_keeps_its_specs(make_echo_env):
 
 
 def test_n_plus_n_equals_2n_bit_for_bit(make_train, tmp_path):
-    whole = make_train(tmp_path / "whole", total_frames=320)
+    whole = make_train(tmp_path / "whole", total_frames=320, utd_ratio=0.06)
     whole.run()
-    half = make_train(tmp_path / "half", total_frames=160)
+    half = make_train(tmp_path / "half", total_frames=160, utd_ratio=0.06)
     half.run()
-    rest = make_train(tmp_path / "half", total_frames=320, seed=7)  # the checkpoint decides everything, not the seed
+    # The checkpoint decides everything, not the seed.
+    rest = make_train(tmp_path / "half", total_frames=320, utd_ratio=0.06, seed=7)
     rest.resume(tmp_path / "half")
     assert rest.frames == 160
     rest.run()
-    assert whole.learner.updates == rest.learner.updates == (320 - 40) // 4
+    assert whole.learner.updates == rest.learner.updates == 16  # 0.06 of 280
     states = [read_state(find_checkpoint(tmp_path / name)) for name in ("whole", "half")]
     expected, found = (dict(_tensors(state)) for state in states)
     assert expected.keys() == found.keys()
@@ -147,7 +148,7 @@ def test_learning_rates_fall_to_a_tenth_over_the_last_share(make_train, tmp_path
     assert [settings.learning_rate_factor(frames) for frames in (0, 300, 350, 400, 450)] == pytest.approx(
         [1.0, 1.0, 0.55, 0.1, 0.1]
     )
-    train = make_train(total_frames=200, anneal=0.25)
+    train = make_train(total_frames=200, utd_ratio=0.05, anneal=0.25)
     train.run()
     assert train.learner.optimizers["actor"].param_groups[0]["lr"] == pytest.approx(1e-4)
     again = make_train(total_frames=400, anneal=0.25)
@@ -159,7 +160,7 @@ def test_the_entropy_weight_falls_with_the_learning_rates(make_train, tmp_path):
     settings = TrainSettings(total_frames=400, anneal=0.25, anneal_entropy=0.2)
     assert [settings.entropy_factor(frames) for frames in (0, 300, 350, 400)] == pytest.approx([1.0, 1.0, 0.6, 0.2])
     before = make_train(total_frames=400).learner.loss_module.log_alpha.exp()
-    train = make_train(total_frames=200, anneal=0.25, anneal_entropy=0.2)
+    train = make_train(total_frames=200, utd_ratio=0.05, anneal=0.25, anneal_entropy=0.2)
     train.run()
     assert train.learner.loss_module.log_alpha.exp() == pytest.approx(0.2 * before)
     again = make_train(total_frames=400, anneal=0.25, anneal_entropy=0.2)
@@ -167,11 +168,11 @@ def test_the_entropy_weight_falls_with_the_learning_rates(make_train, tmp_path):
     assert again.learner.loss_module.log_alpha.exp() == pytest.approx(before)
 
 
-@pytest.mark.parametrize("utd_ratio, updates", [(0.0, 0), (0.125, 15), (0.3, 36), (1.0, 120)])
+@pytest.mark.parametrize("utd_ratio, updates", [(0.0, 0), (0.125, 5), (0.3, 12), (1.0, 40)])
 def test_updates_per_step(make_train, utd_ratio, updates):
-    train = make_train(total_frames=160, utd_ratio=utd_ratio)
+    train = make_train(total_frames=80, utd_ratio=utd_ratio)
     train.run()
-    assert abs(train.learner.updates - updates) <= 1  # 160 frames, the first 40 are warm-up; 0.3 is not exact in binary
+    assert abs(train.learner.updates - updates) <= 1  # 80 frames, the first 40 are warm-up; 0.3 is not exact in binary
 
 
 def test_without_settings_every_step_is_followed_by_an_update(make_train):
@@ -213,7 +214,7 @@ def test_replay_holds_raw_style_and_no_copy_of_it(make_train):
 
 
 def test_metrics_are_sums_over_episodes(make_train, tmp_path):
-    train = make_train(total_frames=200, log_interval=0.0)
+    train = make_train(total_frames=200, utd_ratio=0.05, log_interval=0.0)
     train.run()
     with (tmp_path / "run" / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -230,10 +231,10 @@ def test_metrics_are_sums_over_episodes(make_train, tmp_path):
 
 
 def test_evaluation_happens_when_due_and_changes_nothing(make_train, make_echo_env, tmp_path):
-    plain = make_train(tmp_path / "plain", total_frames=200)
+    plain = make_train(tmp_path / "plain", total_frames=200, utd_ratio=0.05)
     plain.run()
     calls = []
-    train = make_train(tmp_path / "evaluated", total_frames=200, eval_interval=50)
+    train = make_train(tmp_path / "evaluated", total_frames=200, utd_ratio=0.05, eval_interval=50)
     env = make_echo_env(5)
 
     def evaluate():

@@ -8,6 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, MultiStep, TensorDictReplayBuffer
+from torchrl.envs import MultiStepTransform
 
 from coachable.domains.combat import combat_style_space
 from coachable.domains.humanoid import humanoid_style_space
@@ -212,6 +213,17 @@ def test_sums_of_torchrls_own_n_step_returns_are_refused_too():
     data = MultiStep(gamma=0.9, n_steps=3)(steps(40).reshape(1, 40)).reshape(-1)
     with pytest.raises(ValueError, match="sums over up to 3 steps"):
         relabel(data)
+
+
+@pytest.mark.parametrize("n_step", [MultiStep(gamma=0.9, n_steps=3), MultiStepTransform(gamma=0.9, n_steps=3)])
+def test_sums_of_torchrl_lack_the_features_that_a_linear_style_reward_needs(n_step):
+    space = StyleSpace([Weight("a", 0.0, 1.0)])
+    relabel = TaskImpersonation(StyleReward(space, {"a": WeightedFeature("a", 0)}), n=2)
+    td = steps(40).reshape(1, 40)
+    td["style"] = td["style"][..., :1].abs()
+    summed = n_step(td) if isinstance(n_step, MultiStep) else n_step.inv(td)
+    with pytest.raises(ValueError, match=r"up to 3 steps from TorchRL's MultiStep, .*let EventTableBuffer sum"):
+        relabel(summed.reshape(-1))
 
 
 def test_sums_are_relabelled_where_the_style_reward_is_linear():

@@ -31,7 +31,7 @@ def amount(p: Weight | Setpoint, segment: Segment, now: float, last: Last | None
     sign = _sign(segment, p, last, sense)
     if segment.number is not None:
         return _given(p, segment, now, sign, sense)
-    if segment.keep and sign is None and segment.only_degree:
+    if segment.keep and sign is None and not segment.explicit:
         return now
     if segment.negated and segment.direction is not None:
         return now  # "not longer" asks for no change
@@ -83,7 +83,7 @@ def _sign(segment: Segment, p: Weight | Setpoint, last: Last | None, sense: int)
     if segment.level is not None:
         relative = (segment.too or segment.negated) and segment.level != 0.5
         return (-turn if segment.level > 0.5 else turn) if relative else None
-    if segment.mentions and segment.only_degree and (segment.too or (segment.negated and "so" in segment.words)):
+    if segment.mentions and not segment.explicit and (segment.too or (segment.negated and "so" in segment.words)):
         return -turn  # "too much fire", "not so careful"
     return last[1] if last is not None and same and segment.repeated else None
 

@@ -14,20 +14,7 @@ from typing import cast
 from coachable.coach.phrases import segments
 from coachable.coach.phrases.amounts import Last, amount, dimension_of, wrapped
 from coachable.coach.phrases.segments import Mention, Segment
-from coachable.coach.phrases.vocabulary import (
-    DEFAULTS,
-    DIRECTIONS,
-    FACTORS,
-    FILLERS,
-    LEVELS,
-    NEGATIONS,
-    PERCENT,
-    PREFERENCES,
-    SEPARATORS,
-    UNITS,
-    stem,
-    tokenise,
-)
+from coachable.coach.phrases.vocabulary import RESERVED, stem, tokenise
 from coachable.styles import Choice, Parameter, StyleSpace, Weight
 
 Value = float | str
@@ -109,6 +96,7 @@ class StyleGrammar:
     ) -> None:
         declared = parameters.parameters if isinstance(parameters, StyleSpace) else tuple(parameters)
         self.parameters: dict[str, Parameter] = {p.name: p for p in declared}
+        self._defaults = {p.name: cast(Value, p.default) for p in declared}
         self.lexicon: dict[tuple[str, ...], Mention] = {}
         self._context = {p.name: {stem(w) for w in tokenise(f"{p.help} {p.name}")} for p in declared}
         self._ignored = frozenset((vocabulary or {}).get("", ()))
@@ -127,7 +115,7 @@ class StyleGrammar:
         )
 
     def read(self, phrase: str, current: Mapping[str, Value], previous: Understanding | None = None) -> Understanding:
-        """Understands a phrase, relative to the style in force.
+        """Understand a phrase, relative to the style in force.
 
         Args:
             phrase: what the coach said, at most 2,000 characters.
@@ -159,19 +147,15 @@ class StyleGrammar:
             self.lexicon[words] = mention
 
     def _add_names(self) -> None:
-        singles: Counter[str] = Counter()
+        named = []
         for p in self.parameters.values():
-            for name in (p.name, *(p.options if isinstance(p, Choice) else ())):
-                singles.update(set(tokenise(name)))
-        for p in self.parameters.values():
-            for name, mention in [
-                (p.name, Mention((p.name,))),
-                *((option, Mention((p.name,), option)) for option in (p.options if isinstance(p, Choice) else ())),
-            ]:
-                for word in tokenise(name):
-                    if singles[word] == 1 and self._is_free(word):
-                        self._add(word, mention)
-                self._add(name, mention)
+            named += [(p.name, Mention((p.name,))), *((option, Mention((p.name,), option)) for option in _options(p))]
+        counts = Counter(word for name, _ in named for word in set(tokenise(name)))
+        for name, mention in named:
+            for word in tokenise(name):
+                if counts[word] == 1 and self._is_free(word):
+                    self._add(word, mention)
+            self._add(name, mention)
 
     def _add_help(self) -> None:
         """Content words of the help texts that belong to one parameter alone."""
@@ -184,9 +168,7 @@ class StyleGrammar:
 
     def _is_free(self, word: str) -> bool:
         """Whether a word has no other meaning, so that alone it may stand for a parameter."""
-        taken = (DIRECTIONS, LEVELS, FACTORS, NEGATIONS, PREFERENCES, DEFAULTS, FILLERS, SEPARATORS, UNITS, PERCENT)
-        taken += (self._ignored,)
-        return word.isalpha() and len(word) > 1 and not any(word in table for table in taken)
+        return word.isalpha() and len(word) > 1 and word not in RESERVED and word not in self._ignored
 
     def _mention(self, meaning: str) -> Mention:
         signed, sign, value = read_meaning(meaning)
@@ -194,13 +176,12 @@ class StyleGrammar:
         if unknown or not signed:
             given = " ".join(unknown or signed)
             raise ValueError(f"the vocabulary has words for {given!r}: expected one of {list(self.parameters)}")
-        declared = [self.parameters[name] for name in signed]
         if not value:
             return Mention(signed, sign=sign)
-        for p in declared:
-            if isinstance(p, Choice) and value not in p.options:
-                raise ValueError(f"the vocabulary has words for {meaning!r}: options are {list(p.options)}")
-        p = declared[0]
+        for options in filter(None, (_options(self.parameters[name]) for name in signed)):
+            if value not in options:
+                raise ValueError(f"the vocabulary has words for {meaning!r}: options are {list(options)}")
+        p = self.parameters[signed[0]]
         if isinstance(p, Choice):
             return Mention(signed, value)
         if value in _ENDS:
@@ -210,8 +191,7 @@ class StyleGrammar:
     def _working(self, phrases: Sequence[str]) -> tuple[str, ...]:
         """The first few phrases that are understood."""
         self.examples: tuple[str, ...] = ()
-        now = {name: cast(Value, parameter.default) for name, parameter in self.parameters.items()}
-        return tuple(phrase for phrase in phrases if not self.read(phrase, now).failed)[:_EXAMPLES]
+        return tuple(phrase for phrase in phrases if not self.read(phrase, self._defaults).failed)[:_EXAMPLES]
 
     # -- meaning ---------------------------------------------------------------------------------------------------
 
@@ -252,7 +232,7 @@ class StyleGrammar:
         """A choice without an option that was named."""
         name = parameter.name
         if segment.keep or segment.default:
-            self._change(reading, name, cast(Value, parameter.default) if segment.default else reading.values[name])
+            self._change(reading, name, (self._defaults if segment.default else reading.values)[name])
             return
         unknown = f"unknown: {', '.join(segment.unknown)}; " if segment.unknown else ""
         reading.failed.append(f"'{segment.text}' ({unknown}{_words(name)} can be {_listed(parameter.options)})")
@@ -272,7 +252,7 @@ class StyleGrammar:
     def _deny(self, name: str, value: Value, segment: Segment, reading: _Reading) -> None:
         """Any value but this one."""
         parameter = self.parameters[name]
-        others = [option for option in parameter.options if option != value] if isinstance(parameter, Choice) else []
+        others = [option for option in _options(parameter) if option != value]
         if isinstance(parameter, Choice) and reading.values[name] != value:
             reading.said.append(f"{_words(name)} stays {_shown(parameter, reading.values[name])}")
         elif isinstance(parameter, Weight) and value == 0.0:
@@ -307,10 +287,9 @@ class StyleGrammar:
         return (), f" (of what: {_listed(fitting)}?)"
 
     def _reset(self, reading: _Reading) -> None:
-        defaults = {name: cast(Value, parameter.default) for name, parameter in self.parameters.items()}
-        changed = [name for name, value in defaults.items() if reading.values[name] != value]
-        for name in changed:
-            self._change(reading, name, defaults[name])
+        changed = {name: value for name, value in self._defaults.items() if reading.values[name] != value}
+        for name, value in changed.items():
+            self._change(reading, name, value)
         if not changed:
             reading.said.append("everything stays at its default")
 
@@ -347,6 +326,10 @@ def read_meaning(meaning: str) -> tuple[tuple[str, ...], int, str]:
     names, _, value = meaning.partition("=")
     signs = {_SIGNS.get(name[0], 0) for name in names.split()}
     return tuple(name.lstrip("+-") for name in names.split()), signs.pop() if signs else 0, value
+
+
+def _options(parameter: Parameter) -> tuple[str, ...]:
+    return tuple(parameter.options) if isinstance(parameter, Choice) else ()
 
 
 def _words(name: str) -> str:

@@ -24,6 +24,15 @@ from coachable.coach.phrases.vocabulary import (
     stem,
 )
 
+_FLAGS = {
+    "preferred": PREFERENCES,
+    "default": DEFAULTS,
+    "keep": KEEPS,
+    "repeated": REPEATS,
+    "absolute": ABSOLUTE,
+}
+"""Words by the attribute of a `Segment` that they set."""
+
 
 @dataclass(frozen=True)
 class Mention:
@@ -96,28 +105,25 @@ class Segment:
         return "too" in self.words[:-1]
 
     @property
-    def has_head(self) -> bool:
-        """Whether it asks for something, be it of an unnamed parameter."""
-        asked = (self.direction, self.level, self.number, self.factor)
-        return any(part is not None for part in asked) or self.default or self.repeated or self.keep or self.degree > 0
+    def explicit(self) -> bool:
+        """Whether it says how to change something, by a comparative, an adjective, a number or a factor."""
+        return any(part is not None for part in (self.direction, self.level, self.number, self.factor))
 
     @property
-    def only_degree(self) -> bool:
-        """Whether it says how much, but not of what nor in which direction."""
-        return (self.direction, self.level, self.number, self.factor) == (None,) * 4
+    def has_head(self) -> bool:
+        """Whether it asks for something, be it of an unnamed parameter."""
+        return self.explicit or self.default or self.repeated or self.keep or self.degree > 0
 
     @property
     def complete(self) -> bool:
         """Whether another request may begin here."""
-        valued = any(mention.value is not None for mention in self.mentions)
-        head = any(part is not None for part in (self.direction, self.level, self.number, self.factor))
-        return valued or bool(self.mentions and head)
+        return any(m.value is not None for m in self.mentions) or bool(self.mentions and self.explicit)
 
 
 def split(
     tokens: Sequence[str], lexicon: Mapping[tuple[str, ...], Mention], ignored: Collection[str] = ()
 ) -> list[Segment]:
-    """Cuts a phrase at punctuation, conjunctions, and where a request is complete and another begins.
+    """Cut a phrase at punctuation, conjunctions, and where a request is complete and another begins.
 
     The work grows in proportion to the number of tokens.
 
@@ -126,43 +132,39 @@ def split(
         lexicon: what stemmed words name.
         ignored: words that ask for nothing, beside those of the vocabulary.
     """
-    sizes, named_ahead = _look_up(tokens, lexicon)
     stems = [stem(token) for token in tokens]
+    sizes, named_ahead = _look_up(stems, lexicon)
     found, segment, i = [], Segment(), 0
     while i < len(tokens):
         size = sizes[i]
         mention = lexicon[tuple(stems[i : i + size])] if size else None
-        if mention is None and tokens[i] in SEPARATORS:
-            found.append(segment)
-            segment, i = Segment(), i + 1
-            continue
-        if _begins_another(segment, tokens[i : i + 2], mention, named_ahead[i]):
+        separated = mention is None and tokens[i] in SEPARATORS
+        if separated or _begins_another(segment, tokens[i : i + 2], mention, named_ahead[i]):
             found.append(segment)
             segment = Segment()
         if mention is not None:
             segment.words += tokens[i : i + size]
             if mention not in segment.mentions:
                 segment.mentions.append(mention)
-            i += size
-        else:
-            i += _take(segment, tokens, i, ignored)
+        elif not separated:
+            size = _take(segment, tokens, i, ignored)
+        i += max(size, 1)
     found.append(segment)
     return _tidy(found)
 
 
-def _look_up(tokens: Sequence[str], lexicon: Mapping[tuple[str, ...], Mention]) -> tuple[list[int], list[bool]]:
-    """Finds what the lexicon names at each token.
+def _look_up(stems: Sequence[str], lexicon: Mapping[tuple[str, ...], Mention]) -> tuple[list[int], list[bool]]:
+    """Find what the lexicon names at each token.
 
     Returns:
         The number of tokens of the longest entry that begins there, 0 if none does; and whether an entry lies between
         there and the next separator.
     """
     longest = max((len(words) for words in lexicon), default=1)
-    stems = [stem(token) for token in tokens]
-    sizes, named_ahead = [0] * len(tokens), [False] * len(tokens)
+    sizes, named_ahead = [0] * len(stems), [False] * len(stems)
     ahead, clear = False, 0  # `clear` counts the tokens before the next separator
-    for i in reversed(range(len(tokens))):
-        fitting = [n for n in range(min(longest, len(tokens) - i), 0, -1) if tuple(stems[i : i + n]) in lexicon]
+    for i in reversed(range(len(stems))):
+        fitting = [n for n in range(min(longest, len(stems) - i), 0, -1) if tuple(stems[i : i + n]) in lexicon]
         sizes[i] = fitting[0] if fitting else 0
         clear = 0 if stems[i] in SEPARATORS else clear + 1
         ahead = clear > 0 and (ahead or any(n <= clear for n in fitting))
@@ -189,20 +191,19 @@ def _begins_another(segment: Segment, rest: Sequence[str], mention: Mention | No
 
 
 def _take(segment: Segment, tokens: Sequence[str], i: int, ignored: Collection[str]) -> int:
-    """Notes what a word means; returns how many tokens were used."""
+    """Note what a word means; return how many tokens were used."""
     word = tokens[i]
     segment.words.append(word)
     if word[-1].isdigit() and not math.isfinite(float(word)):
         segment.unknown.append(word)
     elif word[-1].isdigit():
-        segment.signed = word.startswith("+")
         unit = stem(tokens[i + 1]) if i + 1 < len(tokens) else ""
-        if unit in PERCENT or unit in UNITS:
+        known = unit in PERCENT or unit in UNITS
+        segment.signed, segment.number = word.startswith("+"), (float(word), unit if known else "")
+        if known:
             segment.words.append(tokens[i + 1])
-            segment.number = (float(word), unit)
             segment.dimension = segment.dimension or UNITS.get(unit, ("", 1.0))[0]
             return 2
-        segment.number = (float(word), "")
     elif word in NEGATIONS:
         segment.negated = not segment.negated
     elif word in DIRECTIONS:
@@ -221,27 +222,16 @@ def _take(segment: Segment, tokens: Sequence[str], i: int, ignored: Collection[s
 
 
 def _take_modifier(segment: Segment, word: str, ignored: Collection[str]) -> None:
-    known = word in FILLERS or word in ignored
-    if word in DEGREES:
-        segment.degree = max(segment.degree, DEGREES[word])
-        known = True
-    if word in PREFERENCES:
-        segment.preferred = known = True
-    if word in DEFAULTS:
-        segment.default = known = True
-    if word in KEEPS:
-        segment.keep = known = True
-    if word in REPEATS:
-        segment.repeated = known = True
-    if word in ABSOLUTE:
-        segment.absolute |= word != "by"
-        known = True
-    if not known:
+    flags = [name for name, words in _FLAGS.items() if word in words]
+    for name in flags:
+        setattr(segment, name, True)
+    segment.degree = max(segment.degree, DEGREES.get(word, 0.0))
+    if not (flags or word in DEGREES or word in FILLERS or word in ignored):
         segment.unknown.append(word)
 
 
 def _tidy(found: list[Segment]) -> list[Segment]:
-    """Drops empty segments and joins what a comma tore apart: "steps, shorter", "shorter steps, just a bit"."""
+    """Drop empty segments and join what a comma tore apart: "steps, shorter", "shorter steps, just a bit"."""
     kept: list[Segment] = []
     for segment in found:
         asks = segment.mentions or segment.unknown or segment.has_head or segment.negated or segment.preferred
@@ -249,7 +239,7 @@ def _tidy(found: list[Segment]) -> list[Segment]:
             continue
         before = kept[-1] if kept else None
         anonymous = not (segment.mentions or segment.unknown)
-        if before is not None and anonymous and segment.degree and segment.only_degree:
+        if before is not None and anonymous and segment.degree and not segment.explicit:
             before.degree = segment.degree
         elif before is not None and anonymous and before.mentions and not (before.has_head or before.complete):
             segment.mentions, segment.words = before.mentions, [*before.words, *segment.words]

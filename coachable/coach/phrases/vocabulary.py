@@ -95,6 +95,11 @@ FILLERS = _words(
     over under per both each maybe"""
 )
 
+RESERVED = frozenset().union(
+    DIRECTIONS, LEVELS, FACTORS, NEGATIONS, PREFERENCES, DEFAULTS, FILLERS, SEPARATORS, UNITS, PERCENT
+)
+"""Words that have a meaning of their own, so that none of them alone may stand for a parameter."""
+
 _ARTICLES = _words("the your my his her its their")  # "raise your arms" reads as "raise arms"
 
 _ONES = ("one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")

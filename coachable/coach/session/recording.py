@@ -98,7 +98,7 @@ class Recording:
                     raise ValueError(
                         f"the recording has the unknown style parameter {name!r}: {domain} has {space.names}"
                     )
-                if not _is_trained(space[name], value):
+                if not is_trained(space[name], value):
                     raise ValueError(f"the recording asks for {name} = {value!r}, which lies outside the trained range")
         for steering in (self.controls, *(event.get("controls", {}) for event in self.events)):
             for name, value in steering.items():
@@ -130,7 +130,8 @@ def check_seed(seed: int) -> None:
         raise ValueError(f"seed = {seed}: expected a whole number from 0 to 2**63 - 1")
 
 
-def _is_trained(parameter: Parameter, value: float | str) -> bool:
+def is_trained(parameter: Parameter, value: float | str) -> bool:
+    """Return whether agents were trained on a value: one of the options, or a number in the range, as float32."""
     if isinstance(parameter, Choice):
         return value in parameter.options
     return not isinstance(value, str) and bool(

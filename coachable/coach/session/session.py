@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -18,10 +17,10 @@ from coachable.coach.phrases.fitting import fitting
 from coachable.coach.phrases.grammar import StyleGrammar, Understanding
 from coachable.coach.session.live_episodes import LiveEpisodes
 from coachable.coach.session.readout import MeasuredWindow, StyleReport
-from coachable.coach.session.recording import Recording, check_seed
+from coachable.coach.session.recording import Recording, check_seed, is_trained
 from coachable.coach.session.timeline import Timeline
 from coachable.domain import Domain
-from coachable.styles import Choice, StyleSpace, Weight
+from coachable.styles import StyleSpace, Weight
 from coachable.training.weights import domain_of, load_policy
 
 
@@ -358,7 +357,8 @@ class CoachSession:
 
     def _request(self, theta: Tensor, asked: Mapping[str, Any]) -> None:
         """Puts a style in force; `asked` is what led to it, perhaps beyond the trained range."""
-        self._outside = {name: v for name, v in {**self._outside, **asked}.items() if self._is_outside(name, v)}
+        everything = {**self._outside, **asked}
+        self._outside = {name: value for name, value in everything.items() if not is_trained(self.space[name], value)}
         before = self.style
         self._theta = theta
         changed = {name: value for name, value in self.style.items() if value != before[name]}
@@ -378,12 +378,6 @@ class CoachSession:
     def _steer_env(self) -> None:
         for name, value in self._control_values.items():
             self._controls[name].apply(self.base_env, value)
-
-    def _is_outside(self, name: str, value: float | str) -> bool:
-        parameter = self.space[name]
-        if isinstance(parameter, Choice):
-            return False
-        return not np.float32(parameter.low) <= np.float32(value) <= np.float32(parameter.high)
 
     def _seconds(self, step: int) -> float:
         return (step - self._steps_at_request) * self.domain.control_step

@@ -7,25 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import matplotlib
 import numpy as np
 import torch
-from tensordict import TensorDict
-from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
 from coachable.envs.combat.constants import PLAYER_HP
 from coachable.envs.combat.tables import ELEMENTS, STYLES
 from coachable.envs.combat.traits import MACHINE_NAMES
-from coachable.evaluation.figures import readable
+from coachable.evaluation.figures import drawing, readable
+from coachable.evaluation.rollouts import Rollout
 from coachable.evaluation.runs import SWITCH_PERIOD
-from coachable.keys import STYLE
 from coachable.styles import StyleSpace
-from coachable.training.rng import RandomStream
-from coachable.transforms import coachable_env
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
 
 if TYPE_CHECKING:
     from coachable.domain import Domain
@@ -131,7 +123,6 @@ def requests_of(space: StyleSpace) -> tuple[str, ...]:
     return tuple(name for name in space.names if name in (*SOURCES, *STATES))
 
 
-@torch.no_grad()
 def fight_coached(
     domain: Domain, agent: LoadedPolicy, *, sequences: int, steps: int, seed: int, progress: bool
 ) -> CoachedFights:
@@ -156,22 +147,21 @@ def fight_coached(
     period = max(1, min(SWITCH_PERIOD, steps // len(names)))
     requests = _draw_requests(len(names), -(-steps // period), sequences, seed).repeat_interleave(period, 0)[:steps]
 
-    simulation: Any = domain.make_env(num_envs=sequences, seed=seed)
-    env = coachable_env(simulation, agent.space, domain.make_reward(agent.space), seed=seed)
-    env.set_seed(seed)
-    current = env.reset(TensorDict({STYLE: theta[requests[0]]}, env.batch_size))
+    env = domain.styled_env(agent.space, sequences, seed=seed)
+    simulation: Any = env.base_env
+    rollout = Rollout(env, seed)
+    rollout.begin(theta[requests[0]])
     rows: list[dict[str, torch.Tensor]] = []
     label = f"{sequences} sequences of fights, style switched every {period} steps" if progress else None
-    with RandomStream(seed).drawn():
-        for request in tqdm(requests, desc=label, disable=True if label is None else None, leave=False):
-            transition = env.step(agent.actor(current.set(STYLE, theta[request])))
-            row = domain.measures.step(transition)
-            state = simulation.state
-            row |= {"player health": state.hp / PLAYER_HP, "opponent": state.machine[0].clone()}
-            row |= {"machine health": state.enemy_hp.sum(0) / simulation.traits.hp.sum(0)}
-            row["done"] = transition.get(("next", "done"))[:, 0]
-            rows.append(row)
-            current = env.maybe_reset(step_mdp(transition))
+    for request in tqdm(requests, desc=label, disable=True if label is None else None, leave=False):
+        transition = rollout.step(agent.actor, theta[request])
+        row = domain.measures.step(transition)
+        state = simulation.state
+        row |= {"player health": state.hp / PLAYER_HP, "opponent": state.machine[0].clone()}
+        row |= {"machine health": state.enemy_hp.sum(0) / simulation.traits.hp.sum(0)}
+        row["done"] = transition.get(("next", "done"))[:, 0]
+        rows.append(row)
+        rollout.begin_ended()
     env.close()
     record = {name: torch.stack([row[name] for row in rows]).numpy() for name in rows[0]}
     player, machine = (record.pop(f"{who} health").clip(0.0, 1.0) for who in ("player", "machine"))
@@ -201,44 +191,42 @@ def draw_timeline(rows: Sequence[Mapping[str, Any]], path: Path, *, bin_seconds:
     step = float(times[0])
     colours = {source: f"C{number}" for number, source in enumerate(SOURCES)}
     size = (min(24.0, 4.0 + 0.09 * float(times[-1])), 5.0)
-    figure, (top, ticks, bottom) = plt.subplots(
-        3, 1, figsize=size, sharex=True, height_ratios=[3, 0.4, 2], layout="constrained"
-    )
+    panels = drawing(path, 3, size=size, grid=False, sharex=True, height_ratios=[3, 0.4, 2])
+    with panels as ((top,), (ticks,), (bottom,)):
+        edges = np.arange(0.0, times[-1] + bin_seconds, bin_seconds)
+        requested = {row["requested"] for row in rows}
+        base = np.zeros(len(edges) - 1)
+        for source in SOURCES:
+            done = np.array([row[source] for row in rows])
+            height = np.histogram(times - step / 2, edges, weights=done)[0] / bin_seconds
+            if done.any() or source in requested:
+                top.bar(
+                    edges[:-1], height, bin_seconds, base, align="edge", color=colours[source], label=readable(source)
+                )
+            base += height
+        damage = np.array([sum(row[source] for source in SOURCES) for row in rows])
+        counted = np.array([row["counted"] for row in rows])
+        for hits, level, colour in ((counted > 0, 1, "tab:green"), ((damage > 0) & (counted <= 0), 0, "tab:red")):
+            ticks.eventplot(times[hits], lineoffsets=level, linelengths=0.8, colors=colour)
+        for fight in dict.fromkeys(row["fight"] for row in rows):
+            own = [row for row in rows if row["fight"] == fight]
+            for name, style in (("player", "k-"), ("machine", "r--")):
+                health = [row[f"{name}_health"] for row in own]
+                bottom.plot([row["seconds"] for row in own], health, style, label=None if fight else name)
+            start, ended = own[0]["seconds"] - step, readable(own[-1]["ended"])
+            text = f"{own[0]['machine']}\n{ended}".strip()
+            bottom.text(start + 0.3, 1.06, text, fontsize=7, va="bottom", clip_on=False)
+        _mark(rows, colours, (top, ticks, bottom))
 
-    edges = np.arange(0.0, times[-1] + bin_seconds, bin_seconds)
-    requested = {row["requested"] for row in rows}
-    base = np.zeros(len(edges) - 1)
-    for source in SOURCES:
-        done = np.array([row[source] for row in rows])
-        height = np.histogram(times - step / 2, edges, weights=done)[0] / bin_seconds
-        if done.any() or source in requested:
-            top.bar(edges[:-1], height, bin_seconds, base, align="edge", color=colours[source], label=readable(source))
-        base += height
-    damage = np.array([sum(row[source] for source in SOURCES) for row in rows])
-    counted = np.array([row["counted"] for row in rows])
-    for hits, level, colour in ((counted > 0, 1, "tab:green"), ((damage > 0) & (counted <= 0), 0, "tab:red")):
-        ticks.eventplot(times[hits], lineoffsets=level, linelengths=0.8, colors=colour)
-    for fight in dict.fromkeys(row["fight"] for row in rows):
-        own = [row for row in rows if row["fight"] == fight]
-        for name, style in (("player", "k-"), ("machine", "r--")):
-            health = [row[f"{name}_health"] for row in own]
-            bottom.plot([row["seconds"] for row in own], health, style, label=None if fight else name)
-        start, ended = own[0]["seconds"] - step, readable(own[-1]["ended"])
-        text = f"{own[0]['machine']}\n{ended}".strip()
-        bottom.text(start + 0.3, 1.06, text, fontsize=7, va="bottom", clip_on=False)
-    _mark(rows, colours, (top, ticks, bottom))
-
-    top.set_ylabel("damage [HP/s]")
-    top.set_ylim(0, max(1.0, 1.2 * float(base.max())))
-    top.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    ticks.set_yticks([0, 1], ["other hits", "as requested"], fontsize=7)
-    ticks.set_ylim(-0.6, 1.6)
-    bottom.set(ylabel="health", xlabel="time [s]", xlim=(0, times[-1]))
-    bottom.set_ylim(0, 1.45)
-    bottom.set_yticks([0, 0.5, 1])
-    bottom.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
+        top.set_ylabel("damage [HP/s]")
+        top.set_ylim(0, max(1.0, 1.2 * float(base.max())))
+        top.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+        ticks.set_yticks([0, 1], ["other hits", "as requested"], fontsize=7)
+        ticks.set_ylim(-0.6, 1.6)
+        bottom.set(ylabel="health", xlabel="time [s]", xlim=(0, times[-1]))
+        bottom.set_ylim(0, 1.45)
+        bottom.set_yticks([0, 0.5, 1])
+        bottom.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
 def _mark(rows: Sequence[Mapping[str, Any]], colours: Mapping[str, Any], panels: Sequence[Any]) -> None:

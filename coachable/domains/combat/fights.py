@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import matplotlib
 import numpy as np
 import torch
 
@@ -22,16 +20,12 @@ from coachable.domains.combat.coached_fight import (
 from coachable.domains.combat.styles import single_styles
 from coachable.envs.combat.tables import MACHINES, SITES, STYLES, UNSEEN_MACHINES
 from coachable.evaluation.evaluation_settings import EvaluationSettings
-from coachable.evaluation.figures import readable
+from coachable.evaluation.figures import drawing, readable
 from coachable.evaluation.rollouts import record_episodes
 from coachable.evaluation.statistics import rank_correlation
-from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_csv
+from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_results
 from coachable.evaluation.sweep import WeightSweep, sweep_weights
 from coachable.styles import StyleSpace
-from coachable.transforms import coachable_env
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
 
 if TYPE_CHECKING:
     from coachable.domain import Domain
@@ -59,12 +53,7 @@ def style_label(cell: Mapping[str, float]) -> str:
     return " + ".join(named) or "default"
 
 
-def evaluate_fights(
-    domain: Domain,
-    agent: LoadedPolicy,
-    out: Path,
-    settings: EvaluationSettings,
-) -> str:
+def evaluate_fights(domain: Domain, agent: LoadedPolicy, out: Path, settings: EvaluationSettings) -> str:
     """Fight every machine in every style and write tables, figures and a report.
 
     Files: `damage.csv` (what was done under which style), `wins.csv` (by style and machine), `unseen.csv` (wins against
@@ -115,9 +104,6 @@ def evaluate_fights(
         timeline = coached.timeline()
         tables |= {"switches": coached.switches(), "timeline": timeline}
         draw_timeline(timeline, out / "timeline.png")
-    for name, rows in tables.items():
-        if rows:
-            write_csv(rows, out / f"{name}.csv")
     draw_damage(damage, out / "damage.png")
     draw_sweep(sweep, out / "sweep.png")
     scores = {row["style"]: row["style_score"] for row in damage if row["style_score"] is not None}
@@ -129,12 +115,10 @@ def evaluate_fights(
         "switching": {row["style"]: row for row in tables.get("switches", [])}.get("all styles"),
         "seed": seed,
     }
-    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     report = _report(agent, tables, summary, episodes, steps, seed)
     if coached is not None:
         report += _switch_report(coached, tables["switches"])
-    (out / "report.md").write_text(report)
-    return report
+    return write_results(out, report, summary, tables)
 
 
 def fight_matrix(
@@ -152,14 +136,13 @@ def fight_matrix(
     space, shape = agent.space, (len(cells), len(opponents), episodes)
     theta = torch.stack([space.make(strict=True, **cell) for cell in cells])
     theta = theta.repeat_interleave(len(opponents) * episodes, 0)
-    simulation: Any = domain.make_env(num_envs=len(theta), seed=seed, num_enemies=len(opponents[0]))
+    env = domain.styled_env(space, len(theta), seed=seed, num_enemies=len(opponents[0]))
     sites = np.random.default_rng(seed).choice(SITES, len(opponents) * episodes)
     names = [machines for machines in opponents for _ in range(episodes)] * len(cells)
+    simulation: Any = env.base_env
     simulation.assign(names, [str(site) for site in sites] * len(cells))
-    env = coachable_env(simulation, space, domain.make_reward(space), seed=seed)
     label = f"{len(cells)} styles x {len(opponents)} opponents x {episodes} fights" if progress else None
     record = record_episodes(env, agent.actor, theta, domain.measures, steps=steps, seed=seed, progress=label)
-    env.close()
     sums = domain.measures.summarise(record.measures, record.alive)
     sums["timeout"] = 1.0 - sums["won"] - torch.maximum(sums["died"], sums["out_of_bounds"])
     sums["seconds"] = record.alive.sum(0) * domain.control_step
@@ -222,18 +205,19 @@ def draw_damage(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """The damage matrix: columns are requested styles, rows what was done (paper)."""
     kinds = [*SOURCES, *STATES]
     shares = np.array([[row[kind] for row in rows] for kind in kinds])
-    figure, axes = plt.subplots(figsize=(2.5 + 0.62 * len(rows), 2.2 + 0.36 * len(kinds)), layout="constrained")
-    axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
-    for (i, j), share in np.ndenumerate(shares):
-        axes.text(j, i, f"{share:.2f}", ha="center", va="center", fontsize=7, color="white" if share > 0.6 else "black")
-    axes.axhline(len(SOURCES) - 0.5, color="0.4", lw=1)
-    names = [readable(row["style"]) for row in rows]
-    axes.set_xticks(range(len(rows)), [f"{n}\n{row['won']:.0%} won" for n, row in zip(names, rows, strict=True)])
-    axes.tick_params(axis="x", labelrotation=60, labelsize=8)
-    axes.set_yticks(range(len(kinds)), list(map(readable, kinds)), fontsize=8)
-    axes.set(xlabel="requested style", title="share of the damage (below the line: while the state was active)")
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
+    size = (2.5 + 0.62 * len(rows), 2.2 + 0.36 * len(kinds))
+    with drawing(path, size=size, grid=False) as ((axes,),):
+        axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
+        for (i, j), share in np.ndenumerate(shares):
+            axes.text(
+                j, i, f"{share:.2f}", ha="center", va="center", fontsize=7, color="white" if share > 0.6 else "black"
+            )
+        axes.axhline(len(SOURCES) - 0.5, color="0.4", lw=1)
+        names = [readable(row["style"]) for row in rows]
+        axes.set_xticks(range(len(rows)), [f"{n}\n{row['won']:.0%} won" for n, row in zip(names, rows, strict=True)])
+        axes.tick_params(axis="x", labelrotation=60, labelsize=8)
+        axes.set_yticks(range(len(kinds)), list(map(readable, kinds)), fontsize=8)
+        axes.set(xlabel="requested style", title="share of the damage (below the line: while the state was active)")
 
 
 def draw_sweep(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
@@ -242,19 +226,20 @@ def draw_sweep(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     columns = min(len(names), 5)
     count = -(-len(names) // columns)
     size = (2.6 * columns, 2.4 * count)
-    figure, grid = plt.subplots(count, columns, figsize=size, squeeze=False, layout="constrained")
-    for panel, name in zip(grid.flat, names, strict=False):
-        points = [row for row in rows if row["style"] == name]
-        panel.plot([p["weight"] for p in points], [p["style_score"] for p in points], marker="o", ms=4, label="score")
-        panel.plot([p["weight"] for p in points], [p["won"] for p in points], ls="--", marker="x", ms=4, label="won")
-        panel.set(title=readable(name), xlabel="weight")
-        panel.set_ylim(-0.05, None)
-        panel.grid(alpha=0.3)
-    for panel in list(grid.flat)[len(names) :]:
-        panel.set_visible(False)
-    grid[0, 0].legend(fontsize=7)
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
+    with drawing(path, count, columns, size=size) as grid:
+        for panel, name in zip(grid.flat, names, strict=False):
+            points = [row for row in rows if row["style"] == name]
+            panel.plot(
+                [p["weight"] for p in points], [p["style_score"] for p in points], marker="o", ms=4, label="score"
+            )
+            panel.plot(
+                [p["weight"] for p in points], [p["won"] for p in points], ls="--", marker="x", ms=4, label="won"
+            )
+            panel.set(title=readable(name), xlabel="weight")
+            panel.set_ylim(-0.05, None)
+        for panel in list(grid.flat)[len(names) :]:
+            panel.set_visible(False)
+        grid[0, 0].legend(fontsize=7)
 
 
 def _report(

@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-from typing import cast
-
-import numpy as np
-from torchrl.envs import EnvBase
-
 from coachable.domain import Domain
 from coachable.domains.humanoid.metrics import HumanoidMeasures
 from coachable.domains.humanoid.render import HumanoidRenderer
@@ -17,31 +12,13 @@ from coachable.envs.humanoid.env import EPISODE_STEPS, HumanoidEnv
 from coachable.envs.humanoid.model import CONTROL_STEP
 from coachable.envs.humanoid.observation import OBSERVATION_GROUPS
 
-
-class _EnvRenderer:
-    """`HumanoidRenderer` of one row of a `HumanoidEnv`, below whatever transforms wrap it."""
-
-    def __init__(self, width: int = 640, height: int = 480) -> None:
-        self._renderer = HumanoidRenderer(width, height)
-
-    def draw(self, env: EnvBase, row: int = 0) -> np.ndarray:
-        """Image of the humanoid's current state."""
-        while not isinstance(env, HumanoidEnv):
-            env = cast(EnvBase, env.base_env)
-        return self._renderer.draw(env.simulation.positions[row], float(env.course[row]))
-
-    def close(self) -> None:
-        """Release the graphics context."""
-        self._renderer.close()
-
-
 DOMAIN = Domain(
     name="humanoid",
     make_env=HumanoidEnv,
     make_space=humanoid_style_space,
     make_reward=humanoid_style_reward,
     measures=HumanoidMeasures(),
-    make_renderer=_EnvRenderer,
+    make_renderer=HumanoidRenderer,
     make_scene=HumanoidScene,
     grid={"pose": POSES, "step_length": (0.30, 0.35, 0.40, 0.45, 0.50, 0.55, 0.60, 0.65)},
     control_step=CONTROL_STEP,

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import mujoco
 import numpy as np
+from torchrl.envs import EnvBase
 
-from coachable.envs.humanoid.model import NUM_POSITIONS, load_spec
+from coachable.envs.humanoid.env import HumanoidEnv
+from coachable.envs.humanoid.model import load_spec
 from coachable.offscreen import OffscreenMujoco
 
 CAMERA_DISTANCE = 3.2  # [m]
@@ -15,39 +19,31 @@ CAMERA_AZIMUTH = 125.0  # [deg] relative to the course
 
 
 class HumanoidRenderer:
-    """Draws a humanoid's state as an RGB image, the camera following the torso.
+    """Draw one humanoid of a `HumanoidEnv`, below whatever transforms wrap it; the camera follows the torso.
 
     Args:
         width: image width [px].
         height: image height [px].
-        shadows: draw shadows and reflections, which cost three to four times the rest in software.
 
     Raises:
-        RuntimeError: if no OpenGL library is installed; names the package that gives one.
+        RenderingError: if no OpenGL library is installed; names the package that gives one.
     """
 
-    def __init__(self, width: int = 640, height: int = 480, *, shadows: bool = False) -> None:
+    def __init__(self, width: int = 640, height: int = 480) -> None:
         spec = load_spec()
         spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
-        self._offscreen = OffscreenMujoco(self._model, width, height, shadows=shadows)
+        self._offscreen = OffscreenMujoco(self._model, width, height)
         camera = self._offscreen.camera
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE
         camera.distance, camera.elevation = CAMERA_DISTANCE, CAMERA_ELEVATION
 
-    def draw(self, positions: np.ndarray, course: float = 0.0) -> np.ndarray:
-        """Image of a posture.
-
-        Args:
-            positions: (28,) generalised positions.
-            course: direction that counts as forward [rad].
-
-        Returns:
-            (height, width, 3) uint8.
-        """
-        if positions.shape != (NUM_POSITIONS,):
-            raise ValueError(f"expected {NUM_POSITIONS} generalised positions, got shape {positions.shape}")
+    def draw(self, env: EnvBase, row: int = 0) -> np.ndarray:
+        """Return an image (height, width, 3) uint8 of the current state of one row."""
+        while not isinstance(env, HumanoidEnv):
+            env = cast(EnvBase, env.base_env)
+        positions, course = env.simulation.positions[row], float(env.course[row])
         self._data.qpos[:] = positions
         mujoco.mj_forward(self._model, self._data)
         camera = self._offscreen.camera

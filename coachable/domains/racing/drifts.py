@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import matplotlib
 import numpy as np
 
 from coachable.domains.racing.metrics import DRIFT_ANGLE_DEG, GRIP_ANGLE_DEG
 from coachable.envs.racing.race.features import DRIFT_NAMES
 from coachable.envs.racing.race.scenarios import Scenario
 from coachable.evaluation.evaluation_settings import EvaluationSettings
+from coachable.evaluation.figures import drawing
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
-from coachable.evaluation.style_grid import evaluate_grid, markdown_table, policy_sentence, write_csv
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
+from coachable.evaluation.style_grid import evaluate_grid, markdown_table, policy_sentence, write_results
 
 if TYPE_CHECKING:
     from coachable.domain import Domain
@@ -35,12 +31,7 @@ _STARTS = (Scenario("solo", 1.0, "solo"),)
 _METRICS = ("slip_angle_rear", "slip_angle_front", "pace", "off", "turns", "survived")
 
 
-def evaluate_drift(
-    domain: Domain,
-    agent: LoadedPolicy,
-    out: Path,
-    settings: EvaluationSettings,
-) -> str:
+def evaluate_drift(domain: Domain, agent: LoadedPolicy, out: Path, settings: EvaluationSettings) -> str:
     """Drive under rising weights, of the rear slip angle alone, with the ratio, and of all four, from ordinary starts.
 
     Files: `drift.csv` (by weight), `drift.png`, `report.md`, `summary.json`.
@@ -61,11 +52,9 @@ def evaluate_drift(
         agent.actor,
         agent.space,
         episodes=settings.episodes,
-        steps=settings.steps,
-        seed=settings.seed,
         cells=cells,
-        progress=settings.progress,
         env_options={"scenarios": _STARTS},
+        **settings.rollout,
     )
     values = {name: value.reshape(len(SWEEPS), len(WEIGHTS), -1) for name, value in grid.episodes.items()}
     rows = [
@@ -85,12 +74,8 @@ def evaluate_drift(
             "most_turns": max(row["most_turns"] for row in own),
         }
     summary |= {"episodes_per_weight": settings.episodes, "seed": settings.seed}
-    write_csv(rows, out / "drift.csv")
     draw_drift(rows, out / "drift.png")
-    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
-    report = _report(agent, rows, summary, grid.steps)
-    (out / "report.md").write_text(report)
-    return report
+    return write_results(out, _report(agent, rows, summary, grid.steps), summary, {"drift": rows})
 
 
 def _rows(sweep: str, episodes: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
@@ -108,23 +93,20 @@ def _rows(sweep: str, episodes: Mapping[str, np.ndarray]) -> list[dict[str, Any]
 
 def draw_drift(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Mean rear slip angle with its 95 % interval, and pace, over the weight, a line per sweep."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.8), layout="constrained")
-    for sweep, marker in zip(SWEEPS, "ovs", strict=True):
-        own = [row for row in rows if row["sweep"] == sweep]
-        weights, angle = [row["weight"] for row in own], np.array([row[ANGLE] for row in own])
-        error = np.abs(np.array([[row["angle_low"], row["angle_high"]] for row in own]) - angle[:, None]).T
-        left.errorbar(weights, angle, error, marker=marker, capsize=3)
-        right.plot(weights, [row["pace_kept"] for row in own], marker=marker, label=sweep)
-    for line in (DRIFT_ANGLE_DEG, GRIP_ANGLE_DEG):
-        left.axhline(line, color="0.6", lw=1, ls=":")
-    left.set(xlabel="requested weight", ylabel="slip angle of the rear tyres [deg], 95 %")
-    right.set(xlabel="requested weight", ylabel="progress, share of that at 0")
-    right.legend(fontsize=8, loc="lower left")  # of both: on the left the lines leave no room
-    for panel in (left, right):
-        panel.set_ylim(0.0, None)
-        panel.grid(alpha=0.3)
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
+    with drawing(path, 1, 2, size=(9.0, 3.8)) as ((left, right),):
+        for sweep, marker in zip(SWEEPS, "ovs", strict=True):
+            own = [row for row in rows if row["sweep"] == sweep]
+            weights, angle = [row["weight"] for row in own], np.array([row[ANGLE] for row in own])
+            error = np.abs(np.array([[row["angle_low"], row["angle_high"]] for row in own]) - angle[:, None]).T
+            left.errorbar(weights, angle, error, marker=marker, capsize=3)
+            right.plot(weights, [row["pace_kept"] for row in own], marker=marker, label=sweep)
+        for line in (DRIFT_ANGLE_DEG, GRIP_ANGLE_DEG):
+            left.axhline(line, color="0.6", lw=1, ls=":")
+        left.set(xlabel="requested weight", ylabel="slip angle of the rear tyres [deg], 95 %")
+        right.set(xlabel="requested weight", ylabel="progress, share of that at 0")
+        right.legend(fontsize=8, loc="lower left")  # of both: on the left the lines leave no room
+        for panel in (left, right):
+            panel.set_ylim(0.0, None)
 
 
 def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Mapping[str, Any], steps: int) -> str:

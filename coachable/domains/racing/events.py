@@ -7,7 +7,7 @@ import math
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from coachable.domains.racing.families import check_family
+from coachable.domains.racing.families import racing_family
 from coachable.envs.racing.race.features import DRIFT_NAMES, OVERTAKE, anyone_near
 from coachable.envs.racing.race.observation import own_columns
 from coachable.keys import STYLE_FEATURES
@@ -29,7 +29,7 @@ def racing_events(family: str = "resources") -> PredicateEvents:
     Raises:
         ValueError: if there is no such family.
     """
-    check_family(family)
+    racing_family(family)  # raises if there is none
     tables = {"recovery": _off_course}
     if family == "aggressiveness":
         tables |= {"contact": _contact, "overtake": _overtake, "slipstream": _slipstream}

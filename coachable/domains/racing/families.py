@@ -109,23 +109,14 @@ _FAMILIES = {
 FAMILIES = tuple(_FAMILIES)
 
 
-def check_family(family: str) -> None:
-    """Refuses what is no family of styles.
+def racing_family(family: str) -> Family:
+    """Return the family of that name.
 
     Raises:
         ValueError: naming the families.
     """
     if family not in _FAMILIES:
         raise ValueError(f"unknown family {family!r}: expected drift, resources or aggressiveness")
-
-
-def racing_family(family: str) -> Family:
-    """The family of that name.
-
-    Raises:
-        ValueError: naming the families.
-    """
-    check_family(family)
     return _FAMILIES[family]
 
 

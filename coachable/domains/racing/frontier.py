@@ -33,6 +33,7 @@ from coachable.envs.racing.physics.powertrain import (
 )
 from coachable.envs.racing.physics.tyres import WEAR_ENERGY
 from coachable.envs.racing.race.driver import line_geometry
+from coachable.evaluation.figures import drawing
 
 STAGE = 6.0  # [m], about
 SPEEDS = np.linspace(12.0, 100.0, 353)  # [m/s]
@@ -254,30 +255,23 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def draw(curves: Sequence[Rows], path: Path) -> None:
     """Range gained against seconds lost per lap, one curve per car and resource."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 4.2), dpi=120)
-    axes = figure.add_subplot()
     styles = {("tyre", 2.5): "-", ("fuel", 2.5): "--", ("fuel", 1.0): ":"}
-    for rows in curves:
-        first = rows[0]
-        label = "tyre life" if first["resource"] == "tyre" else f"fuel range, n = {first['fuel_exponent']:g}"
-        axes.plot(
-            [row["seconds_lost"] for row in rows],
-            [100 * row["range_gain"] for row in rows],
-            styles[first["resource"], first["fuel_exponent"]],
-            color={"gt3": "#1f77b4", "x2019": "#d62728"}[first["car"]],
-            marker="o",
-            markersize=3,
-            label=f"{first['car']}, {label}",
-        )
-    axes.set(xlim=(0, 6), ylim=(0, 120), xlabel="lap time lost [s]", ylabel="range gained [%]")
-    axes.set_title("Lakeside: what a point mass can trade (n = 2.5 is the game-like fuel law)", fontsize=10)
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
-    figure.tight_layout()
-    FigureCanvasAgg(figure).print_png(path)
+    with drawing(path, size=(7.0, 4.2)) as ((axes,),):
+        for rows in curves:
+            first = rows[0]
+            label = "tyre life" if first["resource"] == "tyre" else f"fuel range, n = {first['fuel_exponent']:g}"
+            axes.plot(
+                [row["seconds_lost"] for row in rows],
+                [100 * row["range_gain"] for row in rows],
+                styles[first["resource"], first["fuel_exponent"]],
+                color={"gt3": "#1f77b4", "x2019": "#d62728"}[first["car"]],
+                marker="o",
+                markersize=3,
+                label=f"{first['car']}, {label}",
+            )
+        axes.set(xlim=(0, 6), ylim=(0, 120), xlabel="lap time lost [s]", ylabel="range gained [%]")
+        axes.set_title("Lakeside: what a point mass can trade (n = 2.5 is the game-like fuel law)", fontsize=10)
+        axes.legend(fontsize=8)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from coachable.domains.racing.families import check_family
+from coachable.domains.racing.families import racing_family
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
 from coachable.envs.racing.race.features import DRIFT, FUEL, NEAR_DISTANCE, TIRE, anyone_near, gap_columns
 from coachable.envs.racing.race.observation import own_columns
@@ -38,7 +38,7 @@ class RacingMeasures:
     """
 
     def __init__(self, family: str) -> None:
-        check_family(family)
+        racing_family(family)  # raises if there is none
         self.family = family
         self.needs = _NEEDS[family]
 

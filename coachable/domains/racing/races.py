@@ -6,13 +6,11 @@ first ("leader"), as in Werner et al. (2023).
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import matplotlib
 import numpy as np
 import torch
 from tensordict import TensorDictBase
@@ -24,13 +22,11 @@ from coachable.envs.racing.race.features import anyone_beside
 from coachable.envs.racing.race.run import Run
 from coachable.envs.racing.race.scenarios import rolling_start
 from coachable.evaluation.evaluation_settings import EvaluationSettings
+from coachable.evaluation.figures import drawing, shade
 from coachable.evaluation.rollouts import record_episodes
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation, wilson_interval
-from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_csv
+from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_results
 from coachable.keys import STYLE_FEATURES
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
 
 if TYPE_CHECKING:
     from coachable.domain import Domain
@@ -63,12 +59,7 @@ class _RaceMeasures(TelemetryMeasures):
         return super().step(transition) | {"beside": beside.float()}
 
 
-def evaluate_aggressiveness(
-    domain: Domain,
-    agent: LoadedPolicy,
-    out: Path,
-    settings: EvaluationSettings,
-) -> str:
+def evaluate_aggressiveness(domain: Domain, agent: LoadedPolicy, out: Path, settings: EvaluationSettings) -> str:
     """Race pairs with rising lateral margins against three other copies of the agent.
 
     Files: `races.csv` (by setting and margin), `radar.png`, `report.md`, `summary.json`.
@@ -99,12 +90,8 @@ def evaluate_aggressiveness(
         for setting in SETTINGS
     }
     summary |= {"races_per_row": len(OTHERS) * episodes, "seed": seed}
-    write_csv(rows, out / "races.csv")
     draw_radar(rows, out / "radar.png")
-    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
-    report = _report(agent, rows, summary)
-    (out / "report.md").write_text(report)
-    return report
+    return write_results(out, _report(agent, rows, summary), summary, {"races": rows})
 
 
 def _race(
@@ -198,7 +185,6 @@ def race_alike(
         seed=settings.seed,
         progress=f"{races} races of {cars} cars" if settings.progress else None,
     )
-    env.close()
     measured = {name: values.reshape(-1, cars, races) for name, values in record.measures.items()}
     by_slot = {name: values.gather(1, car_at.expand_as(values)) for name, values in measured.items()}
     return by_slot, simulation.course.length
@@ -259,29 +245,25 @@ def _rows(cells: Sequence[tuple[str, float]], found: Mapping[str, np.ndarray]) -
 def draw_radar(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """One radar per setting, one polygon per margin; every axis runs from the lowest to the highest value on it."""
     angles = np.linspace(0.0, 2.0 * np.pi, len(_METRICS), endpoint=False) + np.pi / 2
-    figure, axes = plt.subplots(
-        1, len(SETTINGS), figsize=(9.5, 4.6), subplot_kw={"projection": "polar"}, layout="constrained"
-    )
-    for panel, setting in zip(axes, SETTINGS, strict=True):
-        own = [row for row in rows if row["setting"] == setting]
-        table = np.array([[row[name] for name in _METRICS] for row in own])
-        low, high = table.min(0), table.max(0)
-        scaled = 0.15 + 0.85 * (table - low) / np.maximum(high - low, 1e-9)
-        for index, row in enumerate(own):
-            color = plt.get_cmap("viridis")(0.9 * index / max(len(own) - 1, 1))
-            closed = np.append(scaled[index], scaled[index, 0])
-            panel.plot(
-                np.append(angles, angles[0]), closed, color=color, marker="o", ms=3, label=f"{row['lateral']:g} m"
-            )
-        labels = [f"{text}\n{a:.2f} to {b:.2f}" for text, a, b in zip(_METRICS.values(), low, high, strict=True)]
-        panel.set_xticks(angles, labels, fontsize=8)
-        panel.tick_params(axis="x", pad=26)  # clear of the circle, left and right
-        panel.set_yticks([])
-        panel.set_ylim(0.0, 1.05)
-        panel.set_title(setting)
-    axes[-1].legend(title="lateral margin", loc="upper left", bbox_to_anchor=(1.1, 1.0), fontsize=8)
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
+    with drawing(path, 1, len(SETTINGS), size=(9.5, 4.6), grid=False, subplot_kw={"projection": "polar"}) as panels:
+        for panel, setting in zip(panels[0], SETTINGS, strict=True):
+            own = [row for row in rows if row["setting"] == setting]
+            table = np.array([[row[name] for name in _METRICS] for row in own])
+            low, high = table.min(0), table.max(0)
+            scaled = 0.15 + 0.85 * (table - low) / np.maximum(high - low, 1e-9)
+            for index, row in enumerate(own):
+                color = shade(index, len(own))
+                closed = np.append(scaled[index], scaled[index, 0])
+                panel.plot(
+                    np.append(angles, angles[0]), closed, color=color, marker="o", ms=3, label=f"{row['lateral']:g} m"
+                )
+            labels = [f"{text}\n{a:.2f} to {b:.2f}" for text, a, b in zip(_METRICS.values(), low, high, strict=True)]
+            panel.set_xticks(angles, labels, fontsize=8)
+            panel.tick_params(axis="x", pad=26)  # clear of the circle, left and right
+            panel.set_yticks([])
+            panel.set_ylim(0.0, 1.05)
+            panel.set_title(setting)
+        panels[0, -1].legend(title="lateral margin", loc="upper left", bbox_to_anchor=(1.1, 1.0), fontsize=8)
 
 
 def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Mapping[str, Any]) -> str:

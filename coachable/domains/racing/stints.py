@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import matplotlib
 import numpy as np
 import torch
 
@@ -20,12 +18,10 @@ from coachable.envs.racing.physics.cars import Resources
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
 from coachable.envs.racing.race.scenarios import Conditions, Scenario
 from coachable.evaluation.evaluation_settings import EvaluationSettings
-from coachable.evaluation.rollouts import record_episodes
+from coachable.evaluation.figures import drawing, shade
+from coachable.evaluation.rollouts import record_styles
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
-from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_csv
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
+from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_results
 
 if TYPE_CHECKING:
     from coachable.domain import Domain
@@ -64,12 +60,7 @@ class Stint:
         return float(flying.mean()) if len(flying) else float("nan")
 
 
-def evaluate_resources(
-    domain: Domain,
-    agent: LoadedPolicy,
-    out: Path,
-    settings: EvaluationSettings,
-) -> str:
+def evaluate_resources(domain: Domain, agent: LoadedPolicy, out: Path, settings: EvaluationSettings) -> str:
     """Drive stints under rising weights of one resource at a time, and a time trial without any.
 
     As in the paper, the other resource is switched off. Files: `stints.csv` (by resource and weight), `laps.csv` (every
@@ -90,8 +81,8 @@ def evaluate_resources(
     out.mkdir(parents=True, exist_ok=True)
     trained, episodes, seed = agent.config.get("env", {}), settings.episodes, settings.seed
     car, track = trained.get("car", "x2019"), trained.get("track", "lakeside")
-    rates = Resources.calibrated(car)
-    options: dict[str, Any] = {"steps": settings.steps or STINT_STEPS, "seed": seed, "progress": settings.progress}
+    rates, length = Resources.calibrated(car), load_track(track).length
+    options: dict[str, Any] = {**settings.rollout, "steps": settings.steps or STINT_STEPS}
     rows: list[dict[str, Any]] = []
     every: list[dict[str, Any]] = []
     frontiers: dict[str, list[dict[str, float]]] = {}
@@ -100,8 +91,8 @@ def evaluate_resources(
         frontiers[resource] = frontier(track, car, resource)
         high = dict(zip(agent.space.names, agent.space.high.tolist(), strict=True))[name]
         cells = [{name: share * high} for share in SHARES]
-        conditions = Conditions(fuel=TANK, heat=_COLD)
-        stints = _drive(domain, agent, cells, episodes, only, conditions, resource, label=resource, **options)
+        asked = {"resources": only, "conditions": Conditions(fuel=TANK, heat=_COLD), **options}
+        stints = _drive(domain, agent, cells, episodes, resource, label=resource, length=length, **asked)
         rows += _rows(resource, [cell[name] for cell in cells], stints, frontiers[resource])
         for cell, group in zip(cells, stints, strict=True):
             for number, stint in enumerate(group):
@@ -110,27 +101,22 @@ def evaluate_resources(
                     | {"time": float(time), "left": float(stint.left[lap]), "clean": bool(stint.clean[lap])}
                     for lap, time in enumerate(stint.laps)
                 ]
-    options["steps"] = min(options["steps"], TRIAL_STEPS)
-    [trial] = _drive(
-        domain, agent, [{}], max(episodes, 10), rates, Conditions(fuel=TANK / 2), "fuel", label="trial", **options
-    )
+    options |= {
+        "steps": min(options["steps"], TRIAL_STEPS),
+        "resources": rates,
+        "conditions": Conditions(fuel=TANK / 2),
+    }
+    [trial] = _drive(domain, agent, [{}], max(episodes, 10), "fuel", label="trial", length=length, **options)
     summary = _summary(rows, trial, frontiers["fuel"][0]["lap_time"], episodes, seed)
     traffic = race_in_traffic(domain, agent, settings) if trained.get("cars", 1) > 1 else []
-    if traffic:
-        summary["traffic"] = traffic_response(traffic)
-        write_csv(traffic, out / "traffic.csv")
-        draw_traffic(traffic, out / "traffic.png")
-    write_csv(rows, out / "stints.csv")
-    if every:
-        write_csv(every, out / "laps.csv")
-    draw_stints(every, out / "stints.png")
-    draw_tradeoff(rows, frontiers, out / "tradeoff.png")
-    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     report = _report(agent, rows, summary, seed, episodes)
     if traffic:
+        summary["traffic"] = traffic_response(traffic)
         report += traffic_report(traffic, summary["traffic"])
-    (out / "report.md").write_text(report)
-    return report
+        draw_traffic(traffic, out / "traffic.png")
+    draw_stints(every, out / "stints.png")
+    draw_tradeoff(rows, frontiers, out / "tradeoff.png")
+    return write_results(out, report, summary, {"stints": rows, "laps": every, "traffic": traffic})
 
 
 def frontier(track: str, car: str, resource: str) -> list[dict[str, float]]:
@@ -152,36 +138,29 @@ def _drive(
     agent: LoadedPolicy,
     cells: Sequence[Mapping[str, float]],
     episodes: int,
-    rates: Resources,
-    conditions: Conditions,
     resource: str,
     *,
     label: str,
-    steps: int,
-    seed: int,
-    progress: bool,
+    length: float,
+    **options: Any,
 ) -> list[list[Stint]]:
-    """Stints of each cell, each from its own place on the track."""
+    """Drive the stints of each cell, each from its own place on a track of a length [m]."""
     space, count = agent.space, len(cells) * episodes
     theta = torch.stack([space.make(strict=True, **cell) for cell in cells]).repeat_interleave(episodes, 0)
-    env = domain.styled_env(
-        space, count, seed, scenarios=_SOLO, conditions=conditions, resources=rates, episode_steps=steps + 1
-    )
-    simulation: Any = env.base_env
-    bar = f"{label}: {count} stints" if progress else None
-    record = record_episodes(
-        env,
+    record = record_styles(
+        domain,
         agent.actor,
+        space,
         theta,
-        TelemetryMeasures("distance", "fuel", "wear", "off"),
-        steps=steps,
-        seed=seed,
-        progress=bar,
+        f"{label}: {count} stints",
+        measures=TelemetryMeasures("distance", "fuel", "wear", "off"),
+        scenarios=_SOLO,
+        episode_steps=options["steps"] + 1,
+        **options,
     )
-    env.close()
     measured = {name: values.double().numpy() for name, values in record.measures.items()}
     alive = record.alive.numpy()
-    stints = [_stint(measured, alive, row, simulation.course.length, resource) for row in range(count)]
+    stints = [_stint(measured, alive, row, length, resource) for row in range(count)]
     return [stints[i * episodes : (i + 1) * episodes] for i in range(len(cells))]
 
 
@@ -278,48 +257,41 @@ def _summary(
 
 def draw_stints(laps: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Resource left and lap times over laps, one column per resource, one line per weight (means over stints)."""
-    figure, axes = plt.subplots(2, len(WEIGHTS), figsize=(9.5, 6.4), squeeze=False, layout="constrained")
     labels = {"fuel": "fuel left [l]", "tyre": "mean tyre wear"}
-    for column, (resource, name) in enumerate(WEIGHTS.items()):
-        own = [lap for lap in laps if lap["resource"] == resource]
-        weights = sorted({lap["weight"] for lap in own})
-        for index, weight in enumerate(weights):
-            color = plt.get_cmap("viridis")(0.9 * index / max(len(weights) - 1, 1))
-            numbers = sorted({lap["lap"] for lap in own if lap["weight"] == weight})
-            for row, key in enumerate(("left", "time")):
-                means = [
-                    np.mean([lap[key] for lap in own if lap["weight"] == weight and lap["lap"] == number])
-                    for number in numbers
-                ]
-                axes[row, column].plot(numbers, means, marker="o", ms=3, color=color, label=f"{name} {weight:g}")
-        axes[0, column].set(
-            ylabel=labels[resource], title=f"{resource} ({'tyre wear' if column == 0 else 'fuel use'} off)"
-        )
-        axes[1, column].set(xlabel="lap", ylabel="lap time [s]")
-        for panel in axes[:, column]:
-            panel.grid(alpha=0.3)
-        axes[0, column].legend(fontsize=8)
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
+    with drawing(path, 2, len(WEIGHTS), size=(9.5, 6.4)) as axes:
+        for column, (resource, name) in enumerate(WEIGHTS.items()):
+            own = [lap for lap in laps if lap["resource"] == resource]
+            weights = sorted({lap["weight"] for lap in own})
+            for index, weight in enumerate(weights):
+                color = shade(index, len(weights))
+                numbers = sorted({lap["lap"] for lap in own if lap["weight"] == weight})
+                for row, key in enumerate(("left", "time")):
+                    means = [
+                        np.mean([lap[key] for lap in own if lap["weight"] == weight and lap["lap"] == number])
+                        for number in numbers
+                    ]
+                    axes[row, column].plot(numbers, means, marker="o", ms=3, color=color, label=f"{name} {weight:g}")
+            axes[0, column].set(
+                ylabel=labels[resource], title=f"{resource} ({'tyre wear' if column == 0 else 'fuel use'} off)"
+            )
+            axes[1, column].set(xlabel="lap", ylabel="lap time [s]")
+            axes[0, column].legend(fontsize=8)
 
 
 def draw_tradeoff(
     rows: Sequence[Mapping[str, Any]], frontiers: Mapping[str, Sequence[Mapping[str, float]]], path: Path
 ) -> None:
     """Range over lap time, the agent's beside the frontier's."""
-    figure, panels = plt.subplots(1, len(frontiers), figsize=(9.5, 4.0), squeeze=False, layout="constrained")
-    for axes, (resource, bound) in zip(panels[0], frontiers.items(), strict=True):
-        own = [row for row in rows if row["resource"] == resource]
-        times, ranges = ([point[name] for point in bound] for name in ("lap_time", "range_km"))
-        axes.plot(times, ranges, ls="--", label="point mass on a fixed line")
-        axes.plot([row["lap_time"] for row in own], [row["range_km"] for row in own], marker="o", label="agent")
-        for row in own:
-            axes.annotate(f"{row['weight']:.0f}", (row["lap_time"], row["range_km"]), fontsize=8)
-        axes.set(xlabel="lap time [s]", ylabel="range [km]", title=f"{resource}, weight beside each point")
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=8)
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
+    with drawing(path, 1, len(frontiers), size=(9.5, 4.0)) as panels:
+        for axes, (resource, bound) in zip(panels[0], frontiers.items(), strict=True):
+            own = [row for row in rows if row["resource"] == resource]
+            times, ranges = ([point[name] for point in bound] for name in ("lap_time", "range_km"))
+            axes.plot(times, ranges, ls="--", label="point mass on a fixed line")
+            axes.plot([row["lap_time"] for row in own], [row["range_km"] for row in own], marker="o", label="agent")
+            for row in own:
+                axes.annotate(f"{row['weight']:.0f}", (row["lap_time"], row["range_km"]), fontsize=8)
+            axes.set(xlabel="lap time [s]", ylabel="range [km]", title=f"{resource}, weight beside each point")
+            axes.legend(fontsize=8)
 
 
 def _report(

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import matplotlib
 import numpy as np
 import torch
 from tensordict import TensorDictBase
@@ -17,12 +16,10 @@ from coachable.domains.racing.races import race_alike
 from coachable.envs.racing.race.features import DEFEND, OVERTAKE
 from coachable.envs.racing.race.scenarios import Conditions, Scenario
 from coachable.evaluation.evaluation_settings import EvaluationSettings
+from coachable.evaluation.figures import drawing
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
 from coachable.evaluation.style_grid import markdown_table
 from coachable.keys import STYLE_FEATURES
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
 
 if TYPE_CHECKING:
     from coachable.domain import Domain
@@ -122,18 +119,15 @@ def traffic_report(rows: Sequence[dict[str, Any]], response: dict[str, dict[str,
 
 def draw_traffic(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """Metres and places gained over the weight that asks for them, with 95 % intervals."""
-    figure, panels = plt.subplots(2, len(SLOTS), figsize=(9.5, 6.4), layout="constrained", sharex=True)
     titles = {"overtake": "on cars ahead, starting last", "defend": "on cars behind, starting first"}
-    for column, name in zip(panels.T, SLOTS, strict=True):
-        own = [row for row in rows if row["sweep"] == name]
-        weights = [row["weight"] for row in own]
-        for axes, measure, unit in zip(column, (name, "places_gained"), ("metres", "places"), strict=True):
-            low, high = ([row[f"{measure}_{end}"] for row in own] for end in ("low", "high"))
-            axes.plot(weights, [row[measure] for row in own], marker="o")
-            axes.fill_between(weights, low, high, alpha=0.2)
-            axes.set(ylabel=f"{unit} gained in a minute")
-            axes.grid(alpha=0.3)
-        column[0].set(title=titles[name])
-        column[1].set(xlabel=f"weight of {name}")
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
+    with drawing(path, 2, len(SLOTS), size=(9.5, 6.4), sharex=True) as panels:
+        for column, name in zip(panels.T, SLOTS, strict=True):
+            own = [row for row in rows if row["sweep"] == name]
+            weights = [row["weight"] for row in own]
+            for axes, measure, unit in zip(column, (name, "places_gained"), ("metres", "places"), strict=True):
+                low, high = ([row[f"{measure}_{end}"] for row in own] for end in ("low", "high"))
+                axes.plot(weights, [row[measure] for row in own], marker="o")
+                axes.fill_between(weights, low, high, alpha=0.2)
+                axes.set(ylabel=f"{unit} gained in a minute")
+            column[0].set(title=titles[name])
+            column[1].set(xlabel=f"weight of {name}")

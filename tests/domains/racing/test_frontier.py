@@ -17,7 +17,13 @@ from coachable.envs.racing.race.driver import line_geometry
 
 
 @pytest.fixture
-def coarse_speeds(monkeypatch):
+def long_stages(monkeypatch):
+    """Half as many stages of a lap."""
+    monkeypatch.setattr(frontier, "STAGE", 2 * frontier.STAGE)
+
+
+@pytest.fixture
+def coarse_speeds(monkeypatch, long_stages):
     """A quarter as many: enough to compare prices."""
     monkeypatch.setattr(frontier, "SPEEDS", frontier.SPEEDS[::4])
 
@@ -46,7 +52,7 @@ def test_centre_line_laps_are_those_of_the_specification(name, expected):
 def test_a_higher_price_saves_more_and_costs_more(car, resource, coarse_speeds):
     programme, free = lakeside(car)
     scale = {"tyre": free.wear, "fuel": free.fuel}[resource]
-    laps = programme.laps(resource, [0.0, 2.0 / scale, 8.0 / scale, 30.0 / scale])
+    laps = programme.laps(resource, [0.0, 3.0 / scale, 30.0 / scale])
     times = [lap.time for lap in laps]
     used = [{"tyre": lap.wear, "fuel": lap.fuel}[resource] for lap in laps]
     assert times[0] == pytest.approx(free.time, abs=1e-9)
@@ -65,7 +71,7 @@ def test_a_ring_is_driven_at_the_speed_that_friction_allows():
 
 
 @pytest.mark.parametrize("car", ["gt3", "x2019"])
-def test_a_stint_lasts_about_ten_laps(car):
+def test_a_stint_lasts_about_ten_laps(car, long_stages):
     """An uncoached lap: the fastest of the programme on its own line."""
     programme = LapProgramme(load_track("lakeside"), load_car(car), Resources.calibrated(car), fuel=TANK / 2)
     [lap] = programme.laps("fuel", [0.0])

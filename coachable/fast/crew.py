@@ -1,0 +1,64 @@
+"""Threads that work on the independent parts of an update side by side."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+
+import torch
+
+__all__ = ["crew", "crew_size", "share_out"]
+
+_size = 1
+
+
+def crew_size() -> int:
+    """Return how many threads share the work: 1 outside of :func:`crew`."""
+    return _size
+
+
+@contextmanager
+def crew(largest: int) -> Iterator[None]:
+    """Let as many threads as torch has share the work inside the block, while torch itself uses one.
+
+    The kernels release Python's lock, so that threads of Python suffice. Torch's own threads would wait for the next
+    operation in a loop that takes a core from the others.
+
+    Args:
+        largest: With more threads than this nothing changes.
+    """
+    global _size
+    threads = torch.get_num_threads()
+    if not 1 < threads <= largest or _size > 1:
+        yield
+        return
+    torch.set_num_threads(1)
+    _size = threads
+    try:
+        yield
+    finally:
+        _size = 1
+        torch.set_num_threads(threads)
+
+
+def share_out(calls: Sequence[Callable[[], None]]) -> None:
+    """Make all calls, each on a thread of the crew, the first one on this thread."""
+    if _size == 1 or len(calls) == 1:
+        for call in calls:
+            call()
+        return
+    pool = _pool(_size - 1)
+    others = [pool.submit(call) for call in calls[1:]]
+    try:
+        calls[0]()
+    finally:
+        for other in others:
+            other.result()
+
+
+@functools.cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    # Torch remembers its number of threads for each calling thread.
+    return ThreadPoolExecutor(threads, "crew", initializer=functools.partial(torch.set_num_threads, 1))
