@@ -97,7 +97,7 @@ class HumanoidEnv(EnvBase):
         self.gait = GaitTracker.create(num_envs, step_max)
         self.course = np.zeros(num_envs)
         self.steps = np.zeros(num_envs, dtype=np.int64)
-        self.costs = dict(costs or {})
+        self.costs = {name: weight for name, weight in (costs or {}).items() if weight}
         self.push_force, self._push_chance = push_force, CONTROL_STEP / push_interval
         self.push = np.zeros((num_envs, 3))
         self._push_left = np.zeros(num_envs, dtype=np.int64)
