@@ -38,6 +38,7 @@ RANGES: dict[str, Range] = {entry.name: entry.metadata["range"] for entry in fie
     "axes": AMOUNT,
     "num_outputs": COUNT,
     "head_gain": NOT_NEGATIVE,
+    "dropout": Range("[0, 1)"),
     # learner, beyond what the configuration lists
     "alpha_lr": NOT_NEGATIVE,
     "check_every": AMOUNT,
