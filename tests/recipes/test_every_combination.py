@@ -80,7 +80,9 @@ def test_the_papers_racing_learns_with_dropout_and_acts_without(tmp_path):
     tiny = ["preset=paper", "device=cpu", "env.num_envs=3", "network.actor.widths=[8,8]", "network.critic.widths=[8]"]
     tiny += ["replay_capacity=300", "init_random_frames=0", "train.warmup_frames=3", "train.total_frames=18"]
     tiny += ["train.utd_ratio=0.25", "n_steps=2", "train.batch_size=8", "threads.learner=1"]
-    train = import_module("racing_qr_sac").build(compose_config("racing_qr_sac", [*TINY, *tiny, f"run_dir={tmp_path}"]))
+    train = import_module("racing_qr_sac").build(
+        compose_config("racing_qr_sac", [*TINY[1:], *tiny, f"run_dir={tmp_path}"])
+    )
     policy = train.collector.policy
     dropped = []
     for module in policy.modules():
