@@ -18,6 +18,7 @@ from coachable.evaluation.runs import describe
 from coachable.evaluation.style_grid import StyleGrid, mean_of, measured_column, published
 from coachable.styles import Choice, StyleSpace
 
+_PANELS_PER_ROW = 4
 MARKERS = "osD^vP*X"  # distinguishable without colour as well
 
 
@@ -65,8 +66,12 @@ def draw_style_grid(grid: StyleGrid, domain: Domain, space: StyleSpace, path: Pa
     columns = {measured_column(name, grid.cells[0]): name for name in grid.episodes}
     names = [columns[column] for column in formats if column in columns and columns[column] not in space]
     names = [name for name in ((axis,) if axis in grid.episodes else ()) + tuple(names) if name != f"{axis}_error"]
-    with drawing(path, 1, len(names), size=(4.2 * len(names), 3.8)) as axes:
-        for panel, name in zip(axes[0], names, strict=True):
+    wide = min(len(names), _PANELS_PER_ROW)
+    high = -(-len(names) // wide)
+    with drawing(path, high, wide, size=(4.2 * wide, 3.8 * high)) as axes:
+        for panel in axes.flat[len(names) :]:
+            panel.set_axis_off()
+        for panel, name in zip(axes.flat, names, strict=False):
             column = measured_column(name, grid.cells[0])
             for index, (label, cells) in enumerate((lines or {"": list(range(len(grid.cells)))}).items()):
                 x = np.array([grid.cells[i][axis] for i in cells] if axis else cells, dtype=float)
@@ -77,8 +82,8 @@ def draw_style_grid(grid: StyleGrid, domain: Domain, space: StyleSpace, path: Pa
                 style: dict[str, Any] = {"marker": MARKERS[index], "ls": "-" if axis else "", "label": label or None}
                 panel.errorbar(x + offset, values, error, capsize=2, ms=5, **style)
             if name == axis:
-                low, high = space[name].low, space[name].high
-                panel.plot([low, high], [low, high], color="0.6", ls="--", lw=1, label="as requested")
+                bounds = [space[name].low, space[name].high]
+                panel.plot(bounds, bounds, color="0.6", ls="--", lw=1, label="as requested")
                 panel.set_ylabel(f"measured {_with_unit(name, space[name].unit)}")
             else:
                 panel.set_ylabel(_with_unit(name, domain.units.get(name, "")))

@@ -23,6 +23,7 @@ from coachable.training.weights import domain_of, load_policy
 
 VIDEO_SUFFIXES = (".mp4", ".gif", ".png")
 _GIF_FPS = 20
+_MEASURES_IN_CAPTION = 4  # as many as fit
 CAPTION = 44  # [px]
 _SMALLEST = (64, CAPTION + 16)  # [px]
 _LARGEST = 4096  # [px]
@@ -183,7 +184,8 @@ def _measured_line(domain: Domain, recent: list[dict[str, Tensor]], failures: in
     measured = domain.measures.summarise(record, torch.ones(len(window), 1, dtype=torch.bool))
     wanted = [name.removeprefix("measured_") for name in domain.columns]
     published = {name: value for name, value in measured.items() if name in wanted} or measured
-    shown = ", ".join(f"{k} {v.item():.2f}" for k, v in published.items() if not bool(v.isnan().any()))
+    known = [f"{name} {value.item():.2f}" for name, value in published.items() if not bool(value.isnan().any())]
+    shown = ", ".join(known[:_MEASURES_IN_CAPTION])
     return f"last 2 s: {shown}; failures {failures}".replace("_", " ")
 
 
