@@ -1,14 +1,16 @@
-"""Updates per second of the learner and of its peers, alternating, in one table.
+"""Time of an update of the learner and of its peers, alternating, in one table.
 
     python benchmarks/learner.py --peers /path/to/peers-venv/bin/python
 
-Every contestant is a process of its own (`learner_workers.py`); they take turns in rounds of a few updates. The table
-gives medians over the rounds: CPU time with one thread, wall time with more. The last column is what the update's
-matrix products would need at the rate that large bfloat16 products reach here, as a share of the update.
+Every contestant is a process of its own for each number of threads (`learner_workers.py`); they take turns in rounds of
+a few updates. The table gives medians of the wall time over the rounds. Contestants with `resnet` in their names have
+the networks of `coachable`: residual, with layer norm. The others have plain ReLU networks of the same widths, which is
+less work. The gain of `matmul-bf16`, large products of matrices, is what the processor gives a further thread.
 """
 
 import argparse
 import json
+import platform
 import statistics
 import sys
 from pathlib import Path
@@ -17,40 +19,79 @@ from contest import Worker, measure
 from learner_workers import MATMUL_FLOPS, PEERS, WORKERS, flops_per_update
 
 OURS, YARDSTICK = "coachable-bf16", "matmul-bf16"
+DEFAULT = (
+    OURS,
+    "single-file-resnet-bf16",
+    "single-file-bf16",
+    "torchrl-resnet",
+    "torchrl",
+    "sb3",
+    "sbx-8",
+    YARDSTICK,
+)
 
 
-def table(seconds: dict[str, list[float]]) -> str:
-    """Medians, rates, ratios to ours, and the share of the rate of large matrix products."""
-    median = {name: statistics.median(t) for name, t in seconds.items()}
-    rate = MATMUL_FLOPS / median[YARDSTICK] if YARDSTICK in median else None
-    lines = ["| contestant | ms / update | updates / s | ours is faster by | of large bf16 products |", "|-|-|-|-|-|"]
-    for name, time in median.items():
-        if name.startswith("matmul"):
-            lines.append(f"| {name} | {MATMUL_FLOPS / time / 1e9:.0f} GFLOP/s | | | |")
-            continue
-        ratio = f"{time / median[OURS]:.2f}" if OURS in median else ""
-        share = f"{flops_per_update() / time / rate:.2f}" if rate else ""
-        lines.append(f"| {name} | {1e3 * time:.1f} | {1 / time:.1f} | {ratio} | {share} |")
+def table(seconds: dict[int, dict[str, list[float]]]) -> str:
+    """Return medians, the gain of further threads, and how much faster ours is, for each number of threads.
+
+    Args:
+        seconds: By number of threads and contestant, the seconds of an update in each round.
+    """
+    median = {n: {name: statistics.median(times) for name, times in run.items()} for n, run in seconds.items()}
+    few, *more = median
+    columns = [f"ms with {n} thread{'s' * (n > 1)}" for n in median]
+    columns += [f"gain of {n} threads" for n in more]
+    columns += [f"ours is faster by, {n} thread{'s' * (n > 1)}" for n in median]
+    lines = ["| contestant | " + " | ".join(columns) + " |", "|-" * (1 + len(columns)) + "|"]
+    for name in median[few]:
+        product = name.startswith("matmul")
+        times = [run[name] for run in median.values()]
+        cells = [f"{MATMUL_FLOPS / t / 1e9:.0f} GFLOP/s" if product else f"{1e3 * t:.1f}" for t in times]
+        cells += [f"{times[0] / t:.2f}" for t in times[1:]]
+        cells += ["" if product or OURS not in run else f"{run[name] / run[OURS]:.2f}" for run in median.values()]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+def share_of_products(seconds: dict[str, list[float]]) -> float:
+    """Return the time of an update's matrix products, at the rate of large ones, over the time of the update."""
+    update, product = (statistics.median(seconds[name]) for name in (OURS, YARDSTICK))
+    return flops_per_update() / update / (MATMUL_FLOPS / product)
+
+
+def processor() -> str:
+    """Return the processor's name and its family and model, which tell apart what shares a name."""
+    try:
+        lines = [line.split(":") for line in Path("/proc/cpuinfo").read_text().splitlines() if ":" in line]
+    except OSError:
+        return platform.processor()
+    known = {key.strip(): value.strip() for key, value in reversed(lines)}
+    return f"{known.get('model name', platform.processor())}, family {known.get('cpu family')}, {known.get('model')}"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--peers", default=sys.executable, help="interpreter with stable-baselines3 and sbx-rl")
-    parser.add_argument("--only", nargs="*", choices=list(WORKERS), default=list(WORKERS))
-    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--only", nargs="*", choices=list(WORKERS), default=DEFAULT, metavar="NAME", help="contestants")
+    parser.add_argument("--threads", type=int, nargs="*", default=[1, 2])
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--updates", type=int, default=8, help="per round and contestant, a multiple of 8")
     parser.add_argument("--json", type=Path, help="where to write the seconds of every round")
     args = parser.parse_args()
     python = {name: args.peers if name in PEERS else sys.executable for name in args.only}
-    workers = [Worker("learner_workers.py", name, python[name], args.threads) for name in args.only]
     work = {name: 4 if name.startswith("matmul") else args.updates for name in args.only}
-    clock = "cpu" if args.threads == 1 else "wall"
-    times = measure(workers, args.rounds, work)
-    seconds = {name: [spent[clock] for spent in rounds] for name, rounds in times.items()}
-    print(f"{args.threads} thread(s), {clock} time, {args.rounds} rounds, medians\n")
+    seconds = {}
+    for threads in args.threads:
+        workers = [Worker("learner_workers.py", name, python[name], threads) for name in args.only]
+        times = measure(workers, args.rounds, work)
+        seconds[threads] = {name: [spent["wall"] for spent in rounds] for name, rounds in times.items()}
+    print(f"{processor()}; SAC, batch 256, 3 x 512, wall time, medians of {args.rounds} rounds\n")
     print(table(seconds))
+    for threads, run in seconds.items():
+        if {OURS, YARDSTICK} <= set(run):
+            print(
+                f"\nProducts at the rate of {YARDSTICK}, {threads} thread(s): {share_of_products(run):.2f} of an update"
+            )
     if args.json:
         args.json.write_text(json.dumps(seconds))
 

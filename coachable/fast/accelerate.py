@@ -128,6 +128,8 @@ class Acceleration(Backend):
         for parameter, grad in self._trained:
             parameter.grad = grad
         loss._vmap_qnetworkN0 = self._ensemble
+        # The plans hold the policy's parameters, so that swapping them into its modules would change nothing.
+        vars(loss.actor_network_params)["to_module"] = lambda *_, **__: nullcontext()
         for name, network in self._policies.items():
             use_plan(network, self._actor_plans[name])
         try:
@@ -135,6 +137,7 @@ class Acceleration(Backend):
                 yield
         finally:
             loss._vmap_qnetworkN0 = ordinary
+            del vars(loss.actor_network_params)["to_module"]
             for network in self._policies.values():
                 use_plan(network, None)
             for parameter, _ in self._trained:
