@@ -74,7 +74,7 @@ def _support(nx: Tensor, ny: Tensor, body: Bodies) -> tuple[Tensor, Tensor]:
 
 
 def overlap(a: Bodies, b: Bodies) -> Overlap:
-    """Return the overlap of two rectangles along the axis of least depth, at the deepest vertex (separating axis test)."""
+    """Return the overlap of two rectangles at the deepest vertex, along the axis of least depth (separating axes)."""
     dx, dy = a.x - b.x, a.y - b.y
     depth, nx, ny, ours = None, a.cos, a.sin, None
     for owner, (ex, ey) in ((0, (a.cos, a.sin)), (0, (-a.sin, a.cos)), (1, (b.cos, b.sin)), (1, (-b.sin, b.cos))):
