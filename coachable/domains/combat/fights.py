@@ -1,4 +1,4 @@
-"""What a fighter does under every style: damage matrix, wins, parts, response to a weight, switches (paper)."""
+"""Evaluation of fights in every style: damage matrix, wins, parts, response to a weight, and switches (paper)."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ if TYPE_CHECKING:
     from coachable.training.weights import LoadedPolicy
 
 PARTS = STYLES[8:11]
-_COMPOSED_WEAPON = "corrosive_blastsling"  # whose ammunition carries several elements
-_PAIRS = ("Apex Thunderjaw", "Slaughterspine")  # of these, two at once are out of distribution
+_COMPOSED_WEAPON = "corrosive_blastsling"  # its ammunition has several elements
+_PAIRS = ("Apex Thunderjaw", "Slaughterspine")  # two of these at once are out of distribution
 _OUTCOMES = ("won", "died", "out_of_bounds", "timeout")
 
 
 def composed_styles(space: StyleSpace) -> list[dict[str, float]]:
-    """The blastsling together with each of acid, plasma and adhesive, as far as the space has them (paper)."""
+    """Return the blastsling together with each of acid, plasma and adhesive, as far as the space has them (paper)."""
     if _COMPOSED_WEAPON not in space.names:
         return []
     high = dict(zip(space.names, space.high.tolist(), strict=True))
@@ -48,7 +48,7 @@ def composed_styles(space: StyleSpace) -> list[dict[str, float]]:
 
 
 def style_label(cell: Mapping[str, float]) -> str:
-    """How tables name a style: "default", "melee", "no skykiller", "corrosive_blastsling + acid"."""
+    """Return a style's name in tables, such as "default", "melee", "no skykiller" or "corrosive_blastsling + acid"."""
     named = [name if value > 0 else f"no {name}" for name, value in cell.items() if value]
     return " + ".join(named) or "default"
 
@@ -56,21 +56,21 @@ def style_label(cell: Mapping[str, float]) -> str:
 def evaluate_fights(domain: Domain, agent: LoadedPolicy, out: Path, settings: EvaluationSettings) -> str:
     """Fight every machine in every style and write tables, figures and a report.
 
-    Files: `damage.csv` (what was done under which style), `wins.csv` (by style and machine), `unseen.csv` (wins against
-    machines and pairs that no training has), `outcomes.csv` (by machine), `sweep.csv` (share of a style's damage over
-    its weight), `switches.csv` (what follows when the style switches during fights), `timeline.csv` (some fights in a
-    row, step by step), `damage.png`, `sweep.png`, `timeline.png`, `report.md`, `summary.json`.
+    The files are `damage.csv` (damage by kind and requested style), `wins.csv` (by style and machine), `unseen.csv`
+    (wins against machines and pairs that occur in no training), `outcomes.csv` (by machine), `sweep.csv` (share of a
+    style's damage over its weight), `switches.csv` (effects of switches of the style during fights), `timeline.csv`
+    (some fights in a row, step by step), `damage.png`, `sweep.png`, `timeline.png`, `report.md` and `summary.json`.
 
     Args:
-        domain: combat, as the agent was trained in.
-        agent: the policy; samples its actions, as in training.
-        out: folder, created if missing.
-        settings: `episodes` fights per style and machine, at sites drawn at random, of at most `steps`, and
-            `switch_episodes` sequences of fights with a style that switches, each as long; none for an agent with fewer
-            than two styles of damage.
+        domain: Domain combat, as the agent was trained in.
+        agent: Policy, which samples its actions, as in training.
+        out: Folder, which is created if it is missing.
+        settings: `episodes` is the number of fights per style and machine, at random sites; `steps` is their largest
+            length. `switch_episodes` is the number of sequences of fights, of the same length, with a style that
+            switches; an agent with fewer than two styles of damage has none.
 
     Returns:
-        The report, Markdown.
+        The report as Markdown.
     """
     episodes, seed, progress = settings.episodes, settings.seed, settings.progress
     out.mkdir(parents=True, exist_ok=True)
@@ -132,7 +132,21 @@ def fight_matrix(
     seed: int,
     progress: bool,
 ) -> dict[str, np.ndarray]:
-    """Sums over each fight, by what was measured: (styles, opponents, episodes); an opponent is one machine or two."""
+    """Run fights in every style against every opponent.
+
+    Args:
+        domain: Domain combat, as the agent was trained in.
+        agent: Policy.
+        cells: Styles.
+        opponents: Types of the one or two machines of each opponent.
+        episodes: Number of fights per style and opponent.
+        steps: Largest number of steps of a fight.
+        seed: Seed of sites, fights and actions.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        Sum of each measure over each fight, (styles, opponents, episodes).
+    """
     space, shape = agent.space, (len(cells), len(opponents), episodes)
     theta = torch.stack([space.make(strict=True, **cell) for cell in cells])
     theta = theta.repeat_interleave(len(opponents) * episodes, 0)
@@ -150,7 +164,7 @@ def fight_matrix(
 
 
 def damage_rows(fights: Mapping[str, np.ndarray], labels: Sequence[str]) -> list[dict[str, Any]]:
-    """Per requested style: share of all damage by source and in each elemental state, units removed per fight."""
+    """Return for each requested style the shares of damage by source and elemental state, and parts per fight."""
     rows = []
     for index, label in enumerate(labels):
         total = max(fights["damage"][index].sum(), 1e-9)
@@ -180,7 +194,7 @@ def _outcomes(fights: Mapping[str, np.ndarray], machines: Sequence[str]) -> list
 
 
 def _sweep_rows(sweeps: Sequence[WeightSweep]) -> list[dict[str, Any]]:
-    """Share of the damage that counts for a weight, from 0 to its far end; units removed per fight for parts."""
+    """Return the share of damage that counts for a weight, or units removed per fight for parts, over the weight."""
     rows = []
     for sweep in sweeps:
         for position, value in enumerate(sweep.values):
@@ -192,7 +206,7 @@ def _sweep_rows(sweeps: Sequence[WeightSweep]) -> list[dict[str, Any]]:
 
 
 def _correlations(sweep: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Rank correlation of score and weight."""
+    """Return the rank correlation of score and weight for each style."""
     found = {}
     for name in dict.fromkeys(row["style"] for row in sweep):
         points = [row for row in sweep if row["style"] == name]
@@ -202,7 +216,7 @@ def _correlations(sweep: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 
 def draw_damage(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """The damage matrix: columns are requested styles, rows what was done (paper)."""
+    """Draw the damage matrix with a column per requested style and a row per kind of damage (paper)."""
     kinds = [*SOURCES, *STATES]
     shares = np.array([[row[kind] for row in rows] for kind in kinds])
     size = (2.5 + 0.62 * len(rows), 2.2 + 0.36 * len(kinds))
@@ -221,7 +235,7 @@ def draw_damage(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def draw_sweep(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Style score over the weight, one panel per style."""
+    """Draw the style score over the weight, with a panel per style."""
     names = list(dict.fromkeys(row["style"] for row in rows))
     columns = min(len(names), 5)
     count = -(-len(names) // columns)

@@ -1,4 +1,4 @@
-"""What a coach says to the humanoid, and how it is steered."""
+"""Words of the coach's commands to the humanoid, and the control of its course."""
 
 import math
 

@@ -110,8 +110,8 @@ def aggressiveness_style_reward(space: StyleSpace, *, weight: float = 1.0, apart
         space: Result of `aggressiveness_style_space`.
         weight: Penalty per metre by which a gap is below its margin, in each control step; the paper has none.
         apart: Share of the penalty of a gap along one axis while the cars do not overlap along the other, such as the
-            lateral gap to a car straight ahead. 1 charges both gaps of every near car, as in the paper; 0 charges only
-            gaps that are larger if the cars keep more room.
+            lateral gap to a car straight ahead. 1 charges both gaps of every near car, as in the paper; 0 charges a
+            gap only while the cars overlap along the other axis.
 
     Raises:
         ValueError: If `apart` is not in [0, 1].
