@@ -201,9 +201,8 @@ def draw_timeline(rows: Sequence[Mapping[str, Any]], path: Path, *, bin_seconds:
             done = np.array([row[source] for row in rows])
             height = np.histogram(times - step / 2, edges, weights=done)[0] / bin_seconds
             if done.any() or source in requested:
-                top.bar(
-                    edges[:-1], height, bin_seconds, base, align="edge", color=colours[source], label=readable(source)
-                )
+                style = {"align": "edge", "color": colours[source], "label": readable(source)}
+                top.bar(edges[:-1], height, bin_seconds, base, **style)
             base += height
         damage = np.array([sum(row[source] for source in SOURCES) for row in rows])
         counted = np.array([row["counted"] for row in rows])
@@ -238,15 +237,8 @@ def _mark(rows: Sequence[Mapping[str, Any]], colours: Mapping[str, Any], panels:
         name, left, right = rows[start]["requested"], start * step, end * step
         for panel in panels:
             panel.axvspan(left, right, color=colours.get(name, "0.6"), alpha=0.15, lw=0)
-        panels[0].text(
-            (left + right) / 2,
-            0.99,
-            readable(name),
-            transform=panels[0].get_xaxis_transform(),
-            ha="center",
-            va="top",
-            fontsize=8,
-        )
+        style = {"transform": panels[0].get_xaxis_transform(), "ha": "center", "va": "top", "fontsize": 8}
+        panels[0].text((left + right) / 2, 0.99, readable(name), **style)
     for row in rows:
         if row["ended"]:
             for panel in panels:

@@ -84,14 +84,8 @@ def evaluate_fights(domain: Domain, agent: LoadedPolicy, out: Path, settings: Ev
     outcomes = _outcomes(fights, machines)
     alone = fight_matrix(domain, agent, cells, [(name,) for name in UNSEEN_MACHINES], **options)
     pairs = fight_matrix(domain, agent, cells, [(name, name) for name in _PAIRS], **options)
-    unseen = [
-        one | two
-        for one, two in zip(
-            _win_rows(alone, labels, list(UNSEEN_MACHINES)),
-            _win_rows(pairs, labels, [f"two {name}" for name in _PAIRS]),
-            strict=True,
-        )
-    ]
+    twice = _win_rows(pairs, labels, [f"two {name}" for name in _PAIRS])
+    unseen = [one | two for one, two in zip(_win_rows(alone, labels, list(UNSEEN_MACHINES)), twice, strict=True)]
     sweeps = settings.sweeps
     if sweeps is None:
         sweeps = sweep_weights(domain, agent.actor, agent.space, points=7, **options)
@@ -206,7 +200,7 @@ def _sweep_rows(sweeps: Sequence[WeightSweep]) -> list[dict[str, Any]]:
 
 
 def _correlations(sweep: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Return the rank correlation of score and weight for each style."""
+
     found = {}
     for name in dict.fromkeys(row["style"] for row in sweep):
         points = [row for row in sweep if row["style"] == name]
@@ -223,9 +217,8 @@ def draw_damage(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     with drawing(path, size=size, grid=False) as ((axes,),):
         axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
         for (i, j), share in np.ndenumerate(shares):
-            axes.text(
-                j, i, f"{share:.2f}", ha="center", va="center", fontsize=7, color="white" if share > 0.6 else "black"
-            )
+            color = "white" if share > 0.6 else "black"
+            axes.text(j, i, f"{share:.2f}", ha="center", va="center", fontsize=7, color=color)
         axes.axhline(len(SOURCES) - 0.5, color="0.4", lw=1)
         names = [readable(row["style"]) for row in rows]
         axes.set_xticks(range(len(rows)), [f"{n}\n{row['won']:.0%} won" for n, row in zip(names, rows, strict=True)])
@@ -243,12 +236,9 @@ def draw_sweep(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     with drawing(path, count, columns, size=size) as grid:
         for panel, name in zip(grid.flat, names, strict=False):
             points = [row for row in rows if row["style"] == name]
-            panel.plot(
-                [p["weight"] for p in points], [p["style_score"] for p in points], marker="o", ms=4, label="score"
-            )
-            panel.plot(
-                [p["weight"] for p in points], [p["won"] for p in points], ls="--", marker="x", ms=4, label="won"
-            )
+            weights, scores, won = ([point[key] for point in points] for key in ("weight", "style_score", "won"))
+            panel.plot(weights, scores, marker="o", ms=4, label="score")
+            panel.plot(weights, won, ls="--", marker="x", ms=4, label="won")
             panel.set(title=readable(name), xlabel="weight")
             panel.set_ylim(-0.05, None)
         for panel in list(grid.flat)[len(names) :]:
@@ -284,11 +274,9 @@ def _switch_report(coached: CoachedFights, rows: Sequence[Mapping[str, Any]]) ->
     steps, sequences = coached.requests.shape
     period, ends = coached.period * coached.control_step, coached.outcomes()
     text = f"\n## Style switched every {period:g} s\n\n![damage, hits and health over time](timeline.png)\n\n"
-    text += "One sequence of fights, asked for every style in turn. "
-    text += (
-        f"{sequences} such sequences of {steps * coached.control_step:g} s, the others with styles in random order: "
-    )
-    text += f"{ends['fights']} fights ended, {ends['won']} of them won.\n\n"
+    text += f"One sequence of fights, asked for every style in turn. {sequences} such sequences of "
+    text += f"{steps * coached.control_step:g} s, the others with styles in random order: {ends['fights']} fights "
+    text += f"ended, {ends['won']} of them won.\n\n"
     if rows:
         formats = {"style": "", "switches": "", "complied": ".0%", "median_seconds": ".1f", "share": ".0%"}
         text += markdown_table(rows, formats)

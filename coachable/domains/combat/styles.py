@@ -12,9 +12,7 @@ from coachable.styles.mixtures import Single, style_mixture
 
 
 def combat_style_space(
-    styles: Sequence[str] | None = None,
-    reward_scale: str = "sim",
-    combat_component: Single = "continuous_one_hot",
+    styles: Sequence[str] | None = None, reward_scale: str = "sim", combat_component: Single = "continuous_one_hot"
 ) -> StyleSpace:
     """Return the space of the style weights with the mixture from which they are drawn at a reset.
 

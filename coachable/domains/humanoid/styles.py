@@ -27,11 +27,7 @@ STEP_LENGTH_RANGE = (0.30, 0.65)  # [m]
 # Joint bounds of each pose [deg]: right shoulder1, shoulder2, elbow. The left arm mirrors the shoulder joints' signs.
 # Centres: the reach of the hand in the pose's direction, maximised within the joint limits; the elbow nearly straight.
 _SHOULDER_HALF_WIDTH_DEG = 15.0
-_SHOULDER_CENTRES_DEG = {
-    "arms_in_front": (-2.0, 46.0),
-    "arms_up": (-85.0, 16.0),
-    "t_pose": (-56.0, -27.0),
-}
+_SHOULDER_CENTRES_DEG = {"arms_in_front": (-2.0, 46.0), "arms_up": (-85.0, 16.0), "t_pose": (-56.0, -27.0)}
 _ELBOW_BOUNDS_DEG = (-90.0, -70.0)
 POSES = tuple(_SHOULDER_CENTRES_DEG)
 POSE_MARGIN_DEG = 30.0
@@ -104,15 +100,9 @@ def humanoid_style_reward(
         return ChoiceTolerance("pose", joints, bounds[..., 0], bounds[..., 1], margin, sigmoid, value_at_margin)
 
     def gait(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
-        length, target = features[..., LENGTH], style["step_length"]
+        length, fraction, target = features[..., LENGTH], features[..., STRIDE_FRACTION], style["step_length"]
         score = tolerance(length, target, target, LENGTH_MARGIN, "long_tail")
-        score = score * tolerance(
-            features[..., STRIDE_FRACTION],
-            *STRIDE_FRACTION_BOUNDS,
-            margin=_STRIDE_FRACTION_MARGIN,
-            sigmoid="linear",
-            value_at_margin=0.0,
-        )
+        score = score * tolerance(fraction, *STRIDE_FRACTION_BOUNDS, _STRIDE_FRACTION_MARGIN, "linear", 0.0)
         knee_low, knee_high = (math.radians(angle) for angle in KNEE_RANGE_DEG)
         knee_margin = math.radians(_KNEE_MARGIN_DEG)
         score = score * tolerance(features[..., KNEE_MIN], knee_low, math.inf, knee_margin, "linear", 0.0)
@@ -134,12 +124,7 @@ def humanoid_style_reward(
             "gait": Term(gait, parameters=("step_length",)),
             "gait_guide": Term(gait_guide, parameters=("step_length",)),
         },
-        scales={
-            "pose": pose_scale,
-            "pose_guide": pose_guide_scale,
-            "gait": gait_scale,
-            "gait_guide": gait_guide_scale,
-        },
+        scales={"pose": pose_scale, "pose_guide": pose_guide_scale, "gait": gait_scale, "gait_guide": gait_guide_scale},
     )
 
 

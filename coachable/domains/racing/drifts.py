@@ -58,15 +58,12 @@ def evaluate_drift(domain: Domain, agent: LoadedPolicy, out: Path, settings: Eva
         **settings.rollout,
     )
     values = {name: value.reshape(len(SWEEPS), len(WEIGHTS), -1) for name, value in grid.episodes.items()}
-    rows = [
-        row
-        for index, sweep in enumerate(SWEEPS)
-        for row in _rows(sweep, {name: value[index] for name, value in values.items()})
-    ]
-    weights = np.repeat(np.array(WEIGHTS)[:, None], settings.episodes, 1).ravel()
+    weights = np.repeat(WEIGHTS, settings.episodes)
+    rows: list[dict[str, Any]] = []
     summary: dict[str, Any] = {}
     for index, sweep in enumerate(SWEEPS):
-        own = [row for row in rows if row["sweep"] == sweep]
+        own = _rows(sweep, {name: value[index] for name, value in values.items()})
+        rows += own
         summary[sweep] = {
             "rank_correlation": rank_correlation(weights, values[ANGLE][index].ravel()),
             "angle_at_none": own[WEIGHTS.index(0.0)][ANGLE],
@@ -115,18 +112,10 @@ def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Map
     text += f"{policy_sentence(agent)}; {summary['episodes_per_weight']} episodes of "
     text += f"{steps} steps per weight, ordinary starts, the other weights 0, seed {summary['seed']}.\n\n"
     text += "![slip angle over weight](drift.png)\n\n"
-    formats = {
-        "sweep": "",
-        "weight": "g",
-        "slip_angle_rear": ".1f",
-        "slip_angle_front": ".1f",
-        "pace": ".1f",
-        "pace_kept": ".0%",
-    }
-    text += markdown_table(rows, formats | {"off": ".1%", "turns": ".1f", "most_turns": ".0f", "survived": ".0%"})
-    text += (
-        "\nSlip angles in degrees (0 below 5 m/s), pace in m/s along the track, turns: largest rotation against the "
-    )
-    text += "track in one direction, in whole turns, mean and most over episodes.\n\n"
+    formats = {"sweep": "", "weight": "g", "slip_angle_rear": ".1f", "slip_angle_front": ".1f", "pace": ".1f"}
+    formats |= {"pace_kept": ".0%", "off": ".1%", "turns": ".1f", "most_turns": ".0f", "survived": ".0%"}
+    text += markdown_table(rows, formats)
+    text += "\nSlip angles in degrees (0 below 5 m/s), pace in m/s along the track, turns: largest rotation against "
+    text += "the track in one direction, in whole turns, mean and most over episodes.\n\n"
     ranks = ", ".join(f"{sweep} {summary[sweep]['rank_correlation']:.2f}" for sweep in SWEEPS)
     return text + f"Rank correlation of weight and rear slip angle: {ranks}.\n"

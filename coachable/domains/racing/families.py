@@ -38,13 +38,8 @@ def drift_env(num_envs: int = 64, **options: Any) -> RacingEnv:
         num_envs: Number of cars that the agent drives.
         **options: Options of `RacingEnv`.
     """
-    defaults: dict[str, Any] = {
-        "track": "ridge",
-        "car": "street",
-        "scenarios": drift_scenarios(),
-        "wrong_way_time": 10.0,
-    }
-    return RacingEnv(num_envs, **(defaults | options))
+    options = {"track": "ridge", "car": "street", "scenarios": drift_scenarios(), "wrong_way_time": 10.0} | options
+    return RacingEnv(num_envs, **options)
 
 
 def resource_env(num_envs: int = 64, **options: Any) -> RacingEnv:
@@ -75,13 +70,8 @@ def race_env(num_envs: int = 65, **options: Any) -> RacingEnv:
         num_envs: Number of cars, all of which the agent drives.
         **options: Options of `RacingEnv`.
     """
-    defaults: dict[str, Any] = {
-        "cars": 5,
-        "track": "endurance",
-        "car": "pool",
-        "conditions": Conditions.any_compound(),
-    }
-    return RacingEnv(num_envs, **(defaults | options))
+    options = {"cars": 5, "track": "endurance", "car": "pool", "conditions": Conditions.any_compound()} | options
+    return RacingEnv(num_envs, **options)
 
 
 def rival_env(num_envs: int = AGENTS * 21, **options: Any) -> RacingEnv:

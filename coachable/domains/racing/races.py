@@ -81,15 +81,11 @@ def evaluate_aggressiveness(domain: Domain, agent: LoadedPolicy, out: Path, sett
     races = [(setting, lateral, others) for setting, lateral in cells for others in OTHERS for _ in range(episodes)]
     found = _race(domain, agent, races, len(cells), settings)
     rows = _rows(cells, {name: values.reshape(len(cells), -1, 2) for name, values in found.items()})
-    summary: dict[str, Any] = {
-        setting: {
-            name: rank_correlation(
-                *(np.array([r[key] for r in rows if r["setting"] == setting]) for key in ("lateral", name))
-            )
-            for name in _RANKED
-        }
-        for setting in SETTINGS
-    }
+    summary: dict[str, Any] = {}
+    for setting in SETTINGS:
+        own = [row for row in rows if row["setting"] == setting]
+        gained = {name: np.array([row[name] for row in own]) for name in ("lateral", *_RANKED)}
+        summary[setting] = {name: rank_correlation(gained["lateral"], gained[name]) for name in _RANKED}
     summary |= {"races_per_row": len(OTHERS) * episodes, "seed": seed}
     draw_radar(rows, out / "radar.png")
     return write_results(out, _report(agent, rows, summary), summary, {"races": rows})
@@ -271,24 +267,13 @@ def draw_radar(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Mapping[str, Any]) -> str:
     text = "# racing, aggressiveness: requested margin and what came of it\n\n"
-    text += f"{policy_sentence(agent)} in all five cars; {summary['races_per_row']} "
-    text += (
-        f"races per row, {LAPS} laps, rolling start, seed {summary['seed']}. Two cars, which start last (pursuer) or "
-    )
-    text += (
-        f"first (leader), keep the lateral margin, the other three 0.5 or 0.75 m; longitudinal {LONGITUDINAL:g} m.\n\n"
-    )
+    text += f"{policy_sentence(agent)} in all five cars; {summary['races_per_row']} races per row, {LAPS} laps, "
+    text += f"rolling start, seed {summary['seed']}. Two cars, which start last (pursuer) or first (leader), keep the "
+    text += f"lateral margin, the other three 0.5 or 0.75 m; longitudinal {LONGITUDINAL:g} m.\n\n"
     text += "![radar](radar.png)\n\n"
     formats = {"setting": "", "lateral": "g", "win_rate": ".0%", "either_won": ".0%", "places_gained": "+.2f"}
-    formats |= {
-        "places_later": "+.2f",
-        "overtakes": ".1f",
-        "contacts": ".1f",
-        "beside": ".1%",
-        "off": ".1%",
-        "kilometres": ".1f",
-    }
-    text += markdown_table(rows, formats)
+    formats |= {"places_later": "+.2f", "overtakes": ".1f", "contacts": ".1f"}
+    text += markdown_table(rows, formats | {"beside": ".1%", "off": ".1%", "kilometres": ".1f"})
     text += "\nWin rate: share of the pair that ends among the first two. Overtakes, contacts: per car and race; a "
     text += f"car has overtaken who was ahead when it is {_PASSED:g} m ahead; contacts within a second count once. "
     text += "Places later: gained after the first minute. "

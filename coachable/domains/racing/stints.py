@@ -306,10 +306,8 @@ def _report(
     formats |= {"seconds_lost": "+.2f", "frontier_km": ".1f", "laps": "", "clean_laps": ".0%"}
     text += markdown_table(rows, formats)
     text += f"\nRange: until the tank is empty, or until the tyres are worn by {WORN:.0%} on average, at the mean use. "
-    text += (
-        f"Lap time: mean of {COMPARED} laps from the second one on. Frontier: range of a point mass on a fixed line "
-    )
-    text += "at the same lap time (nan where it has none so slow). Clean: never three wheels off the track.\n\n"
+    text += f"Lap time: mean of {COMPARED} laps from the second one on. Frontier: range of a point mass on a fixed "
+    text += "line at the same lap time (nan where it has none so slow). Clean: never three wheels off the track.\n\n"
     ranks = ", ".join(f"{name} {summary[name]['rank_correlation']:.2f}" for name in WEIGHTS)
     text += f"Rank correlation of weight and range: {ranks}.\n\n## Time trial, no saving asked\n\n"
     if not trial["laps"]:

@@ -7,15 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from coachable.envs.racing.race.features import (
-    DEFEND,
-    DRIFT,
-    DRIFT_NAMES,
-    FUEL,
-    OVERTAKE,
-    TIRE,
-    gap_columns,
-)
+from coachable.envs.racing.race.features import DEFEND, DRIFT, DRIFT_NAMES, FUEL, OVERTAKE, TIRE, gap_columns
 from coachable.styles import (
     Mixture,
     PointMass,

@@ -108,18 +108,15 @@ def traffic_report(rows: Sequence[dict[str, Any]], response: dict[str, dict[str,
         response: Result of `traffic_response`.
     """
     text = f"\n## Among others\n\n{CARS} copies close together on a straight, on tyres and fuel of any state, for a "
+    text += f"minute; {rows[0]['races']} races per weight, the same starts for each. The weight of overtaking of the "
     text += (
-        f"minute; {rows[0]['races']} races per weight, the same starts for each. The weight of overtaking of the last "
+        f"last car rises, or that of defending of the first; all others are {OTHERS_WEIGHT:g}, and nobody saves.\n\n"
     )
-    text += f"car rises, or that of defending of the first; all others are {OTHERS_WEIGHT:g}, and nobody saves.\n\n"
     text += "![traffic](traffic.png)\n\n"
     formats = {"sweep": "", "weight": "g", "overtake": "+.1f", "defend": "+.1f", "places_gained": "+.2f"}
     text += markdown_table(rows, formats | {"contact": ".2%", "off": ".2%"})
     text += "\nOvertake, defend: metres gained on cars ahead and on cars behind. Rank correlation with the weight of "
-    found = [
-        f"{name} {values['metres']:.2f} in metres, {values['places']:.2f} in places"
-        for name, values in response.items()
-    ]
+    found = [f"{name} {v['metres']:.2f} in metres, {v['places']:.2f} in places" for name, v in response.items()]
     return text + "; of ".join(found) + ".\n"
 
 

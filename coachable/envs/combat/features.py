@@ -26,7 +26,6 @@ from coachable.envs.combat.tables import ATTACK_SLOTS, ELEMENTS, PART_SLOTS, SIT
 from coachable.envs.combat.traits import AMMO_SLOTS, HIDDEN, INTERVAL, MACHINE_NAMES, MAGAZINE, Traits
 from coachable.envs.combat.traits import RELOAD as RELOAD_FRAMES
 
-ENEMY_SLOTS = 2  # in the observation, whatever the number of enemies
 SMALL_PARTS = 4
 _GAME_TIMERS = slice(0, 11)
 _SPEED_SCALE, _TIMER_SCALE = 0.1, 0.5 / c.FPS  # per m/s, per frame
