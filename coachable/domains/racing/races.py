@@ -275,7 +275,7 @@ def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Map
     formats |= {"places_later": "+.2f", "overtakes": ".1f", "contacts": ".1f"}
     text += markdown_table(rows, formats | {"beside": ".1%", "off": ".1%", "kilometres": ".1f"})
     text += "\nWin rate: share of the pair that ends among the first two. Overtakes, contacts: per car and race; a "
-    text += f"car has overtaken who was ahead when it is {_PASSED:g} m ahead; contacts within a second count once. "
+    text += f"car has overtaken another when it is {_PASSED:g} m ahead; contacts within a second count once. "
     text += "Places later: gained after the first minute. "
     text += f"Beside: share of the time with another car alongside, less than {LATERAL[-1]:g} m away."
     text += "\n\nRank correlation with the margin: "

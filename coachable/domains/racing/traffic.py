@@ -110,7 +110,7 @@ def traffic_report(rows: Sequence[dict[str, Any]], response: dict[str, dict[str,
     text = f"\n## Among others\n\n{CARS} copies close together on a straight, on tyres and fuel of any state, for a "
     text += f"minute; {rows[0]['races']} races per weight, the same starts for each. The weight of overtaking of the "
     text += (
-        f"last car rises, or that of defending of the first; all others are {OTHERS_WEIGHT:g}, and nobody saves.\n\n"
+        f"last car rises, or that of defending of the first; all others are {OTHERS_WEIGHT:g}, and no car saves.\n\n"
     )
     text += "![traffic](traffic.png)\n\n"
     formats = {"sweep": "", "weight": "g", "overtake": "+.1f", "defend": "+.1f", "places_gained": "+.2f"}

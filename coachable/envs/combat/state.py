@@ -36,44 +36,62 @@ class State:
     """State of N fights against E enemies, which together with the random generator determines the next step.
 
     Attributes:
-        position, velocity: (2, N) of the player [m], [m/s].
-        yaw, pitch: (N,) of the camera, counter-clockwise from +x and upwards [rad].
-        hp, stamina, weapon_stamina, berries: (N,).
-        inventory: (4, N) traps of each type.
-        tool, weapon, section: (N,) int64, selected trap type, weapon and ammo.
-        magazine: (18, N) rounds by wheel section, three rows per weapon.
-        timers: (11, N), rows above [frames].
-        technique: (N,) 1 while the next shot deals double damage.
-        dodge: (2, N) direction of the running dodge or slide.
-        wheel, quick: (N,) 1 if shown in the last step.
-        sticks: (4, N) right stick of the last step and of the one before.
-        anchor: (2, N) centre of the Dynamic Anchor Bound [m].
-        distance: (N,) to the nearest enemy after the last step [m].
-        closeness: (2, N) of the nearest enemy and of the player to a set trap.
-        steps: (N,) since the reset.
-        site: (N,) int64.
-        machine: (E, N) int64.
-        enemy_position, enemy_velocity: (2, E, N) [m], [m/s].
-        enemy_z, enemy_yaw, enemy_hp: (E, N) [m], [rad], [HP].
-        phase, phase_timer: (E, N); the timer in frames.
-        attack: (E, N) int64, attack slot.
-        cooldown: (4, E, N) of the slots [frames].
-        pause: (E, N) until the next attack may start [frames].
-        lock: (2, E, N) locked direction.
-        hits_left: (E, N) of the running attack.
-        stagger_sum: (E, N) damage since the last stagger [HP].
-        strafe: (E, N) +1 or -1.
-        gauge: (7, E, N) build-up of each element, in [0, 1).
-        state_timer: (7, E, N) of each elemental state [frames].
-        source: (7, E, N) latest source of the element's build-up.
-        plasma_store, shock_growth: (E, N) [HP], factor on shock's threshold.
-        count, part_hp: (12, E, N) units left of each part, health of the current one.
-        land_timer, shot_damage: (4, E, N) of the machine's shots in the air [frames], [HP].
-        shot_point: (2, 4, E, N) places where they land [m].
-        trap_position: (2, 4, N) [m]. trap_type: (4, N), -1 where none is set. trap_arm: (4, N) [frames].
-        hazard_position: (2, 2, N) [m]. hazard_timer: (2, N) [frames].
-        actions: (72, N) canonical actions of the last three steps, newest first.
-        features: (24, N) `features.kept_features` of the last two steps, newest first.
+        position: Position of the player (2, N) [m].
+        velocity: Velocity of the player (2, N) [m/s].
+        yaw: Direction of the camera, counter-clockwise from +x (N,) [rad].
+        pitch: Elevation of the camera (N,) [rad].
+        hp: Health of the player (N,) [HP].
+        stamina: Stamina of the player (N,).
+        weapon_stamina: Stamina for weapon techniques (N,).
+        berries: Number of berries left (N,).
+        inventory: Number of traps of each type (4, N).
+        tool: Selected trap type (N,) int64.
+        weapon: Selected weapon (N,) int64.
+        section: Selected ammo of the weapon (N,) int64.
+        magazine: Rounds by wheel section, three rows per weapon (18, N).
+        timers: Timers with the rows `FIRE` to `BERRY` (11, N) [frames].
+        technique: 1 while the next shot deals double damage (N,).
+        dodge: Direction of the current dodge or slide (2, N).
+        wheel: 1 if the weapon wheel was open in the last step (N,).
+        quick: 1 if the tool menu was used in the last step (N,).
+        sticks: Right stick of the last step and of the one before (4, N).
+        anchor: Centre of the Dynamic Anchor Bound (2, N) [m].
+        distance: Distance to the nearest enemy after the last step (N,) [m].
+        closeness: Closeness of the nearest enemy and of the player to a set trap (2, N).
+        steps: Number of steps since the reset (N,).
+        site: Number of the site (N,) int64.
+        machine: Number of the machine type (E, N) int64.
+        enemy_position: Positions of the machines (2, E, N) [m].
+        enemy_velocity: Velocities of the machines (2, E, N) [m/s].
+        enemy_z: Heights of the machines (E, N) [m].
+        enemy_yaw: Directions of the machines (E, N) [rad].
+        enemy_hp: Health of the machines (E, N) [HP].
+        phase: Phase of the machines, `IDLE` to `STAGGERED` (E, N).
+        phase_timer: Time left of the phase (E, N) [frames].
+        attack: Slot of the latest attack (E, N) int64.
+        cooldown: Time until each attack slot can be used again (4, E, N) [frames].
+        pause: Time until the next attack may start (E, N) [frames].
+        lock: Direction of the active attack (2, E, N).
+        hits_left: Number of hits left in the active attack (E, N).
+        stagger_sum: Damage since the last stagger (E, N) [HP].
+        strafe: Direction of strafing, +1 or -1 (E, N).
+        gauge: Build-up of each element, in [0, 1) (7, E, N).
+        state_timer: Time left of each elemental state (7, E, N) [frames].
+        source: Latest source of each element's build-up (7, E, N).
+        plasma_store: Damage that plasma has stored (E, N) [HP].
+        shock_growth: Factor on shock's threshold (E, N).
+        count: Number of units left of each part (12, E, N).
+        part_hp: Health of the current unit of each part (12, E, N) [HP].
+        land_timer: Time until each shot of a machine lands (4, E, N) [frames].
+        shot_damage: Damage of each shot of a machine (4, E, N) [HP].
+        shot_point: Place where each shot of a machine lands (2, 4, E, N) [m].
+        trap_position: Positions of the set traps (2, 4, N) [m].
+        trap_type: Types of the set traps, or -1 in an empty slot (4, N).
+        trap_arm: Time until each trap is armed (4, N) [frames].
+        hazard_position: Positions of the hazard zones (2, 2, N) [m].
+        hazard_timer: Time left of each hazard zone (2, N) [frames].
+        actions: Canonical actions of the last three steps, newest first (72, N).
+        features: Features of the last two steps, newest first (24, N); see `features.kept_features`.
     """
 
     position: Tensor
