@@ -21,7 +21,7 @@ from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import drawing, shade
 from coachable.evaluation.rollouts import record_styles
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
-from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_results
+from coachable.evaluation.style_grid import markdown_table, mean_of, policy_sentence, write_results
 
 if TYPE_CHECKING:
     from coachable.domain import Domain
@@ -195,7 +195,7 @@ def _rows(
     pace = np.array([[stint.compared for stint in group] for group in stints])
     for index, weight in enumerate(weights):
         low, high = bootstrap_interval(reach[index])
-        lap_time = float(np.nanmean(pace[index])) if np.isfinite(pace[index]).any() else float("nan")
+        lap_time = mean_of(pace[index])
         clean = np.concatenate([stint.clean for stint in stints[index]])
         rows.append(
             {
@@ -206,7 +206,7 @@ def _rows(
                 "range_km_high": high,
                 "range_gain": float(reach[index].mean() / reach[0].mean() - 1.0),
                 "lap_time": lap_time,
-                "seconds_lost": lap_time - float(np.nanmean(pace[0])) if np.isfinite(pace[0]).any() else float("nan"),
+                "seconds_lost": lap_time - mean_of(pace[0]),
                 "frontier_km": range_at(bound, lap_time),
                 "laps": len(clean),
                 "clean_laps": float(clean.mean()) if len(clean) else 0.0,
@@ -222,17 +222,14 @@ def range_at(bound: Sequence[Mapping[str, float]], lap_time: float) -> float:
         bound: Points of `frontier`, the fastest lap first.
         lap_time: Lap time [s].
     """
-    times = [point["lap_time"] for point in bound]
-    if not times[0] <= lap_time <= times[-1]:
-        return float("nan")
-    return float(np.interp(lap_time, times, [point["range_km"] for point in bound]))
+    times, ranges = ([point[name] for point in bound] for name in ("lap_time", "range_km"))
+    return float(np.interp(lap_time, times, ranges, left=np.nan, right=np.nan))
 
 
 def _summary(
     rows: Sequence[Mapping[str, Any]], trial: Sequence[Stint], estimate: float, episodes: int, seed: int
 ) -> dict[str, Any]:
-    flying = [stint.laps[1:] for stint in trial if len(stint.laps) > 1]
-    times = np.concatenate(flying) if flying else np.array([])
+    times = np.concatenate([stint.laps[1:] for stint in trial])
     clean = np.concatenate([stint.clean for stint in trial])
     summary: dict[str, Any] = {
         "trial": {
