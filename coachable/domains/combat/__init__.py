@@ -1,4 +1,4 @@
-"""Fights with a gamepad, in a style that is chosen at run time."""
+"""Domain of fights with a gamepad in a style that is chosen at run time."""
 
 from coachable.domains.combat.events import combat_events
 from coachable.domains.combat.styles import combat_style_reward, combat_style_space

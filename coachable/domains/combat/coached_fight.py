@@ -1,4 +1,4 @@
-"""Fights one after the other whose style is switched while they go on: what is done after a switch, and how soon."""
+"""Evaluation of style switches during sequences of fights: the effect of each switch and its delay."""
 
 from __future__ import annotations
 
@@ -32,18 +32,19 @@ _OUTCOMES = ("won", "died", "out_of_bounds")
 
 @dataclass(frozen=True)
 class CoachedFights:
-    """N sequences of fights, T steps each. Where a fight ends the next one starts; the request goes on.
+    """N sequences of fights of T steps. When a fight ends, the next one starts with the same request.
 
     Attributes:
-        names: styles that are requested, each alone and at its maximum.
-        requests: (T, N) number of the requested style; it changes every `period` steps. Sequence 0 has the styles in
-            their order, the others have them at random.
-        period: steps between switches.
-        control_step: [s].
-        measures: name to (T, N), what `CombatMeasures` measures in each step.
-        player, machine: (T, N) health after each step, as a share of full health.
-        opponent: (T, N) number of the machine in `MACHINE_NAMES`.
-        done: (T, N) bool, last steps of fights.
+        names: Styles that are requested, each alone and at its maximum.
+        requests: Number of the requested style (T, N), which changes every `period` steps. Sequence 0 has the styles in
+            their order, the others have them in random order.
+        period: Number of steps between switches.
+        control_step: Duration of a step [s].
+        measures: Measures of `CombatMeasures` in each step by name, (T, N) each.
+        player: Health of the player after each step (T, N), as a share of full health.
+        machine: Health of the machine after each step (T, N), as a share of full health.
+        opponent: Number of the machine in `MACHINE_NAMES` (T, N).
+        done: Whether each step is the last one of a fight (T, N) bool.
     """
 
     names: tuple[str, ...]
@@ -57,12 +58,12 @@ class CoachedFights:
     done: np.ndarray
 
     def switches(self) -> list[dict[str, Any]]:
-        """What followed the switches to each style, until the next switch, and to all of them ("all styles").
+        """Summarise the time from the switches to each style, and to all of them, until the next switch.
 
         Returns:
-            Rows with `style`; `switches`, their number; `complied`, share of them followed by damage that counts for
-            the style; `median_seconds` from the switch to the first of it, where none counts as infinite; and `share`,
-            what counts over all damage.
+            Rows with `style`, or "all styles"; `switches`, their number; `complied`, the share of switches after which
+            damage counts for the style; `median_seconds`, the median time from a switch to the first such damage, which
+            is infinite if there is none; and `share`, the share of the damage that counts for the style.
         """
         starts = range(self.period, len(self.requests) - self.period + 1, self.period)
         if not starts:
@@ -93,15 +94,15 @@ class CoachedFights:
         return rows
 
     def outcomes(self) -> dict[str, int]:
-        """How many fights ended, and how; those that the end of a sequence cut are left out."""
+        """Count the fights that ended, and their outcomes, without those that the end of a sequence interrupted."""
         ended = {name: int((self.measures[name] * self.done).sum()) for name in _OUTCOMES}
         return {"fights": int(self.done.sum()), **ended}
 
     def timeline(self) -> list[dict[str, Any]]:
-        """Sequence 0, one row per step, until every style was requested once.
+        """Return sequence 0 with a row per step, until every style was requested once.
 
-        `machine` is its type, `player_health` and `machine_health` are shares, sources are in HP of damage; `ended`
-        says how the fight ended in this step, if it did.
+        `machine` is the machine's type, `player_health` and `machine_health` are shares, and the sources are damage
+        [HP]. `ended` is the outcome of the fight in its last step, and empty before.
         """
         rows, fight = [], 0
         for step in range(min(len(self.names) * self.period, len(self.requests))):
@@ -119,25 +120,25 @@ class CoachedFights:
 
 
 def requests_of(space: StyleSpace) -> tuple[str, ...]:
-    """The styles that ask for damage of a kind, which can be told from every hit: sources and states, not parts."""
+    """Return the styles with which every hit complies or not: those of damage sources and states, but not of parts."""
     return tuple(name for name in space.names if name in (*SOURCES, *STATES))
 
 
 def fight_coached(
     domain: Domain, agent: LoadedPolicy, *, sequences: int, steps: int, seed: int, progress: bool
 ) -> CoachedFights:
-    """Run the fights.
+    """Run sequences of fights with an agent whose style is switched.
 
     Args:
-        domain: combat, as the agent was trained in; its machines and sites are drawn at random.
-        agent: with at least two styles that `requests_of` names.
-        sequences: N.
-        steps: T.
-        seed: of scenarios, fights, actions and requests.
-        progress: show a bar.
+        domain: Domain combat, as the agent was trained in; machines and sites are drawn at random.
+        agent: Policy with at least two styles of `requests_of`.
+        sequences: Number N of sequences.
+        steps: Number T of steps of each sequence.
+        seed: Seed of scenarios, fights, actions and requests.
+        progress: Whether to show a progress bar.
 
     Raises:
-        ValueError: if there is nothing to switch between.
+        ValueError: If there are fewer than two such styles, or no sequences.
     """
     names = requests_of(agent.space)
     if len(names) < 2 or sequences < 1:
@@ -170,7 +171,7 @@ def fight_coached(
 
 
 def _draw_requests(styles: int, windows: int, sequences: int, seed: int) -> torch.Tensor:
-    """(windows, sequences) numbers of styles, never the same twice in a row."""
+    """Draw the numbers of styles (windows, sequences), never the same twice in a row."""
     generator = torch.Generator().manual_seed(seed)
     further = torch.randint(1, styles, (windows, sequences), generator=generator)
     further[0] = torch.randint(styles, (sequences,), generator=generator)
@@ -180,12 +181,12 @@ def _draw_requests(styles: int, windows: int, sequences: int, seed: int) -> torc
 
 
 def draw_timeline(rows: Sequence[Mapping[str, Any]], path: Path, *, bin_seconds: float = 1.0) -> None:
-    """Damage by source and health over time, under bands of the requested style (paper, timeline of a fight).
+    """Draw damage by source and health over time, under bands of the requested style (paper, timeline of a fight).
 
     Args:
-        rows: of `CoachedFights.timeline`.
+        rows: Result of `CoachedFights.timeline`.
         path: PNG file to write.
-        bin_seconds: width of the bars [s].
+        bin_seconds: Width of the bars [s].
     """
     times = np.array([row["seconds"] for row in rows])
     step = float(times[0])
@@ -200,9 +201,8 @@ def draw_timeline(rows: Sequence[Mapping[str, Any]], path: Path, *, bin_seconds:
             done = np.array([row[source] for row in rows])
             height = np.histogram(times - step / 2, edges, weights=done)[0] / bin_seconds
             if done.any() or source in requested:
-                top.bar(
-                    edges[:-1], height, bin_seconds, base, align="edge", color=colours[source], label=readable(source)
-                )
+                style = {"align": "edge", "color": colours[source], "label": readable(source)}
+                top.bar(edges[:-1], height, bin_seconds, base, **style)
             base += height
         damage = np.array([sum(row[source] for source in SOURCES) for row in rows])
         counted = np.array([row["counted"] for row in rows])
@@ -230,22 +230,15 @@ def draw_timeline(rows: Sequence[Mapping[str, Any]], path: Path, *, bin_seconds:
 
 
 def _mark(rows: Sequence[Mapping[str, Any]], colours: Mapping[str, Any], panels: Sequence[Any]) -> None:
-    """Bands of the requested style, and lines where fights end."""
+    """Draw bands of the requested style, and lines at the ends of fights."""
     step = rows[0]["seconds"]
     starts = [i for i, row in enumerate(rows) if i == 0 or row["requested"] != rows[i - 1]["requested"]]
     for start, end in zip(starts, [*starts[1:], len(rows)], strict=True):
         name, left, right = rows[start]["requested"], start * step, end * step
         for panel in panels:
             panel.axvspan(left, right, color=colours.get(name, "0.6"), alpha=0.15, lw=0)
-        panels[0].text(
-            (left + right) / 2,
-            0.99,
-            readable(name),
-            transform=panels[0].get_xaxis_transform(),
-            ha="center",
-            va="top",
-            fontsize=8,
-        )
+        style = {"transform": panels[0].get_xaxis_transform(), "ha": "center", "va": "top", "fontsize": 8}
+        panels[0].text((left + right) / 2, 0.99, readable(name), **style)
     for row in rows:
         if row["ended"]:
             for panel in panels:

@@ -21,12 +21,19 @@ from coachable.envs.combat.features import observation_groups
 def make_combat_env(
     num_envs: int = 128, seed: int | None = None, num_threads: int | None = None, **options: Any
 ) -> CombatEnv:
-    """A `CombatEnv` that emits `components` for the measures. `num_threads` is not used: threads are torch's own."""
+    """Make a `CombatEnv` that emits `components` for the measures.
+
+    Args:
+        num_envs: Number of fights.
+        seed: Seed of scenarios and fights.
+        num_threads: Ignored; torch's own threads are used.
+        **options: Options of `CombatEnv`.
+    """
     return CombatEnv(num_envs, seed=seed, components=True, **options)
 
 
 def _as_trained(settings: Mapping[str, Any]) -> Domain:
-    """With the machines, styles and observation of a training, and its length of a fight."""
+    """Return the domain with the machines, styles, observation and episode length of a training."""
     options = {name: value for name, value in settings.items() if name not in ("_target_", "num_envs", "components")}
     styles: Sequence[str] | None = settings.get("styles")
     make_space = partial(combat_style_space, styles, settings.get("reward_scale", "sim"))

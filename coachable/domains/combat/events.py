@@ -1,4 +1,4 @@
-"""What fills the event tables of the combat domain."""
+"""Events that fill the replay tables of the combat domain."""
 
 from collections.abc import Sequence
 
@@ -9,11 +9,11 @@ from coachable.replay.routing import StyleEvents
 def combat_events(
     styles: Sequence[str] | None = None, reward_scale: str = "sim", kill_event: bool = False
 ) -> StyleEvents:
-    """One event per style, admitted if the fight's weight of it is not 0 (paper), and optionally dead machines.
+    """Return one event per style, which counts if the style's weight in the fight is not 0 (paper).
 
     Args:
-        styles: as in `CombatEnv`.
-        reward_scale: as in `CombatEnv`.
-        kill_event: as in `CombatEnv`.
+        styles: Names of the styles, as in `CombatEnv`.
+        reward_scale: "sim" or "paper", as in `CombatEnv`.
+        kill_event: Whether the death of all machines is an event, as in `CombatEnv`.
     """
     return StyleEvents.of(combat_style_space(styles, reward_scale), extra=["kill"] if kill_event else [])

@@ -1,4 +1,4 @@
-"""What a fighter does under every style: damage matrix, wins, parts, response to a weight, switches (paper)."""
+"""Evaluation of fights in every style: damage matrix, wins, parts, response to a weight, and switches (paper)."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ if TYPE_CHECKING:
     from coachable.training.weights import LoadedPolicy
 
 PARTS = STYLES[8:11]
-_COMPOSED_WEAPON = "corrosive_blastsling"  # whose ammunition carries several elements
-_PAIRS = ("Apex Thunderjaw", "Slaughterspine")  # of these, two at once are out of distribution
+_COMPOSED_WEAPON = "corrosive_blastsling"  # its ammunition has several elements
+_PAIRS = ("Apex Thunderjaw", "Slaughterspine")  # two of these at once are out of distribution
 _OUTCOMES = ("won", "died", "out_of_bounds", "timeout")
 
 
 def composed_styles(space: StyleSpace) -> list[dict[str, float]]:
-    """The blastsling together with each of acid, plasma and adhesive, as far as the space has them (paper)."""
+    """Return the blastsling together with each of acid, plasma and adhesive, as far as the space has them (paper)."""
     if _COMPOSED_WEAPON not in space.names:
         return []
     high = dict(zip(space.names, space.high.tolist(), strict=True))
@@ -48,7 +48,7 @@ def composed_styles(space: StyleSpace) -> list[dict[str, float]]:
 
 
 def style_label(cell: Mapping[str, float]) -> str:
-    """How tables name a style: "default", "melee", "no skykiller", "corrosive_blastsling + acid"."""
+    """Return a style's name in tables, such as "default", "melee", "no skykiller" or "corrosive_blastsling + acid"."""
     named = [name if value > 0 else f"no {name}" for name, value in cell.items() if value]
     return " + ".join(named) or "default"
 
@@ -56,21 +56,21 @@ def style_label(cell: Mapping[str, float]) -> str:
 def evaluate_fights(domain: Domain, agent: LoadedPolicy, out: Path, settings: EvaluationSettings) -> str:
     """Fight every machine in every style and write tables, figures and a report.
 
-    Files: `damage.csv` (what was done under which style), `wins.csv` (by style and machine), `unseen.csv` (wins against
-    machines and pairs that no training has), `outcomes.csv` (by machine), `sweep.csv` (share of a style's damage over
-    its weight), `switches.csv` (what follows when the style switches during fights), `timeline.csv` (some fights in a
-    row, step by step), `damage.png`, `sweep.png`, `timeline.png`, `report.md`, `summary.json`.
+    The files are `damage.csv` (damage by kind and requested style), `wins.csv` (by style and machine), `unseen.csv`
+    (wins against machines and pairs that occur in no training), `outcomes.csv` (by machine), `sweep.csv` (share of a
+    style's damage over its weight), `switches.csv` (effects of switches of the style during fights), `timeline.csv`
+    (some fights in a row, step by step), `damage.png`, `sweep.png`, `timeline.png`, `report.md` and `summary.json`.
 
     Args:
-        domain: combat, as the agent was trained in.
-        agent: the policy; samples its actions, as in training.
-        out: folder, created if missing.
-        settings: `episodes` fights per style and machine, at sites drawn at random, of at most `steps`, and
-            `switch_episodes` sequences of fights with a style that switches, each as long; none for an agent with fewer
-            than two styles of damage.
+        domain: Domain combat, as the agent was trained in.
+        agent: Policy, which samples its actions, as in training.
+        out: Folder, which is created if it is missing.
+        settings: `episodes` is the number of fights per style and machine, at random sites; `steps` is their largest
+            length. `switch_episodes` is the number of sequences of fights, of the same length, with a style that
+            switches; an agent with fewer than two styles of damage has none.
 
     Returns:
-        The report, Markdown.
+        The report as Markdown.
     """
     episodes, seed, progress = settings.episodes, settings.seed, settings.progress
     out.mkdir(parents=True, exist_ok=True)
@@ -84,14 +84,8 @@ def evaluate_fights(domain: Domain, agent: LoadedPolicy, out: Path, settings: Ev
     outcomes = _outcomes(fights, machines)
     alone = fight_matrix(domain, agent, cells, [(name,) for name in UNSEEN_MACHINES], **options)
     pairs = fight_matrix(domain, agent, cells, [(name, name) for name in _PAIRS], **options)
-    unseen = [
-        one | two
-        for one, two in zip(
-            _win_rows(alone, labels, list(UNSEEN_MACHINES)),
-            _win_rows(pairs, labels, [f"two {name}" for name in _PAIRS]),
-            strict=True,
-        )
-    ]
+    twice = _win_rows(pairs, labels, [f"two {name}" for name in _PAIRS])
+    unseen = [one | two for one, two in zip(_win_rows(alone, labels, list(UNSEEN_MACHINES)), twice, strict=True)]
     sweeps = settings.sweeps
     if sweeps is None:
         sweeps = sweep_weights(domain, agent.actor, agent.space, points=7, **options)
@@ -132,7 +126,21 @@ def fight_matrix(
     seed: int,
     progress: bool,
 ) -> dict[str, np.ndarray]:
-    """Sums over each fight, by what was measured: (styles, opponents, episodes); an opponent is one machine or two."""
+    """Run fights in every style against every opponent.
+
+    Args:
+        domain: Domain combat, as the agent was trained in.
+        agent: Policy.
+        cells: Styles.
+        opponents: Types of the one or two machines of each opponent.
+        episodes: Number of fights per style and opponent.
+        steps: Largest number of steps of a fight.
+        seed: Seed of sites, fights and actions.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        Sum of each measure over each fight, (styles, opponents, episodes).
+    """
     space, shape = agent.space, (len(cells), len(opponents), episodes)
     theta = torch.stack([space.make(strict=True, **cell) for cell in cells])
     theta = theta.repeat_interleave(len(opponents) * episodes, 0)
@@ -150,7 +158,7 @@ def fight_matrix(
 
 
 def damage_rows(fights: Mapping[str, np.ndarray], labels: Sequence[str]) -> list[dict[str, Any]]:
-    """Per requested style: share of all damage by source and in each elemental state, units removed per fight."""
+    """Return for each requested style the shares of damage by source and elemental state, and parts per fight."""
     rows = []
     for index, label in enumerate(labels):
         total = max(fights["damage"][index].sum(), 1e-9)
@@ -180,7 +188,7 @@ def _outcomes(fights: Mapping[str, np.ndarray], machines: Sequence[str]) -> list
 
 
 def _sweep_rows(sweeps: Sequence[WeightSweep]) -> list[dict[str, Any]]:
-    """Share of the damage that counts for a weight, from 0 to its far end; units removed per fight for parts."""
+    """Return the share of damage that counts for a weight, or units removed per fight for parts, over the weight."""
     rows = []
     for sweep in sweeps:
         for position, value in enumerate(sweep.values):
@@ -192,7 +200,7 @@ def _sweep_rows(sweeps: Sequence[WeightSweep]) -> list[dict[str, Any]]:
 
 
 def _correlations(sweep: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Rank correlation of score and weight."""
+
     found = {}
     for name in dict.fromkeys(row["style"] for row in sweep):
         points = [row for row in sweep if row["style"] == name]
@@ -202,16 +210,15 @@ def _correlations(sweep: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 
 def draw_damage(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """The damage matrix: columns are requested styles, rows what was done (paper)."""
+    """Draw the damage matrix with a column per requested style and a row per kind of damage (paper)."""
     kinds = [*SOURCES, *STATES]
     shares = np.array([[row[kind] for row in rows] for kind in kinds])
     size = (2.5 + 0.62 * len(rows), 2.2 + 0.36 * len(kinds))
     with drawing(path, size=size, grid=False) as ((axes,),):
         axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
         for (i, j), share in np.ndenumerate(shares):
-            axes.text(
-                j, i, f"{share:.2f}", ha="center", va="center", fontsize=7, color="white" if share > 0.6 else "black"
-            )
+            color = "white" if share > 0.6 else "black"
+            axes.text(j, i, f"{share:.2f}", ha="center", va="center", fontsize=7, color=color)
         axes.axhline(len(SOURCES) - 0.5, color="0.4", lw=1)
         names = [readable(row["style"]) for row in rows]
         axes.set_xticks(range(len(rows)), [f"{n}\n{row['won']:.0%} won" for n, row in zip(names, rows, strict=True)])
@@ -221,7 +228,7 @@ def draw_damage(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def draw_sweep(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Style score over the weight, one panel per style."""
+    """Draw the style score over the weight, with a panel per style."""
     names = list(dict.fromkeys(row["style"] for row in rows))
     columns = min(len(names), 5)
     count = -(-len(names) // columns)
@@ -229,12 +236,9 @@ def draw_sweep(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     with drawing(path, count, columns, size=size) as grid:
         for panel, name in zip(grid.flat, names, strict=False):
             points = [row for row in rows if row["style"] == name]
-            panel.plot(
-                [p["weight"] for p in points], [p["style_score"] for p in points], marker="o", ms=4, label="score"
-            )
-            panel.plot(
-                [p["weight"] for p in points], [p["won"] for p in points], ls="--", marker="x", ms=4, label="won"
-            )
+            weights, scores, won = ([point[key] for point in points] for key in ("weight", "style_score", "won"))
+            panel.plot(weights, scores, marker="o", ms=4, label="score")
+            panel.plot(weights, won, ls="--", marker="x", ms=4, label="won")
             panel.set(title=readable(name), xlabel="weight")
             panel.set_ylim(-0.05, None)
         for panel in list(grid.flat)[len(names) :]:
@@ -270,11 +274,9 @@ def _switch_report(coached: CoachedFights, rows: Sequence[Mapping[str, Any]]) ->
     steps, sequences = coached.requests.shape
     period, ends = coached.period * coached.control_step, coached.outcomes()
     text = f"\n## Style switched every {period:g} s\n\n![damage, hits and health over time](timeline.png)\n\n"
-    text += "One sequence of fights, asked for every style in turn. "
-    text += (
-        f"{sequences} such sequences of {steps * coached.control_step:g} s, the others with styles in random order: "
-    )
-    text += f"{ends['fights']} fights ended, {ends['won']} of them won.\n\n"
+    text += f"One sequence of fights, asked for every style in turn. {sequences} such sequences of "
+    text += f"{steps * coached.control_step:g} s, the others with styles in random order: {ends['fights']} fights "
+    text += f"ended, {ends['won']} of them won.\n\n"
     if rows:
         formats = {"style": "", "switches": "", "complied": ".0%", "median_seconds": ".1f", "share": ".0%"}
         text += markdown_table(rows, formats)

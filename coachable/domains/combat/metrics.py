@@ -1,4 +1,4 @@
-"""Measured style of a fight: which damage, states and parts, beside what was asked."""
+"""Measures of damage, states and parts in a fight, for comparison with the requested style."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from coachable.keys import STYLE
 
 
 class CombatMeasures:
-    """What counts for each style, the style score, victory and how a fight ended.
+    """Measures of the damage that counts for each style, the style score, and the outcome of a fight.
 
-    Needs an env that emits `components` (`CombatEnv(components=True)`).
+    The environment must emit `components` (`CombatEnv(components=True)`).
 
     Args:
-        styles: names of theta's weights, in order; all 18 by default.
+        styles: Names of theta's weights, in order; all 18 by default.
     """
 
     needs = "damage, under a weight above 0"
-    """What it takes to tell whether the agent complies."""
+    """Condition under which compliance can be judged."""
 
     def __init__(self, styles: Sequence[str] | None = None) -> None:
         self.styles = check_styles(styles)
@@ -34,10 +34,10 @@ class CombatMeasures:
         self._counts = style_counts(STYLES)  # (18, 44)
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
-        """See `StyleMeasures.step`.
+        """Return the measures of a step; see `StyleMeasures.step`.
 
-        HP of damage that counts for each of the 18 styles (units for parts), all damage, and how much counts for the
-        style that theta asks for most.
+        They are the damage [HP], or units of parts, that counts for each of the 18 styles, all damage, the damage that
+        counts for the style with the largest weight ("requested"), and the outcome.
         """
         components = transition.get(("next", COMPONENTS_KEY))
         counted = components @ self._counts.T.to(components.device)  # (N, 18)
@@ -57,19 +57,19 @@ class CombatMeasures:
         }
 
     def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
-        """See `StyleMeasures.summarise`: sums over the steps that count, and the style score.
+        """Return sums over the steps that count, and the style score; see `StyleMeasures.summarise`.
 
-        The score is what counted for the style that was asked for most, over all damage; at most 1, except for the part
-        styles, whose units are removals.
+        The score is the share of the damage that counts for the style with the largest weight. It may exceed 1 for part
+        styles, for which removals count.
         """
         sums = {name: torch.where(alive, values, 0.0).sum(0) for name, values in record.items()}
         score = sums["requested"] / sums["damage"].clamp(min=1e-6)
         return {**sums, "style_score": torch.where(sums["damage"] > 0, score, torch.nan)}
 
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
-        """See `StyleMeasures.complies`: damage was done, and it counted for the style that was asked for."""
+        """Return whether damage counts for the requested style in each step; see `StyleMeasures.complies`."""
         return record["requested"] > 0
 
     def judged(self, record: Mapping[str, Tensor]) -> Tensor:
-        """(T, N) bool: damage was done while a style was asked for."""
+        """Return whether each step has damage while a style is requested, (T, N) bool."""
         return ~torch.isnan(record["requested"]) & ((record["damage"] > 0) | (record["requested"] > 0))

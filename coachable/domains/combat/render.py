@@ -1,4 +1,4 @@
-"""A fight seen from above, drawn with Pillow: facing, attacks and their warning, traps, parts, health, ammo."""
+"""Top-down images of a fight with machines, attacks, traps, parts, health and ammo, drawn with Pillow."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ _PANEL = 92  # [px] below the map
 
 
 class CombatRenderer:
-    """Draws one fight of a `CombatEnv`, below whatever transforms wrap it; the map follows the player.
+    """Renderer of one fight of a `CombatEnv` or of an environment around it; the map follows the player.
 
     Args:
-        width: of the image [px].
-        height: of the image [px], the panel included.
+        width: Width of the image [px].
+        height: Height of the image, with the panel [px].
     """
 
     def __init__(self, width: int = 640, height: int = 480) -> None:
@@ -57,7 +57,7 @@ class CombatRenderer:
         self._font = ImageFont.load_default(size=max(10, width // 54))
 
     def draw(self, env: EnvBase, row: int = 0) -> np.ndarray:
-        """Image of the current state of one fight, (height, width, 3) uint8."""
+        """Return an image (height, width, 3) uint8 of the current state of one fight."""
         while not isinstance(env, CombatEnv):
             env = cast(EnvBase, env.base_env)
         s = {name: value[..., row].cpu() for name, value in env.state.tensors().items()}
@@ -73,7 +73,7 @@ class CombatRenderer:
         return np.asarray(image)
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Do nothing, because there is nothing to release."""
 
     # -- the map ---------------------------------------------------------------------------------------------------
 

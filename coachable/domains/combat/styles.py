@@ -1,4 +1,4 @@
-"""Styles of the combat domain: 18 weights, their ranges and the training mixture (paper, Appendix C)."""
+"""Style space of the combat domain, with 18 weights, their ranges and the training mixture (paper, Appendix C)."""
 
 from __future__ import annotations
 
@@ -12,19 +12,17 @@ from coachable.styles.mixtures import Single, style_mixture
 
 
 def combat_style_space(
-    styles: Sequence[str] | None = None,
-    reward_scale: str = "sim",
-    combat_component: Single = "continuous_one_hot",
+    styles: Sequence[str] | None = None, reward_scale: str = "sim", combat_component: Single = "continuous_one_hot"
 ) -> StyleSpace:
-    """The style weights and the mixture that they are drawn from at every reset.
+    """Return the space of the style weights with the mixture from which they are drawn at a reset.
 
     Args:
-        styles: names of the weights, as in `CombatEnv(styles=...)`; all 18 if None.
-        reward_scale: "sim" ranges fit the damage rates of this simulator, "paper" are the paper's.
-        combat_component: third component of the mixture, see `coachable.styles.mixtures.style_mixture`.
+        styles: Names of the weights, as in `CombatEnv(styles=...)`; all 18 by default.
+        reward_scale: "sim" for ranges that fit the damage rates of this simulator, or "paper" for the paper's.
+        combat_component: Third component of the mixture, see `coachable.styles.mixtures.style_mixture`.
 
     Raises:
-        ValueError: if a name or an option is unknown.
+        ValueError: If a name or an option is unknown.
     """
     names = check_styles(styles)
     if reward_scale not in REWARD_SCALES:
@@ -43,7 +41,10 @@ def combat_style_space(
 
 
 def single_styles(space: StyleSpace) -> list[dict[str, float]]:
-    """No style, then each weight alone at the ends of the range that reports sweep (the lower end if it is not 0)."""
+    """Return the neutral style, and each weight alone at the upper and, if it is not 0, the lower end of its range.
+
+    The range is the one that reports sweep.
+    """
     neutral = dict.fromkeys(space.names, 0.0)
     cells = [neutral]
     for weight in space.parameters:
@@ -54,9 +55,9 @@ def single_styles(space: StyleSpace) -> list[dict[str, float]]:
 
 
 def combat_style_reward(space: StyleSpace) -> StyleReward:
-    """Style part of the reward, sum_i w_i g_i: `style_features` holds the g_i in the order of the space's weights.
+    """Return the style reward sum_i w_i g_i, where `style_features` has the g_i in the order of the space's weights.
 
     Args:
-        space: of `combat_style_space`, with the same styles as the environment.
+        space: Result of `combat_style_space` with the styles of the environment.
     """
     return StyleReward(space, {"styles": WeightedSum(space.names)})

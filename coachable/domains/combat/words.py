@@ -1,4 +1,4 @@
-"""What a coach says to the fighter."""
+"""Words of the coach's commands to the player."""
 
 from coachable.domain import Words
 

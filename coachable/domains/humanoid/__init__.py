@@ -1,4 +1,4 @@
-"""The DeepMind Control humanoid, walking with a requested arm pose and step length."""
+"""Domain of the DeepMind Control humanoid that walks with a requested arm pose and step length."""
 
 from coachable.domains.humanoid.events import humanoid_events
 from coachable.domains.humanoid.styles import humanoid_style_reward, humanoid_style_space

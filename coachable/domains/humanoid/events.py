@@ -1,4 +1,4 @@
-"""Rare events of the humanoid, for the event tables."""
+"""Rare events that fill the replay tables of the humanoid."""
 
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -9,7 +9,7 @@ from coachable.replay.routing import PredicateEvents
 
 
 def humanoid_events() -> PredicateEvents:
-    """Tables "step", of strikes of the expected foot, and "fall"."""
+    """Return the events "step", which are strikes of the expected foot, and "fall"."""
     return PredicateEvents({"step": _step, "fall": _fall})
 
 

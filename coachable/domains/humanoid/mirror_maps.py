@@ -1,8 +1,8 @@
-"""The humanoid's left-right symmetry: what each observation, action and style feature becomes in the mirror.
+"""Mirror maps of the humanoid's observations, actions and style features, for its left-right symmetry.
 
-The mirror is the vertical plane through the course. It turns y and rotations about x and z around. Joints of the left
-side whose axis is the mirrored one (hips, knees, elbows) swap with their sign kept; those whose axis the mirror turns
-around (shoulders, ankle_x) change sign.
+The mirror is the vertical plane through the course. It reverses y and rotations about x and z. Joints swap sides. Their
+signs stay the same if the axis on one side is the mirror image of that on the other (hips, knees, elbows), and change
+otherwise (shoulders, ankle_x).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def _keep(signs: tuple[int, ...]) -> tuple[list[int], list[int]]:
 
 
 def _swap(signs: tuple[int, ...]) -> tuple[list[int], list[int]]:
-    """Two halves, one per side, that swap."""
+    """Return the map of two halves, one per side, that swap."""
     n = len(signs)
     return [*range(n, 2 * n), *range(n)], [*signs, *signs]
 
@@ -63,7 +63,7 @@ STYLE_FEATURES = _map(_join(_swap(_ARM), _keep((1,) * (STYLE_FEATURES_SIZE - NUM
 
 
 def humanoid_mirror_maps() -> dict[str | tuple[str, ...], MirrorMap]:
-    """Mirror maps of a stored transition, for `MirrorSymmetry`."""
+    """Return the mirror maps of a stored transition by key, for `MirrorSymmetry`."""
     return {
         "observation": OBSERVATION,
         "action": ACTION,

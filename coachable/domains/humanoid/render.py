@@ -1,4 +1,4 @@
-"""Frames of one humanoid, headless."""
+"""Off-screen images of one humanoid."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ CAMERA_AZIMUTH = 125.0  # [deg] relative to the course
 
 
 class HumanoidRenderer:
-    """Draw one humanoid of a `HumanoidEnv`, below whatever transforms wrap it; the camera follows the torso.
+    """Renderer of one humanoid of a `HumanoidEnv` or of an environment around it; the camera follows the torso.
 
     Args:
-        width: image width [px].
-        height: image height [px].
+        width: Width of the image [px].
+        height: Height of the image [px].
 
     Raises:
-        RenderingError: if no OpenGL library is installed; names the package that gives one.
+        RenderingError: If no OpenGL library is installed.
     """
 
     def __init__(self, width: int = 640, height: int = 480) -> None:
@@ -47,7 +47,7 @@ class HumanoidRenderer:
         self._data.qpos[:] = positions
         mujoco.mj_forward(self._model, self._data)
         camera = self._offscreen.camera
-        camera.lookat[:] = (positions[0], positions[1], 0.9)  # a fixed height, steady while the torso bobs
+        camera.lookat[:] = (positions[0], positions[1], 0.9)  # a fixed height, because the torso moves up and down
         camera.azimuth = CAMERA_AZIMUTH + np.rad2deg(course)
         return self._offscreen.draw(self._data)
 

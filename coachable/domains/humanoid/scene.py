@@ -1,4 +1,4 @@
-"""The humanoid on the live page, in 3-D."""
+"""3-D view of the humanoid on the live page."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from coachable.envs.humanoid.model import load_spec
 if TYPE_CHECKING:
     import viser
 
-_START = (2.0, -2.0, 1.3)  # [m], of the camera
-_VISERS_START = (3.0, 3.0, 3.0)  # before a browser has heard of it
+_START = (2.0, -2.0, 1.3)  # [m], initial position of the camera
+_VISERS_START = (3.0, 3.0, 3.0)  # [m], viser's default until the browser receives `_START`
 
 
 class HumanoidScene:
-    """The humanoid in 3-D, followed by the camera, with an arrow along the course.
+    """3-D view of the humanoid, which the camera follows, with an arrow along the course.
 
-    mjviser is at 0.0.x: this is the only place that touches it.
+    Only this class uses mjviser, because mjviser's interface is not stable yet (version 0.0.x).
     """
 
     def __init__(self, server: viser.ViserServer, session: CoachSession) -> None:
@@ -33,7 +33,7 @@ class HumanoidScene:
         self._model = load_spec().compile()
         self._data = mujoco.MjData(self._model)
         self._scene = ViserMujocoScene(server, self._model, num_envs=1)
-        self._scene.camera_tracking_enabled = False  # it would also follow the bobbing of the torso
+        self._scene.camera_tracking_enabled = False  # it would also follow the torso up and down
         self._torso = self._model.body("torso").id
         server.scene.set_up_direction("+z")
         server.initial_camera.position = _START
@@ -43,7 +43,10 @@ class HumanoidScene:
         self._course: float | None = None
 
     def update(self) -> None:
-        """See `View.update`. The world moves, so that the camera, which belongs to the viewer, need not."""
+        """Show the present state; see `View.update`.
+
+        The world moves instead of the camera, because each viewer controls their own camera.
+        """
         self._data.qpos[:] = self._env.simulation.positions[0]
         self._mujoco.mj_kinematics(self._model, self._data)
         offset = np.array([*self._data.xpos[self._torso, :2], 0.0])
@@ -67,16 +70,16 @@ class HumanoidScene:
 
 
 def _watch_from_above_the_panel(client: viser.ClientHandle) -> None:
-    """Shows the agent in the upper part of a narrow window, also after the browser has put its camera at the start."""
+    """Show the agent in the upper part of a narrow window, also after the browser has reset its camera."""
     _raise_agent(client.camera)
     client.camera.on_update(_raise_agent)
 
 
 def _raise_agent(camera: viser.CameraHandle) -> None:
-    """Takes a narrow window's camera back and points it lower, unless the user has moved it."""
+    """Move a narrow window's camera back and point it lower, unless the user has moved it."""
     untouched = any(np.allclose(camera.position, start, atol=1e-3) for start in (_START, _VISERS_START))
     if camera.image_width <= PHONE and untouched:
-        with contextlib.suppress(ValueError):  # the browser told of a camera that cannot be
+        with contextlib.suppress(ValueError):  # the browser reported an invalid camera
             camera.up_direction = (0.0, 0.0, 1.0)
             camera.position = (3.0, -3.0, 1.3)
             camera.look_at = (0.0, 0.0, -0.9)

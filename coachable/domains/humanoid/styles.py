@@ -1,4 +1,4 @@
-"""Styles of the humanoid: three arm poses and a step length, and the reward terms that ask for them."""
+"""Style space of the humanoid, with three arm poses and a step length, and the reward terms of its styles."""
 
 from __future__ import annotations
 
@@ -27,18 +27,14 @@ STEP_LENGTH_RANGE = (0.30, 0.65)  # [m]
 # Joint bounds of each pose [deg]: right shoulder1, shoulder2, elbow. The left arm mirrors the shoulder joints' signs.
 # Centres: the reach of the hand in the pose's direction, maximised within the joint limits; the elbow nearly straight.
 _SHOULDER_HALF_WIDTH_DEG = 15.0
-_SHOULDER_CENTRES_DEG = {
-    "arms_in_front": (-2.0, 46.0),
-    "arms_up": (-85.0, 16.0),
-    "t_pose": (-56.0, -27.0),
-}
+_SHOULDER_CENTRES_DEG = {"arms_in_front": (-2.0, 46.0), "arms_up": (-85.0, 16.0), "t_pose": (-56.0, -27.0)}
 _ELBOW_BOUNDS_DEG = (-90.0, -70.0)
 POSES = tuple(_SHOULDER_CENTRES_DEG)
 POSE_MARGIN_DEG = 30.0
 _POSE_GUIDE_MARGIN_DEG = 120.0
 
 LENGTH_MARGIN = 0.05  # [m] (paper)
-_NEAR_MARGIN, _FAR_MARGIN = 0.25, 0.5  # [m], of the gait's guide
+_NEAR_MARGIN, _FAR_MARGIN = 0.25, 0.5  # [m], margins of the gait's guide
 STRIDE_FRACTION_BOUNDS = (1 / 3, 2 / 3)
 _STRIDE_FRACTION_MARGIN = 1 / 6
 KNEE_RANGE_DEG = (-145.0, 0.0)
@@ -46,7 +42,7 @@ _KNEE_MARGIN_DEG = 30.0
 
 
 def pose_bounds_deg() -> np.ndarray:
-    """Joint bounds (3 poses, 6 arm joints, lower and upper) [deg], in the order of `POSES` and `ARM_JOINTS`."""
+    """Return lower and upper joint bounds of the poses, (3, 6, 2), in the order of `POSES` and `ARM_JOINTS` [deg]."""
     bounds = []
     for shoulder1, shoulder2 in _SHOULDER_CENTRES_DEG.values():
         right = [(c - _SHOULDER_HALF_WIDTH_DEG, c + _SHOULDER_HALF_WIDTH_DEG) for c in (shoulder1, shoulder2)]
@@ -56,10 +52,10 @@ def pose_bounds_deg() -> np.ndarray:
 
 
 def humanoid_style_space() -> StyleSpace:
-    """Arm pose and step length, drawn independently and uniformly at reset.
+    """Return the space of arm pose and step length, which are drawn independently and uniformly at a reset.
 
-    The step length is encoded over its range, not divided by its bound (deviation from Appendix C's f(theta)): 0.30 to
-    0.65 m would otherwise reach the network as 0.46 to 1, a signal small beside the other eighty inputs.
+    The step length is encoded over its range and not divided by its bound (deviation from Appendix C's f(theta)).
+    Otherwise 0.30 to 0.65 m would become 0.46 to 1 in the network's input, a small signal among eighty others.
     """
     low, high = STEP_LENGTH_RANGE
     return StyleSpace(
@@ -82,37 +78,31 @@ def humanoid_style_reward(
     gait_guide_scale: float = 1.5,
     timeout_penalty: float = 0.1,
 ) -> StyleReward:
-    """Style part of the reward: lambda_pose * r_pose + lambda_gait * r_gait (Appendix C, DMC Humanoid), and two guides.
+    """Return the style reward lambda_pose * r_pose + lambda_gait * r_gait (Appendix C, DMC Humanoid) with two guides.
 
-    The paper's tolerances are narrow: a shoulder that is 90 degrees off, or a step that is 0.2 m off, earns next to
-    nothing more for being less far off. The guides reward the same quantities over their whole range and lead there;
-    with scales of 0 the reward is the paper's.
+    The paper's tolerances are narrow: far from the target, such as 90 degrees at a shoulder or 0.2 m in a step, an
+    improvement earns almost nothing. The guides reward the same quantities over their whole range. With guide scales of
+    0 the reward is the paper's.
 
     Args:
-        space: the humanoid's style space.
-        pose_scale: lambda_pose.
-        pose_guide_scale: of the pose's guide.
-        gait_scale: lambda_gait.
-        gait_guide_scale: of the gait's guide.
-        timeout_penalty: v_m, taken off r_gait in every control step in which the step is timed out.
+        space: Style space of the humanoid.
+        pose_scale: Scale lambda_pose of the pose.
+        pose_guide_scale: Scale of the pose's guide.
+        gait_scale: Scale lambda_gait of the gait.
+        gait_guide_scale: Scale of the gait's guide.
+        timeout_penalty: Penalty v_m that r_gait subtracts in every control step in which the step is timed out.
     """
     bounds = torch.from_numpy(np.deg2rad(pose_bounds_deg()))
 
     def arms(margin_deg: float, sigmoid: str, value_at_margin: float) -> ChoiceTolerance:
-        """Mean over the six arm joints of their closeness to the requested bounds."""
+        """Return the mean closeness of the six arm joints to the requested bounds."""
         joints, margin = slice(0, NUM_ARM_JOINTS), math.radians(margin_deg)
         return ChoiceTolerance("pose", joints, bounds[..., 0], bounds[..., 1], margin, sigmoid, value_at_margin)
 
     def gait(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
-        length, target = features[..., LENGTH], style["step_length"]
+        length, fraction, target = features[..., LENGTH], features[..., STRIDE_FRACTION], style["step_length"]
         score = tolerance(length, target, target, LENGTH_MARGIN, "long_tail")
-        score = score * tolerance(
-            features[..., STRIDE_FRACTION],
-            *STRIDE_FRACTION_BOUNDS,
-            margin=_STRIDE_FRACTION_MARGIN,
-            sigmoid="linear",
-            value_at_margin=0.0,
-        )
+        score = score * tolerance(fraction, *STRIDE_FRACTION_BOUNDS, _STRIDE_FRACTION_MARGIN, "linear", 0.0)
         knee_low, knee_high = (math.radians(angle) for angle in KNEE_RANGE_DEG)
         knee_margin = math.radians(_KNEE_MARGIN_DEG)
         score = score * tolerance(features[..., KNEE_MIN], knee_low, math.inf, knee_margin, "linear", 0.0)
@@ -122,7 +112,7 @@ def humanoid_style_reward(
     def gait_guide(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
         error = (features[..., LENGTH] - style["step_length"]).abs()
         near = tolerance(error, margin=_NEAR_MARGIN, sigmoid="long_tail")
-        # Below zero too: otherwise a gallop, one foot always behind the other, loses nothing.
+        # Negative values penalise a gallop, in which one foot is always behind the other.
         far = (1 - error / _FAR_MARGIN).clamp(min=-1.0)
         return _per_control_step(features, 0.5 * (near + far))
 
@@ -134,15 +124,10 @@ def humanoid_style_reward(
             "gait": Term(gait, parameters=("step_length",)),
             "gait_guide": Term(gait_guide, parameters=("step_length",)),
         },
-        scales={
-            "pose": pose_scale,
-            "pose_guide": pose_guide_scale,
-            "gait": gait_scale,
-            "gait_guide": gait_guide_scale,
-        },
+        scales={"pose": pose_scale, "pose_guide": pose_guide_scale, "gait": gait_scale, "gait_guide": gait_guide_scale},
     )
 
 
 def _per_control_step(features: Tensor, score: Tensor) -> Tensor:
-    """Pays a completed step's score once for each control step that it took, whatever the cadence."""
+    """Return the score of a completed step times its number of control steps, which is independent of the cadence."""
     return features[..., COMPLETED] * (features[..., DURATION] / CONTROL_STEP) * score

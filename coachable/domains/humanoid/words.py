@@ -1,4 +1,4 @@
-"""What a coach says to the humanoid, and how it is steered."""
+"""Words of the coach's commands to the humanoid, and the control of its course."""
 
 import math
 
@@ -13,9 +13,7 @@ def _steer(env: EnvBase, course_deg: float) -> None:
 
 
 COURSE = Control(
-    Setpoint("course", -180.0, 180.0, unit="deg", help="direction of walking, left is positive"),
-    _steer,
-    circular=True,
+    Setpoint("course", -180.0, 180.0, unit="deg", help="direction of walking, left is positive"), _steer, circular=True
 )
 
 WORDS = Words(
@@ -24,15 +22,7 @@ WORDS = Words(
         "pose": ("arm", "hand", "posture", "elbow"),
         "pose=arms_up": (
             *("up", "arms raised", "raise arms", "raise both arms", "lift arms", "hands up", "hands high"),
-            *(
-                "overhead",
-                "above head",
-                "over head",
-                "reach up",
-                "arms high",
-                "arms in the air",
-                "hands in the air",
-            ),
+            *("overhead", "above head", "over head", "reach up", "arms high", "arms in the air", "hands in the air"),
         ),
         "pose=arms_in_front": ("forward", "front", "in front", "ahead", "zombie", "sleepwalker"),
         "pose=t_pose": ("t shape", "t", "sideway", "to side", "out to side", "spread", "aeroplane", "airplane"),

@@ -1,4 +1,4 @@
-"""Three families of driving style: saving tyres and fuel, drifting, and margins to other cars."""
+"""Three racing domains, one per family of driving style: saving tyres and fuel, drifting, and margins to other cars."""
 
 from coachable.domains.racing.events import racing_events
 from coachable.domains.racing.styles import (

@@ -1,4 +1,4 @@
-"""Declarations of the three racing domains, one per family of style."""
+"""Function that declares the three racing domains, one per family of styles."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ from coachable.envs.racing.physics.simulation import CONTROL_STEP
 from coachable.envs.racing.race.observation import COURSE_POINTS, observation_groups
 from coachable.envs.racing.race.scenarios import rolling_start
 
-# Of a training's environment, what an agent is not shown or measured with: how many cars learn, among whom, how their
-# episodes start, what they are rewarded for.
+# Options of a training's environment that do not apply when an agent is shown or measured.
 _OF_TRAINING = ("_target_", "family", "num_envs", "scenarios", "conditions", "weights", "driver")
 
 
@@ -30,25 +29,25 @@ def racing_domain(
     evaluation: Callable[..., str],
     **options: Any,
 ) -> Domain:
-    """The domain of a family of style.
+    """Return the domain of a family of styles.
 
     Args:
-        family: drift, resources or aggressiveness.
-        cars: of a race.
-        grid: see `Domain`.
-        columns: what is published beside survival, pace, time off course and changes of the steering command.
-        evaluation: what `coachable evaluate` calls.
-        **options: of the environment, where an agent is shown and measured otherwise than it is trained.
+        family: Name of the family: "drift", "resources" or "aggressiveness".
+        cars: Number of cars in a race.
+        grid: Evaluation grid, as in `Domain`.
+        columns: Published columns beside survival, pace, time off course and changes of the steering command.
+        evaluation: Function that `coachable evaluate` calls.
+        **options: Options of the environment that differ from training when an agent is shown and measured.
     """
     make_env, make_space, make_reward = racing_family(family)
 
     def as_trained(settings: Mapping[str, Any]) -> Domain:
-        """With the track, the car and the observation of a training, and its length of an episode."""
+        """Return the domain with the track, car, observation and episode length of a training."""
         chosen = {name: value for name, value in settings.items() if name not in _OF_TRAINING}
         chosen |= {"compiled": False, "device": "cpu", **options}
         chosen.setdefault("opponents", chosen.get("cars", cars) > 1)
         coached = {}
-        if cars == 1 and (met := chosen.pop("cars", 1)) > 1:  # measured alone, whoever was there when it learnt
+        if cars == 1 and (met := chosen.pop("cars", 1)) > 1:  # agents trained in traffic are measured alone, too
             coached = {"cars": met, "scenarios": rolling_start(met)}
         pool, points = chosen.get("car") == "pool", chosen.get("course_points", COURSE_POINTS)
         return replace(

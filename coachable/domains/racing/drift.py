@@ -6,7 +6,7 @@ from coachable.envs.racing.race.features import DRIFT_NAMES
 
 _NONE: dict[str, float] = dict.fromkeys(DRIFT_NAMES, 0.0)
 _ALL: dict[str, float] = dict.fromkeys(DRIFT_NAMES, 5.0)
-_REAR = ("slip_angle_rear", "slip_ratio_rear")  # together they make the car slide
+_REAR = ("slip_angle_rear", "slip_ratio_rear")  # the car slides if both are asked for
 
 DOMAIN = racing_domain(
     "drift",

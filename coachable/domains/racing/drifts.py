@@ -1,4 +1,4 @@
-"""How far a car drives sideways under rising drift weights, and what that costs."""
+"""Evaluation of drifting: the slip angle under rising weights, and its cost in pace."""
 
 from __future__ import annotations
 
@@ -32,18 +32,19 @@ _METRICS = ("slip_angle_rear", "slip_angle_front", "pace", "off", "turns", "surv
 
 
 def evaluate_drift(domain: Domain, agent: LoadedPolicy, out: Path, settings: EvaluationSettings) -> str:
-    """Drive under rising weights, of the rear slip angle alone, with the ratio, and of all four, from ordinary starts.
+    """Evaluate an agent under rising drift weights, from ordinary starts, and write the results.
 
-    Files: `drift.csv` (by weight), `drift.png`, `report.md`, `summary.json`.
+    The weights of the rear slip angle, of the rear slip angle and ratio, and of all four quantities rise in turn. The
+    files are `drift.csv` (by weight), `drift.png`, `report.md` and `summary.json`.
 
     Args:
-        domain: racing_drift, as the agent was trained in.
-        agent: the policy; acts deterministically.
-        out: folder, created if missing.
-        settings: `episodes` per weight, each from its own place on the track.
+        domain: Domain racing_drift, as the agent was trained in.
+        agent: Policy, which acts deterministically.
+        out: Folder, which is created if it is missing.
+        settings: `episodes` is the number of episodes per weight, each from its own place on the track.
 
     Returns:
-        The report, Markdown.
+        The report as Markdown.
     """
     out.mkdir(parents=True, exist_ok=True)
     cells = [dict.fromkeys(names, weight) for names in SWEEPS.values() for weight in WEIGHTS]
@@ -57,15 +58,12 @@ def evaluate_drift(domain: Domain, agent: LoadedPolicy, out: Path, settings: Eva
         **settings.rollout,
     )
     values = {name: value.reshape(len(SWEEPS), len(WEIGHTS), -1) for name, value in grid.episodes.items()}
-    rows = [
-        row
-        for index, sweep in enumerate(SWEEPS)
-        for row in _rows(sweep, {name: value[index] for name, value in values.items()})
-    ]
-    weights = np.repeat(np.array(WEIGHTS)[:, None], settings.episodes, 1).ravel()
+    weights = np.repeat(WEIGHTS, settings.episodes)
+    rows: list[dict[str, Any]] = []
     summary: dict[str, Any] = {}
     for index, sweep in enumerate(SWEEPS):
-        own = [row for row in rows if row["sweep"] == sweep]
+        own = _rows(sweep, {name: value[index] for name, value in values.items()})
+        rows += own
         summary[sweep] = {
             "rank_correlation": rank_correlation(weights, values[ANGLE][index].ravel()),
             "angle_at_none": own[WEIGHTS.index(0.0)][ANGLE],
@@ -79,7 +77,7 @@ def evaluate_drift(domain: Domain, agent: LoadedPolicy, out: Path, settings: Eva
 
 
 def _rows(sweep: str, episodes: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
-    """Means by weight, with 95 % intervals of the angle, of values (weights, episodes)."""
+    """Return the means of values (weights, episodes) by weight, with 95 % intervals of the angle."""
     neutral = float(np.nanmean(episodes["pace"][WEIGHTS.index(0.0)]))
     rows = []
     for index, weight in enumerate(WEIGHTS):
@@ -92,7 +90,7 @@ def _rows(sweep: str, episodes: Mapping[str, np.ndarray]) -> list[dict[str, Any]
 
 
 def draw_drift(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Mean rear slip angle with its 95 % interval, and pace, over the weight, a line per sweep."""
+    """Draw the mean rear slip angle with its 95 % interval, and the pace, over the weight, with a line per sweep."""
     with drawing(path, 1, 2, size=(9.0, 3.8)) as ((left, right),):
         for sweep, marker in zip(SWEEPS, "ovs", strict=True):
             own = [row for row in rows if row["sweep"] == sweep]
@@ -104,7 +102,7 @@ def draw_drift(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
             left.axhline(line, color="0.6", lw=1, ls=":")
         left.set(xlabel="requested weight", ylabel="slip angle of the rear tyres [deg], 95 %")
         right.set(xlabel="requested weight", ylabel="progress, share of that at 0")
-        right.legend(fontsize=8, loc="lower left")  # of both: on the left the lines leave no room
+        right.legend(fontsize=8, loc="lower left")  # for both panels: the lines of the left one leave no room
         for panel in (left, right):
             panel.set_ylim(0.0, None)
 
@@ -114,18 +112,10 @@ def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Map
     text += f"{policy_sentence(agent)}; {summary['episodes_per_weight']} episodes of "
     text += f"{steps} steps per weight, ordinary starts, the other weights 0, seed {summary['seed']}.\n\n"
     text += "![slip angle over weight](drift.png)\n\n"
-    formats = {
-        "sweep": "",
-        "weight": "g",
-        "slip_angle_rear": ".1f",
-        "slip_angle_front": ".1f",
-        "pace": ".1f",
-        "pace_kept": ".0%",
-    }
-    text += markdown_table(rows, formats | {"off": ".1%", "turns": ".1f", "most_turns": ".0f", "survived": ".0%"})
-    text += (
-        "\nSlip angles in degrees (0 below 5 m/s), pace in m/s along the track, turns: largest rotation against the "
-    )
-    text += "track in one direction, in whole turns, mean and most over episodes.\n\n"
+    formats = {"sweep": "", "weight": "g", "slip_angle_rear": ".1f", "slip_angle_front": ".1f", "pace": ".1f"}
+    formats |= {"pace_kept": ".0%", "off": ".1%", "turns": ".1f", "most_turns": ".0f", "survived": ".0%"}
+    text += markdown_table(rows, formats)
+    text += "\nSlip angles in degrees (0 below 5 m/s), pace in m/s along the track, turns: largest rotation against "
+    text += "the track in one direction, in whole turns, mean and most over episodes.\n\n"
     ranks = ", ".join(f"{sweep} {summary[sweep]['rank_correlation']:.2f}" for sweep in SWEEPS)
     return text + f"Rank correlation of weight and rear slip angle: {ranks}.\n"

@@ -1,4 +1,4 @@
-"""Events that fill the replay tables of racing: rare or hard moments (Kompella et al. 2023)."""
+"""Rare or hard events that fill the replay tables of racing (Kompella et al. 2023)."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from coachable.envs.racing.race.observation import own_columns
 from coachable.keys import STYLE_FEATURES
 from coachable.replay import PredicateEvents
 
-SLIDE = math.radians(20.0)  # mean slip angle of the rear tyres
-TOW = 0.3  # strength of a slipstream that counts
+SLIDE = math.radians(20.0)  # mean slip angle of the rear tyres above which a car slides
+TOW = 0.3  # strength above which a slipstream counts
 
 
 def racing_events(family: str = "resources") -> PredicateEvents:
-    """Tables of a family's training.
+    """Return the events of a family's replay tables.
 
-    "recovery" (three wheels off the track) in all families; "slide" (rear slip angle above 20 degrees) alone on the
-    track; "contact", "overtake" (metres gained on a car ahead) and "slipstream" in races.
+    All families have "recovery" (three wheels off the track). Races have "contact", "overtake" (metres gained on a car
+    ahead) and "slipstream" as well, the other families "slide" (rear slip angle above 20 degrees).
 
     Args:
-        family: drift, resources or aggressiveness.
+        family: Name of the family: "drift", "resources" or "aggressiveness".
 
     Raises:
-        ValueError: if there is no such family.
+        ValueError: If there is no such family.
     """
-    racing_family(family)  # raises if there is none
+    racing_family(family)  # raises an error if there is none
     tables = {"recovery": _off_course}
     if family == "aggressiveness":
         tables |= {"contact": _contact, "overtake": _overtake, "slipstream": _slipstream}
@@ -39,7 +39,7 @@ def racing_events(family: str = "resources") -> PredicateEvents:
 
 
 def _flags(steps: TensorDictBase) -> Tensor:
-    """Off course, wall, contact, (N, 3)."""
+    """Return the flags off course, wall and contact, (N, 3)."""
     return steps["next", "observation"][..., own_columns("flags")]
 
 

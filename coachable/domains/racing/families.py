@@ -1,4 +1,4 @@
-"""The environments that the three families of style are trained in."""
+"""Training environments, style spaces and style rewards of the three families of styles."""
 
 from __future__ import annotations
 
@@ -25,25 +25,30 @@ from coachable.envs.racing.race.task import TaskWeights
 from coachable.styles import StyleReward, StyleSpace
 
 RIVALS_GRIP = 0.97  # of the fastest scripted opponents; the slowest use 0.8
-TYRE_HEAT = 900.0  # [m] that all grip is worth for the minute that heat takes to go
+TYRE_HEAT = 900.0  # [m], progress that all grip is worth during the minute in which heat dissipates
 AGENTS, CARS = 3, 5  # in a race of the aggressiveness family
 
 
 def drift_env(num_envs: int = 64, **options: Any) -> RacingEnv:
-    """Street car on Ridge, launched anywhere in any direction; it may slide backwards for ten seconds."""
-    defaults: dict[str, Any] = {
-        "track": "ridge",
-        "car": "street",
-        "scenarios": drift_scenarios(),
-        "wrong_way_time": 10.0,
-    }
-    return RacingEnv(num_envs, **(defaults | options))
+    """Make the environment of drifting: a street car on Ridge, launched anywhere in any direction.
+
+    The car may slide backwards for ten seconds.
+
+    Args:
+        num_envs: Number of cars that the agent drives.
+        **options: Options of `RacingEnv`.
+    """
+    options = {"track": "ridge", "car": "street", "scenarios": drift_scenarios(), "wrong_way_time": 10.0} | options
+    return RacingEnv(num_envs, **options)
 
 
 def resource_env(num_envs: int = 64, **options: Any) -> RacingEnv:
-    """X2019 on Lakeside, tyres and fuel of any state; stints last about ten laps.
+    """Make the environment of saving: an X2019 on Lakeside with random tyres and fuel, for stints of about ten laps.
 
-    With several `cars`, all are agents, or one is, among scripted ones, where `num_envs` is no multiple of them.
+    Args:
+        num_envs: Number of cars that the agent drives. If it is not a multiple of `cars`, the agent drives one car of
+            each race and the others are scripted.
+        **options: Options of `RacingEnv`.
     """
     cars = options.get("cars", 1)
     if num_envs % cars:
@@ -59,20 +64,23 @@ def resource_env(num_envs: int = 64, **options: Any) -> RacingEnv:
 
 
 def race_env(num_envs: int = 65, **options: Any) -> RacingEnv:
-    """Five cars of one model from the pool on Endurance, on any compound; the agent drives all of them."""
-    defaults: dict[str, Any] = {
-        "cars": 5,
-        "track": "endurance",
-        "car": "pool",
-        "conditions": Conditions.any_compound(),
-    }
-    return RacingEnv(num_envs, **(defaults | options))
+    """Make races of five cars on Endurance, with one model from the pool per race and any compound.
+
+    Args:
+        num_envs: Number of cars, all of which the agent drives.
+        **options: Options of `RacingEnv`.
+    """
+    options = {"cars": 5, "track": "endurance", "car": "pool", "conditions": Conditions.any_compound()} | options
+    return RacingEnv(num_envs, **options)
 
 
 def rival_env(num_envs: int = AGENTS * 21, **options: Any) -> RacingEnv:
-    """Three agents among two rivals, scripted or copies of the policy (`Rivals`), GT3 cars, all kinds of starts.
+    """Make races of GT3 cars against rivals, which are scripted or copies of the policy, from all kinds of starts.
 
-    One agent among four rivals where `num_envs` is no multiple of three.
+    Args:
+        num_envs: Number of cars that the agent drives: three of the five cars of each race, or one if it is not a
+            multiple of three.
+        **options: Options of `RacingEnv`.
     """
     course, driver = _line_follower(options, "endurance", "gt3")
     space = aggressiveness_style_space()
@@ -87,14 +95,14 @@ def rival_env(num_envs: int = AGENTS * 21, **options: Any) -> RacingEnv:
 
 
 def _line_follower(options: Mapping[str, Any], track: str, car: str) -> tuple[Track, LineFollower]:
-    """The track of an environment with these options, and the fastest scripted opponent on it."""
+    """Return the track of an environment with these options, and the fastest scripted opponent on it."""
     chosen = options.get("track", track)
     course = load_track(chosen) if isinstance(chosen, str) else chosen
     return course, LineFollower(course, load_car(options.get("car", car)), grip=RIVALS_GRIP, lanes=(0.0, 2.2, -2.2))
 
 
 class Family(NamedTuple):
-    """What a family of styles is trained with."""
+    """Functions that make the environment, the style space and the style reward of a family."""
 
     make_env: Callable[..., RacingEnv]
     make_space: Callable[[], StyleSpace]
@@ -110,10 +118,10 @@ FAMILIES = tuple(_FAMILIES)
 
 
 def racing_family(family: str) -> Family:
-    """Return the family of that name.
+    """Return a family by its name.
 
     Raises:
-        ValueError: naming the families.
+        ValueError: If there is no such family.
     """
     if family not in _FAMILIES:
         raise ValueError(f"unknown family {family!r}: expected drift, resources or aggressiveness")
@@ -121,17 +129,20 @@ def racing_family(family: str) -> Family:
 
 
 def family_env(num_envs: int = 64, *, family: str, **options: Any) -> RacingEnv:
-    """The environment of a family.
+    """Make the training environment of a family.
 
     Args:
-        num_envs: cars that the agent drives.
-        family: drift, resources or aggressiveness.
-        **options: of `RacingEnv`.
+        num_envs: Number of cars that the agent drives.
+        family: Name of the family: "drift", "resources" or "aggressiveness".
+        **options: Options of `RacingEnv`.
+
+    Raises:
+        ValueError: If there is no such family.
     """
     return racing_family(family).make_env(num_envs, **options)
 
 
 def family_style(family: str) -> tuple[StyleSpace, Callable[..., StyleReward]]:
-    """Style space and `make_style_reward(space, **settings)` of a family."""
+    """Return the style space of a family and its function `make_style_reward(space, **settings)`."""
     found = racing_family(family)
     return found.make_space(), found.make_reward

@@ -1,10 +1,10 @@
-"""Lap time against tyre wear and fuel without learning: a dynamic programme over speeds on a fixed line.
+"""Trade-off of lap time against tyre wear and fuel, by dynamic programming over speeds on a fixed line.
 
     python -m coachable.domains.racing.frontier docs/results/racing
 
-The car is a point mass with a friction ellipse, an engine and brakes. A lap is cut into stages of about 6 m; in each
-the programme chooses throttle or brakes so as to minimise lap time + λ · resource. Sweeping λ gives the trade-off that
-any driver of this line is bound to, but for what a point mass leaves out.
+The car is a point mass with a friction ellipse, an engine and brakes. A lap consists of stages of about 6 m. In each
+stage the programme chooses throttle or brakes to minimise lap time + λ · resource. A sweep of λ gives the best
+trade-off on this line, apart from the effects that a point mass neglects.
 """
 
 from __future__ import annotations
@@ -43,21 +43,21 @@ RESOURCES = ("tyre", "fuel")
 TANK = 100.0  # [l]
 WORN = 0.75  # mean wear that ends a stint
 _TOO_FAST = 1e4  # [s], cost of a speed that the corner does not allow
-_CRUISE = (0.56, 0.34)  # engine speed over its highest at no and at full power: the middle of the gearbox's shift band
-
+# Engine speed relative to its highest, as a constant and a slope over power: the middle of the gearbox's shift band.
+_CRUISE = (0.56, 0.34)
 
 Rows = list[dict[str, Any]]
 
 
 @dataclass(frozen=True)
 class Lap:
-    """One lap of the programme's driver.
+    """Result of one lap.
 
     Attributes:
-        time: [s].
-        fuel: [l].
-        wear: mean of the tyres.
-        speeds: (S,) at the start of each stage [m/s].
+        time: Lap time [s].
+        fuel: Fuel used [l].
+        wear: Mean wear of the tyres.
+        speeds: Speeds at the start of each stage (S,) [m/s].
     """
 
     time: float
@@ -67,14 +67,14 @@ class Lap:
 
 
 class LapProgramme:
-    """The cheapest ways round a track for one car.
+    """Dynamic programme for the laps of least cost of one car on one track.
 
     Args:
-        track: circuit.
-        car: parameters, numbers.
-        resources: wear and fuel rates; the latter's exponent decides how much part throttle saves.
-        fuel: load, half a tank by default [l].
-        line: (n,) offset from the centre line [m]; default the line of least curvature.
+        track: Circuit.
+        car: Parameters of one car, as numbers.
+        resources: Wear and fuel rates; `fuel_exponent` determines how much part throttle saves.
+        fuel: Fuel on board, half a tank by default [l].
+        line: Offset from the centre line (n,); by default the line of least curvature [m].
 
     Example:
         >>> programme = LapProgramme(load_track("ring"), load_car("gt3"), Resources(wear=1.0, fuel=1.0))
@@ -96,14 +96,14 @@ class LapProgramme:
         self._tables()
 
     def laps(self, resource: str, prices: Sequence[float]) -> list[Lap]:
-        """The cheapest lap for each price.
+        """Return the lap of least cost for each price.
 
         Args:
             resource: "tyre" or "fuel".
-            prices: λ, seconds per unit of mean wear or per litre.
+            prices: Values of λ: seconds per unit of mean wear, or per litre.
 
         Raises:
-            ValueError: if the resource is unknown.
+            ValueError: If the resource is unknown.
         """
         if resource not in RESOURCES:
             raise ValueError(f"unknown resource {resource!r}: expected tyre or fuel")
@@ -111,7 +111,7 @@ class LapProgramme:
         count = len(self.curvature)
         value = np.zeros((len(prices), len(SPEEDS)))
         choice = np.zeros((count, len(prices), len(SPEEDS)), dtype=np.int64)
-        for stage in range(2 * count - 1, -1, -1):  # the second lap is the first one's future
+        for stage in range(2 * count - 1, -1, -1):  # the second lap gives the values at the end of the first
             k = stage % count
             after, cost, allowed = self._stage(k)
             spent = cost["time"] + price * cost[resource]
@@ -122,14 +122,14 @@ class LapProgramme:
         return self._drive(choice)
 
     def _tables(self) -> None:
-        """What every speed and choice of pedals gives on a straight, (V, U)."""
+        """Compute the quantities that do not depend on the stage, for all V speeds and U choices of the pedals."""
         car, envelope = self.car, self.envelope
         v = SPEEDS[:, None]
         power = THROTTLE[None, :]
         rev = _CRUISE[0] + _CRUISE[1] * power
         engine = rev * car.rpm_max * (2 * math.pi / 60.0)  # [rad/s]
         drag_power = car.engine_brake * (0.3 + 0.7 * rev) * engine
-        # Acceleration by the engine: what full throttle gives at this speed, in proportion, less the engine brake.
+        # Acceleration by the engine: that at full throttle times the share of power, less the engine brake.
         self._pull = power * envelope.engine(v) - (1.0 - power) * car.efficiency * drag_power / envelope.mass / v
         burning = car.power * power**self.resources.fuel_exponent + FRICTION_SHARE * drag_power
         rate = np.where(power > 0.02, burning / (ENGINE_EFFICIENCY * FUEL_ENERGY), 0.0)
@@ -140,7 +140,7 @@ class LapProgramme:
         self._driven = np.minimum(envelope.traction(SPEEDS) / self._friction, 1.0)
 
     def _stage(self, k: int) -> tuple[np.ndarray, dict[str, np.ndarray], np.ndarray]:
-        """Speeds after stage k (V, U), what it costs (V, U) or (U,) each, and which choices the tyres allow."""
+        """Return the speeds after stage k (V, U), its costs (V, U) each, and whether the tyres allow it (V, U)."""
         lateral = (SPEEDS**2 * self.curvature[k])[:, None]
         friction, driven = self._friction[:, None], self._driven[:, None]
         left = np.sqrt(np.clip(friction**2 - lateral**2, 0.0, None))
@@ -157,7 +157,7 @@ class LapProgramme:
         return after, {"time": seconds, "fuel": self._fuel_rate * seconds, "tyre": wear}, allowed
 
     def _slip_power(self, along: Any, across: np.ndarray) -> np.ndarray:
-        """Power that sliding tyres take, per mass [W/kg], of accelerations: the tyre curve inverted."""
+        """Return the power lost in slip per mass [W/kg] at accelerations [m/s²], by inverting the tyre curve."""
         car, speed = self.car, SPEEDS[:, None]
         total = np.sqrt(along**2 + across**2) + 1e-9
         used = np.minimum(total / self._friction[:, None], 1.0)
@@ -166,14 +166,14 @@ class LapProgramme:
 
     @staticmethod
     def _ahead(value: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """Values (Λ, V) at speeds (V, U), by linear interpolation: (Λ, V, U)."""
+        """Interpolate values (Λ, V) at speeds (V, U) linearly, to (Λ, V, U)."""
         place = np.clip((after - SPEEDS[0]) / (SPEEDS[1] - SPEEDS[0]), 0.0, len(SPEEDS) - 1.0)
         below = np.minimum(place.astype(np.int64), len(SPEEDS) - 2)
         part = place - below
         return value[:, below] * (1.0 - part) + value[:, below + 1] * part
 
     def _drive(self, choice: np.ndarray) -> list[Lap]:
-        """Two laps by each of the choices (S, Λ, V); the second counts."""
+        """Drive two laps by each of the choices (S, Λ, V) and return the second ones."""
         count, prices = choice.shape[:2]
         each = np.arange(prices)
         speed = np.full(prices, 40.0)
@@ -201,14 +201,14 @@ class LapProgramme:
 
 
 def sweep(car: str, resource: str, prices: Sequence[float], *, exponent: float = 2.5, track: str = "lakeside") -> Rows:
-    """Rows of the trade-off, first the fastest lap, as dictionaries.
+    """Return the rows of the trade-off as dictionaries, the fastest lap first.
 
     Args:
-        car: name of a shipped car.
+        car: Name of a shipped car.
         resource: "tyre" or "fuel".
-        prices: λ in seconds per lap at the fastest lap's use: 1 means that a whole lap's resource is worth 1 s.
-        exponent: n of the fuel law.
-        track: name of a shipped circuit.
+        prices: Values of λ in seconds per lap at the fastest lap's use; at 1 a lap's use of the resource is worth 1 s.
+        exponent: Exponent n of the fuel law.
+        track: Name of a shipped circuit.
     """
     rates = Resources.calibrated(car)
     programme = LapProgramme(load_track(track), load_car(car), Resources(rates.wear, rates.fuel, exponent))
@@ -234,7 +234,7 @@ def sweep(car: str, resource: str, prices: Sequence[float], *, exponent: float =
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Writes frontier.csv and frontier.png."""
+    """Write frontier.csv and frontier.png to the folder that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="folder")
     out: Path = parser.parse_args(arguments).out
@@ -254,7 +254,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def draw(curves: Sequence[Rows], path: Path) -> None:
-    """Range gained against seconds lost per lap, one curve per car and resource."""
+    """Draw the gain in range over the seconds lost per lap, with one curve per car and resource."""
     styles = {("tyre", 2.5): "-", ("fuel", 2.5): "--", ("fuel", 1.0): ":"}
     with drawing(path, size=(7.0, 4.2)) as ((axes,),):
         for rows in curves:

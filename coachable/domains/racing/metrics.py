@@ -1,4 +1,4 @@
-"""Measured style of racing: what the car did, beside what was asked."""
+"""Measures of the style in which a car was driven, for comparison with the requested one."""
 
 from __future__ import annotations
 
@@ -16,38 +16,38 @@ from coachable.envs.racing.race.observation import own_columns
 from coachable.envs.racing.race.referee import TELEMETRY
 from coachable.keys import STYLE, STYLE_FEATURES
 
-DRIFT_ANGLE_DEG = 20.0  # that counts as a drift
-GRIP_ANGLE_DEG = 8.0  # that counts as none
+DRIFT_ANGLE_DEG = 20.0  # smallest slip angle of a drift
+GRIP_ANGLE_DEG = 8.0  # largest slip angle without a drift
 _NEEDS = {
     "drift": "a step",
     "resources": "whole stints with and without saving, as `coachable evaluate` drives them",
     "aggressiveness": f"another car within {NEAR_DISTANCE:g} m",
 }
-"""What it takes to tell whether a car complies, by family."""
+"""Condition under which compliance can be judged, by family."""
 _COLUMN = {name: index for index, name in enumerate(TELEMETRY)}
 
 
 class RacingMeasures:
-    """Pace, road manners and the quantities that the styles ask for.
+    """Measures of pace, driving and the quantities that the styles ask for.
 
     Args:
-        family: "drift", "resources" or "aggressiveness"; decides what compliance means.
+        family: Name of the family, which determines what compliance means: "drift", "resources" or "aggressiveness".
 
     Raises:
-        ValueError: if there is no such family.
+        ValueError: If there is no such family.
     """
 
     def __init__(self, family: str) -> None:
-        racing_family(family)  # raises if there is none
+        racing_family(family)  # raises an error if there is none
         self.family = family
         self.needs = _NEEDS[family]
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
-        """See `StyleMeasures.step`. Angles in degrees, wear and fuel per kilometre, gaps in metres.
+        """Return the measures of a step, with angles in degrees and gaps in metres; see `StyleMeasures.step`.
 
-        "steering_change" is that of the steering command in a control step, at most 2: agents that steer from lock to
-        lock in every step may drive well otherwise. For aggressiveness "longitudinal" is the distance to the nearest
-        car straight ahead or behind, "lateral" that to the nearest one beside; NaN where there is none within 10 m.
+        "steering_change" is the change of the steering command in a control step, at most 2. It reveals agents that
+        steer from lock to lock but drive well otherwise. For aggressiveness, "longitudinal" is the distance to the
+        nearest car straight ahead or behind and "lateral" that to the nearest car beside; NaN if none is within 10 m.
         """
         theta, features = transition.get(STYLE), transition.get(("next", STYLE_FEATURES))
         telemetry = transition.get(("next", "telemetry"))
@@ -84,9 +84,9 @@ class RacingMeasures:
         return found
 
     def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
-        """See `StyleMeasures.summarise`: means over the steps that count; wear and fuel per kilometre of progress.
+        """Return means over the steps that count, with wear and fuel per kilometre; see `StyleMeasures.summarise`.
 
-        For drift also "turns", the largest rotation against the track in one direction, in whole turns.
+        For drift, "turns" is the largest rotation against the track in one direction, in whole turns.
         """
         record = dict(record)
         heading = record.pop("heading", None)
@@ -99,46 +99,52 @@ class RacingMeasures:
         return means
 
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
-        """See `StyleMeasures.complies`.
+        """Return whether the car complies in each step; see `StyleMeasures.complies`.
 
-        Drifting above 20 degrees where asked for and below 8 where not; on the track; margins to a car nearby kept.
+        By family, it drifts at 20 degrees or more if asked to and at 8 or less if not, it is on the track, or it keeps
+        the margins to the cars nearby.
         """
         return record["complied"] > 0
 
     def judged(self, record: Mapping[str, Tensor]) -> Tensor:
-        """(T, N) bool: in this step one can tell whether the car complies.
+        """Return whether compliance can be judged in each step, (T, N) bool.
 
-        Margins are kept or not only while another car is near. Savings show only beside a stint that does not save.
+        Margins can be judged only while another car is near, and savings only by comparison with a stint without them.
         """
         return ~torch.isnan(record["complied"]) & (self.family != "resources")
 
 
 class TelemetryMeasures:
-    """Columns of the telemetry, step by step, for evaluations that judge whole races and stints themselves.
+    """Columns of the telemetry in each step, for evaluations that summarise whole races and stints themselves.
 
     Args:
-        columns: names of `TELEMETRY`.
+        columns: Names in `TELEMETRY`.
     """
 
     def __init__(self, *columns: str) -> None:
         self._columns = {name: _COLUMN[name] for name in columns}
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
-        """See `StyleMeasures.step`."""
+        """Return the columns of a step; see `StyleMeasures.step`."""
         told = transition.get(("next", "telemetry"))
         return {name: told[:, column] for name, column in self._columns.items()}
 
     def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
-        """Nothing: that is the evaluation's business."""
+        """Return no summaries, because the evaluation computes its own."""
         return {}
 
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
-        """See `StyleMeasures.complies`: on the track."""
+        """Return whether the car is on the track in each step; see `StyleMeasures.complies`."""
         return record["off"] == 0.0
 
 
 def whole_turns(heading: Tensor, alive: Tensor) -> Tensor:
-    """Largest rotation in one direction, in whole turns, (N,), of a heading (T, N) [rad] in the steps that count."""
+    """Return the largest rotation in one direction in whole turns, (N,), from the headings in the steps that count.
+
+    Args:
+        heading: Headings (T, N) [rad].
+        alive: Whether each step counts (T, N) bool.
+    """
     steps = torch.diff(heading, dim=0)
     steps = torch.remainder(steps + math.pi, 2.0 * math.pi) - math.pi
     angle = torch.cat([torch.zeros_like(heading[:1]), torch.where(alive[1:], steps, 0.0).cumsum(0)])
@@ -148,18 +154,18 @@ def whole_turns(heading: Tensor, alive: Tensor) -> Tensor:
 
 
 def _margins_kept(features: Tensor, theta: Tensor) -> Tensor:
-    """(N,) bool: no near opponent within the longitudinal and the lateral margin at once."""
+    """Return whether no opponent is within the longitudinal and the lateral margin at once, (N,) bool."""
     long, lat, near = gap_columns(features)
     return ~((near > 0.0) & (long < theta[:, :1]) & (lat < theta[:, 1:2])).any(-1)
 
 
 def _distances(features: Tensor) -> tuple[Tensor, Tensor]:
-    """Distances to the nearest car straight ahead or behind and to the nearest one beside, (N,) each [m]."""
+    """Return the distances to the nearest car straight ahead or behind and to the nearest one beside, (N,) each [m]."""
     long, lat, near = gap_columns(features)
     return _nearest(long, (near > 0.0) & (lat == 0.0)), _nearest(lat, (near > 0.0) & (long == 0.0))
 
 
 def _nearest(distances: Tensor, counts: Tensor) -> Tensor:
-    """Smallest of the distances (N, A) that count, (N,); NaN where none does."""
+    """Return the smallest of the distances (N, A) that count, (N,), or NaN if none does."""
     found = torch.nn.functional.pad(torch.where(counts, distances, torch.inf), (0, 1), value=torch.inf).amin(-1)
     return torch.where(torch.isinf(found), torch.nan, found)

@@ -1,7 +1,7 @@
-"""Races of five agents with different margins: wins, places, overtakes, contacts of a pair, ahead or behind (paper).
+"""Evaluation of aggressiveness: races of five agents with different margins (paper).
 
-Two of five cars get the lateral margin under test, the other three moderate ones. The pair starts last ("pursuer") or
-first ("leader"), as in Werner et al. (2023).
+Two of the five cars have the lateral margin under test, the other three have moderate ones. The pair starts last
+("pursuer") or first ("leader"), as in Werner et al. (2023). The results are its wins, places, overtakes and contacts.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ if TYPE_CHECKING:
     from coachable.training.weights import LoadedPolicy
 
 CARS = 5
-SETTINGS = {"pursuer": (3, 4), "leader": (0, 1)}  # slots of the pair, 0 in front
+SETTINGS = {"pursuer": (3, 4), "leader": (0, 1)}  # slots of the pair on the grid, 0 in front
 LATERAL = (0.0, 0.25, 0.5, 0.75, 1.0)  # [m], of the pair
 OTHERS = tuple(product((0.5, 0.75), repeat=3))  # [m], of the other three
-LONGITUDINAL = 0.0  # [m], of all: the lateral margin alone is to act
+LONGITUDINAL = 0.0  # [m], of all cars, so that only the lateral margin has an effect
 LAPS = 4
 RACE_STEPS = 10_000
-START_STEPS = 600  # a minute, in which the field sorts itself out
+START_STEPS = 600  # a minute, in which the order of the start settles
 _AGAIN = 1.0  # [s], after which touching counts as another contact
-_PASSED = 5.0  # [m], about a car's length: as far ahead of another who was ahead, a car has overtaken it
+_PASSED = 5.0  # [m], about a car's length: lead at which a car that was behind has overtaken another
 _METRICS = {
     "win_rate": "wins",
     "places_gained": "places gained",
@@ -52,7 +52,7 @@ _RANKED = _METRICS | {"places_later": "places gained after the first minute", "b
 
 
 class _RaceMeasures(TelemetryMeasures):
-    """Also whether any opponent is beside, closer than the largest margin."""
+    """Telemetry, and whether an opponent is beside the car, closer than the largest margin."""
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
         beside = anyone_beside(transition.get(("next", STYLE_FEATURES)), within=LATERAL[-1])
@@ -60,19 +60,20 @@ class _RaceMeasures(TelemetryMeasures):
 
 
 def evaluate_aggressiveness(domain: Domain, agent: LoadedPolicy, out: Path, settings: EvaluationSettings) -> str:
-    """Race pairs with rising lateral margins against three other copies of the agent.
+    """Race pairs with rising lateral margins against three other copies of the agent, and write the results.
 
-    Files: `races.csv` (by setting and margin), `radar.png`, `report.md`, `summary.json`.
+    The files are `races.csv` (by setting and margin), `radar.png`, `report.md` and `summary.json`.
 
     Args:
-        domain: racing_aggressiveness, as the agent was trained in.
-        agent: the policy of all five cars; acts deterministically.
-        out: folder, created if missing.
-        settings: `episodes` races per setting, margin and combination of the others' margins, of which there are eight.
-            A race ends when the first car has driven four laps, or after `steps`, by default 10000.
+        domain: Domain racing_aggressiveness, as the agent was trained in.
+        agent: Policy of all five cars, which acts deterministically.
+        out: Folder, which is created if it is missing.
+        settings: `episodes` is the number of races per setting, margin and combination of the other cars' margins, of
+            which there are eight. A race ends when the first car has driven four laps, or after `steps`, 10,000 by
+            default.
 
     Returns:
-        The report, Markdown.
+        The report as Markdown.
     """
     episodes, seed = settings.episodes, settings.seed
     out.mkdir(parents=True, exist_ok=True)
@@ -80,15 +81,11 @@ def evaluate_aggressiveness(domain: Domain, agent: LoadedPolicy, out: Path, sett
     races = [(setting, lateral, others) for setting, lateral in cells for others in OTHERS for _ in range(episodes)]
     found = _race(domain, agent, races, len(cells), settings)
     rows = _rows(cells, {name: values.reshape(len(cells), -1, 2) for name, values in found.items()})
-    summary: dict[str, Any] = {
-        setting: {
-            name: rank_correlation(
-                *(np.array([r[key] for r in rows if r["setting"] == setting]) for key in ("lateral", name))
-            )
-            for name in _RANKED
-        }
-        for setting in SETTINGS
-    }
+    summary: dict[str, Any] = {}
+    for setting in SETTINGS:
+        own = [row for row in rows if row["setting"] == setting]
+        gained = {name: np.array([row[name] for row in own]) for name in ("lateral", *_RANKED)}
+        summary[setting] = {name: rank_correlation(gained["lateral"], gained[name]) for name in _RANKED}
     summary |= {"races_per_row": len(OTHERS) * episodes, "seed": seed}
     draw_radar(rows, out / "radar.png")
     return write_results(out, _report(agent, rows, summary), summary, {"races": rows})
@@ -101,7 +98,7 @@ def _race(
     cells: int,
     settings: EvaluationSettings,
 ) -> dict[str, np.ndarray]:
-    """What `_pair_results` finds in each race, (races, 2); those of all cells start alike."""
+    """Return the values of `_pair_results` in each race, (races, 2); the races of all cells have equal starts."""
     space, count = agent.space, len(races)
     theta = space.default.repeat(CARS, count, 1)
     theta[..., space.slices["longitudinal"]] = LONGITUDINAL
@@ -141,20 +138,22 @@ def race_alike(
     steps: int,
     **options: Any,
 ) -> tuple[dict[str, Tensor], float]:
-    """Races between copies of an agent on equal terms. Cars go by the slots they start from, 0 in front.
+    """Race copies of an agent against each other from equal starts.
+
+    Cars are numbered by the slots that they start from, 0 in front. Stranded cars are put back on the track.
 
     Args:
-        domain: as the agent was trained in.
-        agent: the policy of all cars; acts deterministically.
-        theta: (A, B, d) styles of A cars in B races.
-        measures: what is measured.
-        settings: seed, and whether to show a progress bar.
-        copies: of each start: race b starts like race b + B / copies.
-        steps: of each race; stranded cars are put back on the track.
-        **options: of the environment.
+        domain: Domain, as the agent was trained in.
+        agent: Policy of all cars, which acts deterministically.
+        theta: Styles of A cars in B races (A, B, d).
+        measures: Measures of each step.
+        settings: `seed`, and `progress` for a progress bar.
+        copies: Number of races with equal starts: race b starts like race b + B / copies.
+        steps: Number of steps of each race.
+        **options: Options of the environment.
 
     Returns:
-        What is measured, (T, A, B) each, and the length of the track [m].
+        The measures, (T, A, B) each, and the length of the track [m].
     """
     cars, races, _ = theta.shape
     env = domain.styled_env(
@@ -170,11 +169,11 @@ def race_alike(
         **options,
     )
     simulation: Any = env.base_env
-    # Who starts where is drawn with the start: look, then start again with the same seed.
+    # The slots are drawn at the start. Read them, and start again with the same seed.
     env.set_seed(settings.seed)
     env.reset()
     distance = Run(*simulation.run.unbind(0)).distance  # 0 for the first car, then negative
-    car_at = (-distance.reshape(cars, races)).argsort(0)  # each slot
+    car_at = (-distance.reshape(cars, races)).argsort(0)  # car in each slot
     rows = theta.gather(0, car_at.argsort(0)[..., None].expand_as(theta))
     record = record_episodes(
         env,
@@ -193,7 +192,7 @@ def race_alike(
 def _pair_results(
     race: Mapping[str, np.ndarray], slots: np.ndarray, chosen: np.ndarray, finish: float
 ) -> dict[str, np.ndarray]:
-    """Of the two chosen cars of one race, whose steps are (T, A): values (2,)."""
+    """Return the results (2,) of the two chosen cars of a race, from the measures (T, A) of its steps."""
     distance = race["distance"]
     done = np.flatnonzero(distance.max(1) >= finish)
     end = int(done[0]) + 1 if len(done) else len(distance)
@@ -214,19 +213,19 @@ def _pair_results(
 
 
 def _count(touched: np.ndarray) -> int:
-    """Contacts of one car, steps (T,) bool; those within a second of the last one are the same."""
+    """Count the contacts of a car from its steps (T,) bool; a contact within a second of the last one is the same."""
     steps = np.flatnonzero(touched)
     return int((np.diff(steps, prepend=-np.inf) > _AGAIN / CONTROL_STEP).sum()) if len(steps) else 0
 
 
 def _overtakes(distance: np.ndarray, car: int) -> int:
-    """How often a car overtook one of the others, from the distances (T, A) of all [m]."""
+    """Count how often a car overtook one of the others, from the distances (T, A) of all [m]."""
     gap = distance[:, [car]] - np.delete(distance, car, axis=1)
     return sum(int((np.diff(np.sign(one[np.abs(one) >= _PASSED])) > 0.0).sum()) for one in gap.T)
 
 
 def _rows(cells: Sequence[tuple[str, float]], found: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
-    """Means by setting and margin with 95 % intervals, of values (cells, races, 2)."""
+    """Return the means of values (cells, races, 2) by setting and margin, with 95 % intervals."""
     rows = []
     for index, (setting, lateral) in enumerate(cells):
         of = {name: values[index] for name, values in found.items()}
@@ -243,7 +242,7 @@ def _rows(cells: Sequence[tuple[str, float]], found: Mapping[str, np.ndarray]) -
 
 
 def draw_radar(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """One radar per setting, one polygon per margin; every axis runs from the lowest to the highest value on it."""
+    """Draw a radar per setting with a polygon per margin; every axis spans the lowest to the highest value."""
     angles = np.linspace(0.0, 2.0 * np.pi, len(_METRICS), endpoint=False) + np.pi / 2
     with drawing(path, 1, len(SETTINGS), size=(9.5, 4.6), grid=False, subplot_kw={"projection": "polar"}) as panels:
         for panel, setting in zip(panels[0], SETTINGS, strict=True):
@@ -268,26 +267,15 @@ def draw_radar(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Mapping[str, Any]) -> str:
     text = "# racing, aggressiveness: requested margin and what came of it\n\n"
-    text += f"{policy_sentence(agent)} in all five cars; {summary['races_per_row']} "
-    text += (
-        f"races per row, {LAPS} laps, rolling start, seed {summary['seed']}. Two cars, which start last (pursuer) or "
-    )
-    text += (
-        f"first (leader), keep the lateral margin, the other three 0.5 or 0.75 m; longitudinal {LONGITUDINAL:g} m.\n\n"
-    )
+    text += f"{policy_sentence(agent)} in all five cars; {summary['races_per_row']} races per row, {LAPS} laps, "
+    text += f"rolling start, seed {summary['seed']}. Two cars, which start last (pursuer) or first (leader), keep the "
+    text += f"lateral margin, the other three 0.5 or 0.75 m; longitudinal {LONGITUDINAL:g} m.\n\n"
     text += "![radar](radar.png)\n\n"
     formats = {"setting": "", "lateral": "g", "win_rate": ".0%", "either_won": ".0%", "places_gained": "+.2f"}
-    formats |= {
-        "places_later": "+.2f",
-        "overtakes": ".1f",
-        "contacts": ".1f",
-        "beside": ".1%",
-        "off": ".1%",
-        "kilometres": ".1f",
-    }
-    text += markdown_table(rows, formats)
+    formats |= {"places_later": "+.2f", "overtakes": ".1f", "contacts": ".1f"}
+    text += markdown_table(rows, formats | {"beside": ".1%", "off": ".1%", "kilometres": ".1f"})
     text += "\nWin rate: share of the pair that ends among the first two. Overtakes, contacts: per car and race; a "
-    text += f"car has overtaken who was ahead when it is {_PASSED:g} m ahead; contacts within a second count once. "
+    text += f"car has overtaken another when it is {_PASSED:g} m ahead; contacts within a second count once. "
     text += "Places later: gained after the first minute. "
     text += f"Beside: share of the time with another car alongside, less than {LATERAL[-1]:g} m away."
     text += "\n\nRank correlation with the margin: "

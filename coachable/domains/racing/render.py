@@ -1,4 +1,4 @@
-"""Top-down pictures of a race: track, cars, tyre wear."""
+"""Top-down images of a race with track, cars and tyre wear."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from torchrl.envs import EnvBase
 from coachable.envs.racing.env import RacingEnv
 from coachable.envs.racing.physics.state import ROW, WEARS
 
-VIEW = 60.0  # [m] from the car to the left and right border of the picture
+VIEW = 60.0  # [m] from the car to the left and right border of the image
 _GRASS = "#7ba05b"
 _CAR_COLOURS = ("#d62728", "#1f77b4", "#ff7f0e", "#9467bd", "#17becf")
 
 
 class RacingRenderer:
-    """Draws the surroundings of one car, and the whole track in a corner.
+    """Renderer of the surroundings of one car, with a map of the track in a corner.
 
     Args:
-        width: of the picture [px].
-        height: of the picture [px].
+        width: Width of the image [px].
+        height: Height of the image [px].
     """
 
     def __init__(self, width: int = 640, height: int = 480) -> None:
@@ -32,7 +32,12 @@ class RacingRenderer:
         self._view = VIEW, VIEW * height / width
 
     def draw(self, env: EnvBase, row: int = 0) -> np.ndarray:
-        """(height, width, 3) uint8: the car of a row in the middle, others of its group around it."""
+        """Return an image (height, width, 3) uint8 of the car of a row and of the cars of its group.
+
+        Args:
+            env: A `RacingEnv`, or an environment around it.
+            row: Row of the car in the middle.
+        """
         from matplotlib.patches import Polygon
 
         while not isinstance(env, RacingEnv):
@@ -58,7 +63,7 @@ class RacingRenderer:
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
     def close(self) -> None:
-        """Forgets the figure."""
+        """Clear the figure."""
         self._figure.clear()
 
     @staticmethod
@@ -87,7 +92,7 @@ class RacingRenderer:
 
 
 def _mates(env: RacingEnv, row: int) -> list[int]:
-    """Columns of the cars that meet this one, itself first."""
+    """Return the columns of the cars that meet the car of a row, itself first."""
     car, race = divmod(row, env.races)
     group = env.group[:, race].cpu()
     others = [k for k in range(env.cars) if k != car and group[k] == group[car]]
@@ -95,7 +100,7 @@ def _mates(env: RacingEnv, row: int) -> list[int]:
 
 
 def _corners(env: RacingEnv, state: np.ndarray, column: int) -> np.ndarray:
-    """(4, 2) of the body."""
+    """Return the corners of the body, (4, 2) [m]."""
     length, width = (
         float(value[column]) if hasattr(value, "shape") else value
         for value in (env.garage.car.length, env.garage.car.width)
@@ -107,7 +112,7 @@ def _corners(env: RacingEnv, state: np.ndarray, column: int) -> np.ndarray:
 
 
 def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
-    """First and last index of each stretch of a closed mask; the last may lie beyond the end."""
+    """Return the first and last index of each stretch of a closed mask; the last may be beyond the end."""
     if mask.all():
         return [(0, len(mask))]
     starts = np.flatnonzero(mask & ~np.roll(mask, 1))

@@ -1,4 +1,4 @@
-"""What saving tyres or fuel gains and costs: stints under rising weights, beside the frontier (paper, Figure 2)."""
+"""Evaluation of saving: gain and cost of stints under rising weights, with the frontier (paper, Figure 2)."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import drawing, shade
 from coachable.evaluation.rollouts import record_styles
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
-from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_results
+from coachable.evaluation.style_grid import markdown_table, mean_of, policy_sentence, write_results
 
 if TYPE_CHECKING:
     from coachable.domain import Domain
     from coachable.training.weights import LoadedPolicy
 
-WEIGHTS = {"fuel": "fuel", "tyre": "tire"}  # resource to its style weight
+WEIGHTS = {"fuel": "fuel", "tyre": "tire"}  # style weight of each resource
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the largest weight
 COMPARED = 6  # flying laps of each stint whose times are compared; the first lap is on cold tyres
 STINT_STEPS = 9000  # 15 minutes
@@ -39,13 +39,13 @@ _SOLO = (Scenario("solo", 1.0, "solo"),)
 
 @dataclass(frozen=True)
 class Stint:
-    """What one car did.
+    """Result of one car in a stint.
 
     Attributes:
-        laps: times of its completed laps, from where it started, the first one included [s].
-        clean: of each lap, whether it never had three wheels off the track.
-        left: resource left at the end of each lap: litres, or wear.
-        per_km: resource used per kilometre after the first lap, or in all if there is no other.
+        laps: Times of the completed laps, counted from the car's start [s].
+        clean: Whether each lap had never three wheels off the track.
+        left: State of the resource at the end of each lap: fuel left [l], or wear.
+        per_km: Resource used per kilometre after the first lap, or in total if there is no other lap.
     """
 
     laps: np.ndarray
@@ -55,28 +55,28 @@ class Stint:
 
     @property
     def compared(self) -> float:
-        """Mean time of the laps that are compared; NaN without any [s]."""
+        """Mean time of the laps that are compared, or NaN if there are none [s]."""
         flying = self.laps[1 : 1 + COMPARED]
         return float(flying.mean()) if len(flying) else float("nan")
 
 
 def evaluate_resources(domain: Domain, agent: LoadedPolicy, out: Path, settings: EvaluationSettings) -> str:
-    """Drive stints under rising weights of one resource at a time, and a time trial without any.
+    """Drive stints under rising weights of one resource at a time, and a time trial without saving; write the results.
 
-    As in the paper, the other resource is switched off. Files: `stints.csv` (by resource and weight), `laps.csv` (every
-    lap), `stints.png` (resource left and lap times over laps), `tradeoff.png` (range against pace, with the frontier),
-    `report.md`, `summary.json`. An agent that was trained among others also races them, see `race_in_traffic`:
-    `traffic.csv`, `traffic.png`.
+    As in the paper, the other resource is switched off. The files are `stints.csv` (by resource and weight), `laps.csv`
+    (every lap), `stints.png` (resource left and lap times over laps), `tradeoff.png` (range against pace, with the
+    frontier), `report.md` and `summary.json`. An agent that was trained with several cars also races in traffic, see
+    `race_in_traffic`, which adds `traffic.csv` and `traffic.png`.
 
     Args:
-        domain: racing_resources, as the agent was trained in.
-        agent: the policy; acts deterministically.
-        out: folder, created if missing.
-        settings: `episodes` stints per weight, each from its own place on the track, of `steps`, by default 9000,
-            15 minutes.
+        domain: Domain racing_resources, as the agent was trained in.
+        agent: Policy, which acts deterministically.
+        out: Folder, which is created if it is missing.
+        settings: `episodes` is the number of stints per weight, each from its own place on the track; `steps` is their
+            length, by default 9000 (15 minutes).
 
     Returns:
-        The report, Markdown.
+        The report as Markdown.
     """
     out.mkdir(parents=True, exist_ok=True)
     trained, episodes, seed = agent.config.get("env", {}), settings.episodes, settings.seed
@@ -123,8 +123,8 @@ def frontier(track: str, car: str, resource: str) -> list[dict[str, float]]:
     """Return lap time [s] and range [km] of a point mass on a fixed line, the fastest lap first.
 
     Args:
-        track: name of a shipped circuit.
-        car: name of a shipped car.
+        track: Name of a shipped circuit.
+        car: Name of a shipped car.
         resource: "tyre" or "fuel".
     """
     length = load_track(track).length / 1000.0
@@ -144,7 +144,7 @@ def _drive(
     length: float,
     **options: Any,
 ) -> list[list[Stint]]:
-    """Drive the stints of each cell, each from its own place on a track of a length [m]."""
+    """Drive the stints of each cell, each from its own place on a track of the given length [m]."""
     space, count = agent.space, len(cells) * episodes
     theta = torch.stack([space.make(strict=True, **cell) for cell in cells]).repeat_interleave(episodes, 0)
     record = record_styles(
@@ -165,18 +165,18 @@ def _drive(
 
 
 def _stint(measured: Mapping[str, np.ndarray], alive: np.ndarray, row: int, length: float, resource: str) -> Stint:
-    """From the steps (T, N) of all cars."""
+    """Return the stint of one row from the measures (T, N) of all cars."""
     driven = {name: values[:, row][alive[:, row]] for name, values in measured.items()}
     distance, off = driven["distance"], np.cumsum(driven["off"])
     left = driven["fuel" if resource == "fuel" else "wear"]
-    running = left > 0.0 if resource == "fuel" else left < 1.0  # beyond that nothing is used up any more
+    running = left > 0.0 if resource == "fuel" else left < 1.0  # later steps use nothing
     distance, off, left = distance[running], off[running], left[running]
     furthest = np.maximum.accumulate(distance)
     ends = length * np.arange(1, int(furthest[-1] // length) + 1)
-    steps = np.searchsorted(furthest, ends)  # in which each lap ends
+    steps = np.searchsorted(furthest, ends)  # step in which each lap ends
     before = np.where(steps > 0, furthest[np.maximum(steps - 1, 0)], 0.0)
     crossed = CONTROL_STEP * (steps + (ends - before) / (furthest[steps] - before))
-    first, last = (steps[0], steps[-1]) if len(steps) > 1 else (0, -1)  # the first lap has the start in it
+    first, last = (steps[0], steps[-1]) if len(steps) > 1 else (0, -1)  # the first lap contains the start
     return Stint(
         laps=np.diff(crossed, prepend=0.0),
         clean=np.diff(off[steps], prepend=0.0) == 0.0,
@@ -188,14 +188,14 @@ def _stint(measured: Mapping[str, np.ndarray], alive: np.ndarray, row: int, leng
 def _rows(
     resource: str, weights: Sequence[float], stints: Sequence[Sequence[Stint]], bound: Sequence[Mapping[str, float]]
 ) -> list[dict[str, Any]]:
-    """Per weight: range, pace, and what both are against weight 0."""
+    """Return range and pace for each weight, and their differences from those at a weight of 0."""
     rows = []
     capacity = TANK if resource == "fuel" else WORN
     reach = np.array([[capacity / max(stint.per_km, 1e-9) for stint in group] for group in stints])
     pace = np.array([[stint.compared for stint in group] for group in stints])
     for index, weight in enumerate(weights):
         low, high = bootstrap_interval(reach[index])
-        lap_time = float(np.nanmean(pace[index])) if np.isfinite(pace[index]).any() else float("nan")
+        lap_time = mean_of(pace[index])
         clean = np.concatenate([stint.clean for stint in stints[index]])
         rows.append(
             {
@@ -206,7 +206,7 @@ def _rows(
                 "range_km_high": high,
                 "range_gain": float(reach[index].mean() / reach[0].mean() - 1.0),
                 "lap_time": lap_time,
-                "seconds_lost": lap_time - float(np.nanmean(pace[0])) if np.isfinite(pace[0]).any() else float("nan"),
+                "seconds_lost": lap_time - mean_of(pace[0]),
                 "frontier_km": range_at(bound, lap_time),
                 "laps": len(clean),
                 "clean_laps": float(clean.mean()) if len(clean) else 0.0,
@@ -216,23 +216,20 @@ def _rows(
 
 
 def range_at(bound: Sequence[Mapping[str, float]], lap_time: float) -> float:
-    """Range of the frontier at a lap time [km]; NaN outside its points.
+    """Return the range of the frontier at a lap time, or NaN outside its points [km].
 
     Args:
-        bound: points of `frontier`, the fastest lap first.
-        lap_time: [s].
+        bound: Points of `frontier`, the fastest lap first.
+        lap_time: Lap time [s].
     """
-    times = [point["lap_time"] for point in bound]
-    if not times[0] <= lap_time <= times[-1]:
-        return float("nan")
-    return float(np.interp(lap_time, times, [point["range_km"] for point in bound]))
+    times, ranges = ([point[name] for point in bound] for name in ("lap_time", "range_km"))
+    return float(np.interp(lap_time, times, ranges, left=np.nan, right=np.nan))
 
 
 def _summary(
     rows: Sequence[Mapping[str, Any]], trial: Sequence[Stint], estimate: float, episodes: int, seed: int
 ) -> dict[str, Any]:
-    flying = [stint.laps[1:] for stint in trial if len(stint.laps) > 1]
-    times = np.concatenate(flying) if flying else np.array([])
+    times = np.concatenate([stint.laps[1:] for stint in trial])
     clean = np.concatenate([stint.clean for stint in trial])
     summary: dict[str, Any] = {
         "trial": {
@@ -256,7 +253,7 @@ def _summary(
 
 
 def draw_stints(laps: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Resource left and lap times over laps, one column per resource, one line per weight (means over stints)."""
+    """Draw the mean resource left and lap times over laps, with one column per resource and one line per weight."""
     labels = {"fuel": "fuel left [l]", "tyre": "mean tyre wear"}
     with drawing(path, 2, len(WEIGHTS), size=(9.5, 6.4)) as axes:
         for column, (resource, name) in enumerate(WEIGHTS.items()):
@@ -281,7 +278,7 @@ def draw_stints(laps: Sequence[Mapping[str, Any]], path: Path) -> None:
 def draw_tradeoff(
     rows: Sequence[Mapping[str, Any]], frontiers: Mapping[str, Sequence[Mapping[str, float]]], path: Path
 ) -> None:
-    """Range over lap time, the agent's beside the frontier's."""
+    """Draw the range over the lap time, for the agent and the frontier."""
     with drawing(path, 1, len(frontiers), size=(9.5, 4.0)) as panels:
         for axes, (resource, bound) in zip(panels[0], frontiers.items(), strict=True):
             own = [row for row in rows if row["resource"] == resource]
@@ -306,10 +303,8 @@ def _report(
     formats |= {"seconds_lost": "+.2f", "frontier_km": ".1f", "laps": "", "clean_laps": ".0%"}
     text += markdown_table(rows, formats)
     text += f"\nRange: until the tank is empty, or until the tyres are worn by {WORN:.0%} on average, at the mean use. "
-    text += (
-        f"Lap time: mean of {COMPARED} laps from the second one on. Frontier: range of a point mass on a fixed line "
-    )
-    text += "at the same lap time (nan where it has none so slow). Clean: never three wheels off the track.\n\n"
+    text += f"Lap time: mean of {COMPARED} laps from the second one on. Frontier: range of a point mass on a fixed "
+    text += "line at the same lap time (nan where it has none so slow). Clean: never three wheels off the track.\n\n"
     ranks = ", ".join(f"{name} {summary[name]['rank_correlation']:.2f}" for name in WEIGHTS)
     text += f"Rank correlation of weight and range: {ranks}.\n\n## Time trial, no saving asked\n\n"
     if not trial["laps"]:

@@ -1,4 +1,4 @@
-"""Styles of racing: drift, tyre and fuel saving, aggressiveness. Ranges and laws are the paper's (Appendix C)."""
+"""Style spaces and rewards of drifting, saving and aggressiveness, with the paper's ranges and laws (Appendix C)."""
 
 from __future__ import annotations
 
@@ -7,15 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from coachable.envs.racing.race.features import (
-    DEFEND,
-    DRIFT,
-    DRIFT_NAMES,
-    FUEL,
-    OVERTAKE,
-    TIRE,
-    gap_columns,
-)
+from coachable.envs.racing.race.features import DEFEND, DRIFT, DRIFT_NAMES, FUEL, OVERTAKE, TIRE, gap_columns
 from coachable.styles import (
     Mixture,
     PointMass,
@@ -37,14 +29,14 @@ _FUEL_BOUNDS = (-3.0, 105.0)
 
 
 def _three_way(neutral: float, bounds: tuple[float, float]) -> Mixture:
-    """Neutral with a probability, otherwise negative or positive, equally likely."""
+    """Return a mixture of 0 with probability `neutral` and of negative and positive values, equally likely."""
     low, high = bounds
     side = (1.0 - neutral) / 2
     return Mixture([PointMass(0.0), Uniform(low, 0.0), Uniform(0.0, high)], [neutral, side, side])
 
 
 def drift_style_space() -> StyleSpace:
-    """Weights of slip angle and slip ratio, front and rear: 0.5 δ(0) + 0.25 U(-0.4, 0) + 0.25 U(0, 5) each."""
+    """Return the weights of slip angle and ratio, front and rear: 0.5 δ(0) + 0.25 U(-0.4, 0) + 0.25 U(0, 5) each."""
     low, high = _DRIFT_BOUNDS
     helps = ("front tyres sideways", "rear tyres sideways", "front wheels locking or spinning", "rear wheels spinning")
     parameters = [Weight(name, low, high, help=text) for name, text in zip(DRIFT_NAMES, helps, strict=True)]
@@ -52,7 +44,11 @@ def drift_style_space() -> StyleSpace:
 
 
 def resource_style_space() -> StyleSpace:
-    """Overtake and defend U(0, 2); tire 0.1 δ(0) + 0.45 U(-60, 0) + 0.45 U(0, 12000); fuel likewise with -3 and 105."""
+    """Return the weights of overtaking, defending and saving.
+
+    Overtake and defend are U(0, 2), tire is 0.1 δ(0) + 0.45 U(-60, 0) + 0.45 U(0, 12000), and fuel likewise with -3 and
+    105.
+    """
     parameters = [
         Weight("overtake", 0.0, 2.0, help="gain on cars ahead"),
         Weight("defend", 0.0, 2.0, help="keep cars behind"),
@@ -64,11 +60,11 @@ def resource_style_space() -> StyleSpace:
 
 
 def aggressiveness_style_space(cars: int = 1) -> StyleSpace:
-    """Margins to other cars: longitudinal U(0, 2) m, lateral U(0, 1) m.
+    """Return the margins to other cars: longitudinal U(0, 2) m, lateral U(0, 1) m.
 
     Args:
-        cars: of a race, if all of them are to get the same style, as in the paper; they then have to be the rows of a
-            `RacingEnv` in which every car is controlled.
+        cars: Number of cars of a race that share a style, as in the paper. If it is above 1, the agent must control
+            this many cars of each race of the `RacingEnv`.
     """
     parameters = [
         Setpoint("longitudinal", 0.0, 2.0, unit="m", help="distance to keep ahead and behind"),
@@ -79,17 +75,17 @@ def aggressiveness_style_space(cars: int = 1) -> StyleSpace:
 
 
 def drift_style_reward(space: StyleSpace) -> StyleReward:
-    """Σ w_i g_i over mean slip angles [rad] and slip ratios of the axles."""
+    """Return the reward Σ w_i g_i of mean slip angles [rad] and slip ratios of the axles."""
     return StyleReward(space, {"drift": WeightedSum(DRIFT_NAMES, DRIFT)})
 
 
 def resource_style_reward(space: StyleSpace, *, gained: float = 1.0, defended: float | None = None) -> StyleReward:
-    """Σ w_i g_i: metres gained ahead and behind, minus mean wear, minus fuel [l].
+    """Return the reward Σ w_i g_i of metres gained on cars ahead and behind, minus mean wear, minus fuel [l].
 
     Args:
-        space: `resource_style_space`.
-        gained: how often metres gained count; once in the paper.
-        defended: how often those on cars behind count, by default as often.
+        space: Result of `resource_style_space`.
+        gained: Factor of the metres gained; 1 in the paper.
+        defended: Factor of the metres gained on cars behind; `gained` by default.
     """
     terms = {
         "overtaking": WeightedSum(("overtake",), slice(OVERTAKE, OVERTAKE + 1)),
@@ -100,17 +96,17 @@ def resource_style_reward(space: StyleSpace, *, gained: float = 1.0, defended: f
 
 
 def aggressiveness_style_reward(space: StyleSpace, *, weight: float = 1.0, apart: float = 1.0) -> StyleReward:
-    """Σ over near opponents of weight · (min(0, d_lon - ξ_lon) + min(0, d_lat - ξ_lat)).
+    """Return the reward Σ over near opponents of weight · (min(0, d_lon - ξ_lon) + min(0, d_lat - ξ_lat)).
 
     Args:
-        space: `aggressiveness_style_space`.
-        weight: per metre that a margin is short, in each control step; the paper has none.
-        apart: share of the weight of a gap along one axis while the cars do not overlap along the other, as the
-            lateral gap to a car straight ahead. 1 charges both gaps of every near car, as the paper's formula does; 0
-            those only that more room would widen.
+        space: Result of `aggressiveness_style_space`.
+        weight: Penalty per metre by which a gap is below its margin, in each control step; the paper has none.
+        apart: Share of the penalty of a gap along one axis while the cars do not overlap along the other, such as the
+            lateral gap to a car straight ahead. 1 charges both gaps of every near car, as in the paper; 0 charges a
+            gap only while the cars overlap along the other axis.
 
     Raises:
-        ValueError: if `apart` is not in [0, 1].
+        ValueError: If `apart` is not in [0, 1].
     """
     if not 0.0 <= apart <= 1.0:
         raise ValueError(f"apart is {apart}: expected a share between 0 and 1")

@@ -1,4 +1,4 @@
-"""Overtaking and defending among others, under rising weights: what the tyre and fuel family does in a race."""
+"""Evaluation of overtaking and defending in traffic under rising weights, for the tyre and fuel family."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ if TYPE_CHECKING:
     from coachable.training.weights import LoadedPolicy
 
 CARS = 3
-SLOTS = {"overtake": CARS - 1, "defend": 0}  # where the car whose weight rises starts: last, or first
+SLOTS = {"overtake": CARS - 1, "defend": 0}  # slot of the car whose weight rises: last, or first
 TRAFFIC_WEIGHTS = (0.0, 0.5, 1.0, 1.5, 2.0)
-OTHERS_WEIGHT = 1.0  # of overtaking and of defending, of the other cars; and of the weight that does not rise
+OTHERS_WEIGHT = 1.0  # of all weights of overtaking and defending that do not rise
 TRAFFIC_STEPS = 600  # 60 s
 RACES = 128  # per weight, for each of `EvaluationSettings.episodes`; four leave intervals of 1 to 2 m
 _START = (Scenario("passing", 1.0, "passing", CARS),)
 
 
 class _TrafficMeasures(TelemetryMeasures):
-    """Also the metres gained on cars ahead, and gained or lost to cars behind."""
+    """Telemetry, and the metres gained on cars ahead and on cars behind."""
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
         features = transition.get(("next", STYLE_FEATURES))
@@ -43,19 +43,20 @@ class _TrafficMeasures(TelemetryMeasures):
 
 
 def race_in_traffic(domain: Domain, agent: LoadedPolicy, settings: EvaluationSettings) -> list[dict[str, Any]]:
-    """Three copies of an agent, close together on a straight, on tyres and fuel of any state, for a minute.
+    """Race three copies of an agent that start close together on a straight, with random tyres and fuel, for a minute.
 
-    The weight of overtaking of the last car rises, or that of defending of the first; the races of all weights start
-    alike.
+    The last car's weight of overtaking rises, or the first car's weight of defending. The races of all weights have
+    equal starts.
 
     Args:
-        domain: racing_resources, as the agent was trained in, among others.
-        agent: the policy of all cars; acts deterministically.
-        settings: `episodes` times 128 races per weight, of `steps`, by default 600.
+        domain: Domain racing_resources, as the agent was trained in, with several cars.
+        agent: Policy of all cars, which acts deterministically.
+        settings: `episodes` times 128 is the number of races per weight; `steps` is their length, 600 at most and by
+            default.
 
     Returns:
-        A row per weight: metres gained on cars ahead, and on cars behind (negative: lost), places gained, share of the
-        time in contact and off the track, each with a 95 % interval.
+        A row per weight with the metres gained on cars ahead and on cars behind (negative if lost), the places gained,
+        and the shares of time in contact and off the track, each with a 95 % interval.
     """
     races, steps = RACES * settings.episodes, min(settings.steps or TRAFFIC_STEPS, TRAFFIC_STEPS)
     cells = [(name, weight) for name in SLOTS for weight in TRAFFIC_WEIGHTS]
@@ -90,7 +91,7 @@ def race_in_traffic(domain: Domain, agent: LoadedPolicy, settings: EvaluationSet
 
 
 def traffic_response(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Rank correlation of each weight with the metres that it asks for and with places, from `race_in_traffic`."""
+    """Return the rank correlations of each weight with metres and places, from the rows of `race_in_traffic`."""
 
     def follows(sweep: str, measure: str) -> float:
         pairs = [(row["weight"], row[measure]) for row in rows if row["sweep"] == sweep]
@@ -100,25 +101,27 @@ def traffic_response(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, floa
 
 
 def traffic_report(rows: Sequence[dict[str, Any]], response: dict[str, dict[str, float]]) -> str:
-    """The rows as Markdown."""
+    """Return the section on traffic of the report, as Markdown.
+
+    Args:
+        rows: Result of `race_in_traffic`.
+        response: Result of `traffic_response`.
+    """
     text = f"\n## Among others\n\n{CARS} copies close together on a straight, on tyres and fuel of any state, for a "
+    text += f"minute; {rows[0]['races']} races per weight, the same starts for each. The weight of overtaking of the "
     text += (
-        f"minute; {rows[0]['races']} races per weight, the same starts for each. The weight of overtaking of the last "
+        f"last car rises, or that of defending of the first; all others are {OTHERS_WEIGHT:g}, and no car saves.\n\n"
     )
-    text += f"car rises, or that of defending of the first; all others are {OTHERS_WEIGHT:g}, and nobody saves.\n\n"
     text += "![traffic](traffic.png)\n\n"
     formats = {"sweep": "", "weight": "g", "overtake": "+.1f", "defend": "+.1f", "places_gained": "+.2f"}
     text += markdown_table(rows, formats | {"contact": ".2%", "off": ".2%"})
     text += "\nOvertake, defend: metres gained on cars ahead and on cars behind. Rank correlation with the weight of "
-    found = [
-        f"{name} {values['metres']:.2f} in metres, {values['places']:.2f} in places"
-        for name, values in response.items()
-    ]
+    found = [f"{name} {v['metres']:.2f} in metres, {v['places']:.2f} in places" for name, v in response.items()]
     return text + "; of ".join(found) + ".\n"
 
 
 def draw_traffic(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Metres and places gained over the weight that asks for them, with 95 % intervals."""
+    """Draw the metres and places gained over the weight that asks for them, with 95 % intervals."""
     titles = {"overtake": "on cars ahead, starting last", "defend": "on cars behind, starting first"}
     with drawing(path, 2, len(SLOTS), size=(9.5, 6.4), sharex=True) as panels:
         for column, name in zip(panels.T, SLOTS, strict=True):

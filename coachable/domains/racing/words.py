@@ -1,4 +1,4 @@
-"""What a coach says to the driver, by family of style."""
+"""Words of the coach's commands, by family of styles."""
 
 from coachable.domain import Words
 
@@ -78,4 +78,4 @@ WORDS = {
         terminated="retired",
     ),
 }
-"""By family."""
+"""Words of each family."""

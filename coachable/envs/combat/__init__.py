@@ -1,4 +1,4 @@
-"""A batched arena where a player with a gamepad fights machines; stand-in for the paper's Horizon Forbidden West."""
+"""Batched arena in which a player with a gamepad fights machines, in place of the paper's Horizon Forbidden West."""
 
 from coachable.envs.combat.env import CombatEnv
 

@@ -1,4 +1,4 @@
-"""Scripted players that read the full state: baseline, and check of the game's balance."""
+"""Scripted players that read the full state, as a baseline and to check the game's balance."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from coachable.envs.combat.tables import AMMO, KINDS, WEAPONS
 from coachable.envs.combat.traits import FARTHEST, KIND, SPEED
 
 _BERRY_BELOW = 430.0  # [HP]
-_DODGE_WITHIN, _DODGE_SHARE, _SHOT_SHARE = 0.22, 0.6, 0.42  # [s] before an attack, probability per step
+_DODGE_WITHIN, _DODGE_SHARE, _SHOT_SHARE = 0.22, 0.6, 0.42  # [s] before an attack, probabilities per step
 _SHOT_WITHIN = 0.25  # [s] before a shot lands
 _NEAR, _FAR, _STRAFE = 11.0, 16.0, 0.8  # [m], [m], of the stick
 _RANGED = KINDS.index("ranged")
@@ -27,22 +27,22 @@ _RANGED = KINDS.index("ranged")
 
 @dataclass(frozen=True)
 class Bot:
-    """A player with one way to fight.
+    """Scripted player with one way to fight.
 
     Attributes:
-        name: for reports.
-        ammo: what it shoots, None for the spear.
+        name: Name in reports.
+        ammo: Ammo that it shoots, or None for the spear.
     """
 
     name: str
     ammo: str | None = None
 
     def act(self, env: CombatEnv, generator: torch.Generator) -> Tensor:
-        """Actions (N, 24) from the env's state.
+        """Return the actions (N, 24) in the present state of an environment.
 
         Args:
-            env: fights.
-            generator: of the decisions to dodge.
+            env: Environment of N fights.
+            generator: Random generator of the decisions to dodge.
         """
         s, traits, n = env.state, env.traits, env.num_envs
         second = nearest(s)
@@ -85,7 +85,7 @@ class Bot:
 
     @staticmethod
     def _aim(env: CombatEnv, second: Tensor, aiming: bool, flight: Tensor) -> Tensor:
-        """Right stick (2, N) that brings the camera to the nearest body, led by the shot's flight, within the step."""
+        """Return the right stick (2, N) that aims at the place of the nearest body after the shot's flight [s]."""
         s = env.state
         target = pick(s.enemy_position, second) + pick(s.enemy_velocity, second) * flight - s.position
         level = target.square().sum(0).sqrt()
@@ -98,7 +98,7 @@ class Bot:
 
     @staticmethod
     def _dodges(env: CombatEnv, generator: torch.Generator) -> Tensor:
-        """(N,) bool: whether to dodge, with the bots' probabilities, when an attack or a shot is about to hit."""
+        """Draw whether to dodge, (N,) bool, in the fights in which an attack or a shot is about to hit."""
         s, traits = env.state, env.traits
         kind = traits.attacks[KIND].gather(0, s.attack.unsqueeze(0))[0]
         reach = traits.attacks[FARTHEST].gather(0, s.attack.unsqueeze(0))[0]
@@ -111,7 +111,7 @@ class Bot:
 
 
 BOTS: dict[str, Bot] = {bot.name: bot for bot in (*(Bot(a, a) for names in AMMO for a in names), Bot("Spear"))}
-"""One bot per ammo, and one with the spear."""
+"""Bots by name: one per ammo, and one with the spear."""
 
 
 @torch.no_grad()
@@ -121,15 +121,16 @@ def fight_all(
     """Let a bot fight every machine.
 
     Args:
-        bot: who fights.
-        machines: types.
-        fights: per machine, spread evenly over the three sites.
-        steps: at most.
-        seed: of fights and decisions.
-        **options: of `CombatEnv`.
+        bot: Scripted player.
+        machines: Machine types.
+        fights: Number of fights per machine, spread evenly over the three sites.
+        steps: Largest number of steps of a fight.
+        seed: Seed of the fights and of the bot's decisions.
+        **options: Options of `CombatEnv`.
 
     Returns:
-        By machine: `won`, share of fights; `dealt` and `taken`, damage per second of fight [HP/s]; `seconds`.
+        For each machine: `won`, the share of fights; `dealt` and `taken`, the damage per second [HP/s]; `seconds`, the
+        mean length of a fight [s].
     """
     rows = [machine for machine in machines for _ in range(fights)]
     env = CombatEnv(len(rows), seed=seed, machines=machines, episode_steps=steps, **options)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Constants of the game that are in no table, with their units. "(paper)" marks the paper's; others are ours."""
+"""Constants of the game that are in no table, with their units. "(paper)" marks the paper's; the others are ours."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Hits on the machine: shots at body and parts, the spear, elements, and who gets the credit."""
+"""Damage to the machines by shots at body and parts, the spear, traps and elements, recorded by its cause."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from coachable.envs.combat.traits import RELOAD as RELOAD_FRAMES
 ACID, PURGEWATER, FROST, SHOCK, PLASMA, BURNING, ADHESIVE = range(len(ELEMENTS))
 _CANISTER = PART_TYPES.index("canister")
 _FAR = 1e6  # [m], further than anything
-_MISSED = 1e12  # takes even a near miss out of range
+_MISSED = 1e12  # factor that moves even a near miss out of range
 
 # Rows of `Totals.dealt`.
 BY_SHOT, BY_SPEAR, BY_TRAP, BY_ACID, BY_FIRE, BY_PLASMA = range(6)
@@ -25,15 +25,16 @@ BY_SHOT, BY_SPEAR, BY_TRAP, BY_ACID, BY_FIRE, BY_PLASMA = range(6)
 
 @dataclass
 class Totals:
-    """What a step did to the machines, summed over its frames.
+    """Damage in a step, summed over its frames.
 
     Attributes:
-        dealt: (6, E, N) damage by what did it, clipped to the health left [HP]; rows above.
-        in_state: (7, E, N) damage while each elemental state was active [HP].
-        buildup: (7, E, N) gauge gained less decay.
-        part_dealt: (12, E, N) damage to parts, clipped to the unit's health [HP].
-        removed: (12, E, N) units removed.
-        taken: (N,) damage to the player [HP].
+        dealt: Damage to the machines by cause (6, E, N), clipped to the health left, with the rows `BY_SHOT` to
+            `BY_PLASMA` [HP].
+        in_state: Damage while each elemental state was active (7, E, N) [HP].
+        buildup: Gain of the gauges less their decay (7, E, N).
+        part_dealt: Damage to parts, clipped to the unit's health (12, E, N) [HP].
+        removed: Number of removed units (12, E, N).
+        taken: Damage to the player (N,) [HP].
     """
 
     dealt: Tensor
@@ -52,7 +53,13 @@ class Totals:
 
 @dataclass
 class ElementNumbers:
-    """elements.csv as columns (7, 1, 1): duration [frames], damage per frame [HP], factor less 1 on hits."""
+    """Columns (7, 1, 1) of elements.csv.
+
+    Attributes:
+        frames: Duration of the elemental state [frames].
+        damage: Damage per frame [HP].
+        hit_bonus: Factor on hits, less 1.
+    """
 
     frames: Tensor
     damage: Tensor
@@ -72,21 +79,21 @@ class ElementNumbers:
 def shoot(
     s: State, intent: Intent, traits: Traits, relative: Tensor, distance: Tensor, spread: Tensor, blocked_at: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Advance the weapon by one frame: whether it fires, what the shot meets first, and the damage to the parts.
+    """Advance the weapon by one frame, and find what its shot hits first.
 
-    There are no projectiles: everything is shifted by what it will have moved when the shot arrives.
+    There are no projectiles. Instead, the machines are shifted by the distance that they move until the shot arrives.
 
     Args:
-        s: state; magazine timers and technique change.
-        intent: of the step; `loaded` changes.
-        traits: of the machines.
-        relative: (2, E, N) enemies from the player [m].
-        distance: (E, N) their distance [m].
-        spread: (2, N) standard normal numbers.
-        blocked_at: (N,) distance at which a pillar stops the shot [m].
+        s: State; its timers and `technique` change.
+        intent: Intent of the step; its `loaded` changes.
+        traits: Traits of the machines.
+        relative: Positions of the enemies relative to the player (2, E, N) [m].
+        distance: Distances of the enemies (E, N) [m].
+        spread: Standard normal numbers (2, N).
+        blocked_at: Distance at which a pillar stops the shot (N,) [m].
 
     Returns:
-        Hit (E, N) as 0 or 1, factor of the body's damage (E, N), and of the parts' damage (12, E, N).
+        Hits (E, N), 0 or 1; factor of the body's damage (E, N); factor of the parts' damage (12, E, N).
     """
     fires = intent.shooting & (s.timers[NO_SHOT].amax(0) <= 0) & (intent.loaded > 0)
     intent.loaded = intent.loaded - 1.0 * fires
@@ -129,7 +136,7 @@ def shoot(
     blast = meets.float() * (intent.ammo[BLAST] > 0)
     shares = torch.maximum((1.0 - gap / reach_of_blast).clamp(min=0.0) * blast, struck) * present
 
-    # The technique doubles the shot that is fired, hit or miss.
+    # The technique is used up by the next shot, also by one that misses.
     technique = 1.0 + (c.TECHNIQUE_FACTOR - 1.0) * s.technique
     s.technique = torch.where(fires, 0.0, s.technique)
     hit = meets.float()
@@ -138,18 +145,18 @@ def shoot(
 
 
 def _dot(offset: Tensor, vector: tuple[Tensor, ...]) -> Tensor:
-    """(3, 12, E, N) times three (E, N), summed: (12, E, N)."""
+    """Return the scalar products (12, E, N) of offsets (3, 12, E, N) and a vector of three (E, N)."""
     total = offset[0] * vector[0]
     total = torch.addcmul(total, offset[1], vector[1])
     return torch.addcmul(total, offset[2], vector[2])
 
 
 def _entry(along: Tensor, squared: Tensor) -> Tensor:
-    """Return the distance at which a ray enters a sphere; far out of range if it misses.
+    """Return the distance at which a ray enters a sphere; it is far out of range if the ray misses.
 
     Args:
-        along: projection of the centre on the ray [m].
-        squared: squared distance of the centre less the squared radius [m^2].
+        along: Projection of the centre on the ray [m].
+        squared: Squared distance of the centre less the squared radius [m²].
     """
     inside = along.square() - squared
     # Arithmetic instead of a selection: on the CPU a selection between random elements is ten times slower.
@@ -158,10 +165,16 @@ def _entry(along: Tensor, squared: Tensor) -> Tensor:
 
 
 def damage_parts(s: State, traits: Traits, damage: Tensor, totals: Totals) -> Tensor:
-    """Take damage (12, E, N) off the parts; at most one unit of each is removed.
+    """Subtract damage from the parts and remove at most one unit of each.
+
+    Args:
+        s: State; `part_hp` and `count` change.
+        traits: Traits of the machines.
+        damage: Damage to the parts (12, E, N) [HP].
+        totals: Totals of the step; they change.
 
     Returns:
-        (E, N) canisters burst, 0 or 1.
+        Whether a canister bursts (E, N), 0 or 1.
     """
     applied = torch.minimum(damage, s.part_hp * s.count.clamp(max=1.0))
     left = s.part_hp - applied
@@ -174,10 +187,10 @@ def damage_parts(s: State, traits: Traits, damage: Tensor, totals: Totals) -> Te
 
 
 def swing(s: State, intent: Intent, traits: Traits) -> Tensor:
-    """Advance the spear by one frame: lunge and damage on the first frame of a swing.
+    """Advance the spear by one frame; the player lunges and deals damage on the first frame of a swing.
 
     Returns:
-        (E, N) damage [HP].
+        Damage (E, N) [HP].
     """
     wanted = (intent.light | intent.heavy) & (s.timers[NO_SWING].amax(0) <= 0)
     duration = torch.where(intent.heavy, c.HEAVY_TIME * c.FPS, c.LIGHT_TIME * c.FPS)
@@ -203,13 +216,13 @@ _MELEE_COSINE = float(torch.tensor(c.MELEE_CONE).cos())
 
 
 def build_up(s: State, gain: Tensor, source: Tensor | float, totals: Totals) -> None:
-    """Add build-up to the gauges; a running state takes none.
+    """Add build-up to the gauges of elements whose state is not active.
 
     Args:
-        s: state.
-        gain: (7, E, N) as shares of the threshold, growth of shock's threshold left out.
-        source: what builds up, (N,) or one number.
-        totals: of the step.
+        s: State.
+        gain: Shares of the threshold (7, E, N), without the growth of shock's threshold.
+        source: Number of the source, as in `State.source`: (N,) or one number.
+        totals: Totals of the step; they change.
     """
     idle = 1.0 - s.state_timer.clamp(max=1.0)
     drenched = 1.0 + (c.DRENCHED_BUILDUP - 1.0) * s.state_timer[PURGEWATER].clamp(max=1.0)
@@ -226,11 +239,11 @@ def build_up(s: State, gain: Tensor, source: Tensor | float, totals: Totals) -> 
 def run_elements(
     s: State, numbers: ElementNumbers, traits: Traits, totals: Totals
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Advance the elements by one frame: decay, states that start and end, damage over time.
+    """Advance the decay of the gauges, the elemental states and their damage over time by one frame.
 
     Returns:
-        Active states (7, E, N) as 0 or 1 before they end, damage over time (7, E, N) [HP], plasma's ending (E, N)
-        and shock's beginning (E, N), 0 or 1.
+        Active states (7, E, N), 0 or 1, including those that end; damage over time (7, E, N) [HP]; whether plasma ends
+        (E, N) and whether shock begins (E, N), 0 or 1.
     """
     active = s.state_timer.clamp(max=1.0)
     timer = (s.state_timer - 1.0).clamp(min=0.0)
@@ -238,7 +251,7 @@ def run_elements(
     burst = active[PLASMA] - timer[PLASMA].clamp(max=1.0)
     decayed = (s.gauge - c.GAUGE_DECAY * c.DT).clamp(min=0.0)
     full = (s.gauge >= 1.0).float()
-    # A gauge that is full starts its state before it can decay; the reset is no loss of build-up.
+    # A full gauge starts its state before it can decay. Its reset does not count as a loss of build-up.
     totals.buildup = totals.buildup + (decayed - s.gauge) * (1.0 - full)
     s.gauge = decayed * (1.0 - full)
     s.state_timer = timer + full * numbers.frames
@@ -247,23 +260,23 @@ def run_elements(
 
 
 def hit_factor(s: State, numbers: ElementNumbers) -> Tensor:
-    """(E, N) what frost and acid multiply hits by."""
+    """Return the factor (E, N) of frost and acid on hits."""
     bonus = 1.0 + numbers.hit_bonus * s.state_timer.clamp(max=1.0)
     return bonus[ACID] * bonus[FROST]
 
 
 def take_damage(s: State, raw: Tensor, active: Tensor, burst: Tensor, totals: Totals) -> Tensor:
-    """Subtract damage from the machines, clipped to their health, and record who caused it.
+    """Subtract damage from the machines, clipped to their health, and record its causes.
 
     Args:
-        s: state.
-        raw: (6, E, N) damage of this frame by what did it [HP]; plasma's row is replaced by the stored damage.
-        active: (7, E, N) states during this frame.
-        burst: (E, N) 1 where plasma ends.
-        totals: of the step.
+        s: State.
+        raw: Damage of this frame by cause (6, E, N); the stored damage replaces the row of plasma [HP].
+        active: Active states during this frame (7, E, N), 0 or 1.
+        burst: Whether plasma ends (E, N), 0 or 1.
+        totals: Totals of the step; they change.
 
     Returns:
-        (E, N) damage [HP].
+        Damage (E, N) [HP].
     """
     release = s.plasma_store * burst
     raw = torch.cat((raw[:BY_PLASMA], release.unsqueeze(0)))

@@ -1,4 +1,4 @@
-"""`CombatEnv`: N fights against machines as one TorchRL environment."""
+"""`CombatEnv`, a TorchRL environment of N fights against machines."""
 
 from __future__ import annotations
 
@@ -42,37 +42,38 @@ from coachable.finite import require_finite_action
 from coachable.keys import EVENTS, STYLE_FEATURES, TASK_REWARD
 
 COMPONENTS_KEY = "components"
-"""Raw components of a step, `(N, 44)`, for evaluation; see `rewards.COMPONENTS`."""
+"""Key of the raw components of a step, `(N, 44)`, for evaluation; see `rewards.COMPONENTS`."""
 
 
 class CombatEnv(EnvBase):
-    """Fights of one player with a gamepad against machines, in six-frame steps of 0.2 s (paper: 5 Hz).
+    """Environment of fights of one player with a gamepad against machines, in steps of 0.2 s (paper: 5 Hz).
 
-    The env knows no style: it emits `task_reward` and the `style_features` g_i, from which `StyleReward` computes
-    sum_i w_i g_i. A fight ends when every machine is dead, the player is dead or leaves the Dynamic Anchor Bound
-    (terminated), or after `episode_steps` (truncated).
+    The environment is independent of the style. It emits `task_reward` and the `style_features` g_i, from which
+    `StyleReward` computes sum_i w_i g_i. A fight terminates when all machines or the player are dead, or when the
+    player leaves the Dynamic Anchor Bound. It is truncated after `episode_steps`.
 
     Args:
-        num_envs: N, stepped together.
-        seed: seed of scenarios and fights.
-        machines: types that a fight draws from, uniformly; the paper's 19 by default.
-        sites: sites that a fight draws from, uniformly; all three by default.
-        num_enemies: machines per fight, 1 or 2 of independently drawn types.
-        styles: whose features and events are emitted, in this order; all 18 by default.
+        num_envs: Number N of fights.
+        seed: Seed of scenarios and fights.
+        machines: Machine types from which each fight draws uniformly; the paper's 19 by default.
+        sites: Sites from which each fight draws uniformly; all three by default.
+        num_enemies: Number of machines per fight, 1 or 2, of independently drawn types.
+        styles: Names of the styles whose features and events are emitted, in this order; all 18 by default.
         observation: "full" (629 numbers) or "small" (190).
-        reward_scale: "sim" or "paper": reward of a removed part, 60 or 1000; use the style space of the same scale.
-        episode_steps: steps after which a fight is truncated.
-        traps: of each type in the inventory.
-        assist: aim assist, "full", "small" or "off".
-        kill_event: whether `events` has one more column, every machine dead.
-        components: whether `components` (N, 44) is emitted, too.
-        device: where everything is computed.
+        reward_scale: "sim" or "paper", for a reward of 60 or 1000 for a removed part. Use the style space of the same
+            scale.
+        episode_steps: Number of steps after which a fight is truncated.
+        traps: Number of traps of each type in the inventory.
+        assist: Aim assist: "full", "small" or "off".
+        kill_event: Whether `events` has one more column, for the death of all machines.
+        components: Whether to emit `components` (N, 44), too.
+        device: Device of all tensors.
 
     Keys written: `observation` (N, 629), `task_reward` (N, 1), `style_features` (N, 18), `events` (N, 18) bool,
     `done`, `terminated`, `truncated` (N, 1).
 
     Raises:
-        ValueError: if an option or a name is unknown, or a number is out of range.
+        ValueError: If an option or a name is unknown, or a number is out of range.
 
     Example:
         >>> env = CombatEnv(num_envs=2, seed=0, machines=["Scrounger"], observation="small")
@@ -124,14 +125,14 @@ class CombatEnv(EnvBase):
         self._look_up()
 
     def assign(self, machines: Sequence[str | Sequence[str]], sites: Sequence[str]) -> None:
-        """Give every fight its scenario from its next reset on, instead of drawing it.
+        """Assign scenarios to the fights from their next reset on, instead of drawing them.
 
         Args:
-            machines: one type, or one per enemy, for each of the N fights.
-            sites: one for each of the N fights.
+            machines: Machine type, or one type per enemy, of each of the N fights.
+            sites: Site of each of the N fights.
 
         Raises:
-            ValueError: if a name is unknown or there are not N of them.
+            ValueError: If a name is unknown or there are not N of them.
         """
         rows = [[names] * self.num_enemies if isinstance(names, str) else list(names) for names in machines]
         if len(rows) != self.num_envs or len(sites) != self.num_envs or {len(r) for r in rows} != {self.num_enemies}:
@@ -158,7 +159,7 @@ class CombatEnv(EnvBase):
         self._place_pillars(self._site_pool)
 
     def _place_pillars(self, sites: Tensor) -> None:
-        """Look up pillars only if some fight may have them."""
+        """Load the pillars only if a fight may have them, because they cost time."""
         needed = bool((self._sites[sites, 2] > 0).any())
         self._pillars = torch.tensor(c.PILLARS, device=self._on).T.contiguous() if needed else None
 
@@ -236,7 +237,7 @@ class CombatEnv(EnvBase):
     # -- state -----------------------------------------------------------------------------------------------------
 
     def _fresh(self) -> State:
-        """Return new fights for all rows; the amount of random numbers drawn does not depend on which rows need one."""
+        """Return new fights for all rows, so that the count of random numbers does not depend on which rows reset."""
         n, on = self.num_envs, self._on
         drawn = torch.randint(len(self._machine_pool), (self.num_enemies, n), generator=self._random, device=on)
         machine = self._machine_pool[drawn]
@@ -247,14 +248,14 @@ class CombatEnv(EnvBase):
         return start_fights(machine, site, traits, self._magazines, float(self.traps), self._random)
 
     def _look_up(self) -> None:
-        """Tables of the machines and sites that are being fought."""
+        """Load the tables of the machines and sites of the present fights."""
         self.traits: Traits = look_up_traits(self._machines, self.state.machine)
         traps = TrapNumbers.of(self.traits) if self.traps else None
         site = self._sites.index_select(0, self.state.site).T.contiguous()
         self.rules = Rules(self.traits, site, self._elements, traps, self._pillars, c.ASSIST[self.assist])
 
     def simulator_state(self) -> dict[str, Any]:
-        """Return everything that the next step depends on, fights first, for exact resumption."""
+        """Return all tensors that the next step depends on, with the fights first, for exact resumption."""
         tensors: dict[str, Any] = {
             name: value.movedim(-1, 0).clone().cpu() for name, value in self.state.tensors().items()
         }
@@ -263,8 +264,11 @@ class CombatEnv(EnvBase):
     def load_simulator_state(self, state: dict[str, Any]) -> None:
         """Restore what `simulator_state` returned.
 
+        Args:
+            state: Result of `simulator_state` of an environment with as many fights and enemies.
+
         Raises:
-            ValueError: if it comes from another number of envs or enemies.
+            ValueError: If it comes from another number of fights or enemies.
         """
         shape, expected = tuple(state["machine"].shape), (self.num_envs, self.num_enemies)
         if shape != expected:

@@ -1,4 +1,4 @@
-"""What the agent sees: named groups, camera-aligned, everything roughly within [-1, 1] (paper, Appendix C)."""
+"""Observations in named groups, aligned with the camera and roughly within [-1, 1] (paper, Appendix C)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ from coachable.envs.combat.tables import ATTACK_SLOTS, ELEMENTS, PART_SLOTS, SIT
 from coachable.envs.combat.traits import AMMO_SLOTS, HIDDEN, INTERVAL, MACHINE_NAMES, MAGAZINE, Traits
 from coachable.envs.combat.traits import RELOAD as RELOAD_FRAMES
 
-ENEMY_SLOTS = 2  # in the observation, whatever the number of enemies
 SMALL_PARTS = 4
 _GAME_TIMERS = slice(0, 11)
 _SPEED_SCALE, _TIMER_SCALE = 0.1, 0.5 / c.FPS  # per m/s, per frame
@@ -67,13 +66,15 @@ def _enemy(small: bool) -> list[tuple[str, int]]:
 
 
 def observation_groups(observation: str) -> list[tuple[str, int]]:
-    """Return name and width of every group, in order; enemies are sorted by distance, and "2" marks the second one's.
+    """Return name and width of every group of the observation, in order.
+
+    Enemies are sorted by distance; the names of the second one's groups end in "2".
 
     Args:
         observation: "full" (629 numbers) or "small" (190).
 
     Raises:
-        ValueError: if it is neither.
+        ValueError: If it is neither.
     """
     if observation == "small":
         return [*_PLAYER, *_PLACES, *_enemy(True), ("Action history", 24)]
@@ -103,9 +104,11 @@ def encode_position(offset: Tensor) -> Tensor:
 
 
 def to_camera(vector: Tensor, axes: Tensor) -> Tensor:
-    """Return world vectors (2, ..., N) as forward and left of the camera; `axes` is its forward direction (2, N).
+    """Rotate world vectors (2, ..., N) to the forward and left directions of the camera, ignoring its pitch.
 
-    The camera's pitch is left out: up stays up.
+    Args:
+        vector: Vectors (2, ..., N).
+        axes: Forward direction of the camera (2, N).
     """
     x, y = vector
     fx, fy = axes
@@ -113,32 +116,32 @@ def to_camera(vector: Tensor, axes: Tensor) -> Tensor:
 
 
 def _ground(position: Tensor, s: State, axes: Tensor) -> Tensor:
-    """Encode places on the ground (2, k, N) or (2, N), seen from the eye."""
+    """Encode positions on the ground (2, k, N) or (2, N) relative to the eye."""
     own = s.position.view(2, *[1] * (position.ndim - 2), -1)
     flat = to_camera(position - own, axes)
     return encode_position(torch.cat([flat, torch.full_like(flat[:1], -c.EYE_HEIGHT)]))
 
 
 def one_hot_rows(index: Tensor, size: int) -> Tensor:
-    """(..., N) numbers to (size, ..., N) 0 or 1."""
+    """Return the one-hots (size, ..., N) of indices (..., N)."""
     return (index == torch.arange(size, device=index.device).view(-1, *[1] * index.ndim)).float()
 
 
 def _body(s: State, traits: Traits, axes: Tensor) -> Tensor:
-    """Return body centres from the eye (3, E, N), camera-aligned [m]."""
+    """Return the centres of the machines relative to the eye (3, E, N), aligned with the camera [m]."""
     flat = to_camera(s.enemy_position - s.position.unsqueeze(1), axes)
     return torch.cat([flat, (s.enemy_z + traits.radius - c.EYE_HEIGHT).unsqueeze(0)])
 
 
 def _attack_id(s: State, traits: Traits) -> Tensor:
-    """(4, E, N) one-hot of the running attack; zero when there is none or it cannot be recognised."""
+    """Return the one-hot (4, E, N) of the current attack; it is zero if there is none or if it is hidden."""
     hidden = traits.attacks[HIDDEN].gather(0, s.attack.unsqueeze(0))[0]
     shown = (s.phase > IDLE) & (s.phase < STAGGERED) & (hidden <= 0) & (s.enemy_hp > 0)
     return one_hot_rows(s.attack, ATTACK_SLOTS) * shown
 
 
 def kept_features(s: State, traits: Traits) -> Tensor:
-    """(12, N) what the feature history keeps of a state: nearest enemy, both healths, the attack."""
+    """Return the row (12, N) of a state in the feature history: place of the nearest enemy, both healths, attack."""
     second = nearest(s)
     return torch.cat(
         [
@@ -151,14 +154,14 @@ def kept_features(s: State, traits: Traits) -> Tensor:
 
 
 def observe(s: State, traits: Traits, ammo: Tensor, observation: str, episode_steps: int) -> Tensor:
-    """Return the observation (N, 629) or (N, 190), a function of the state alone.
+    """Return the observation (N, 629) or (N, 190) of a state.
 
     Args:
-        s: state.
-        traits: of the machines.
-        ammo: (18, N) rows of `ammo_table` of the ammo in hand.
+        s: State.
+        traits: Traits of the machines.
+        ammo: Rows of `ammo_table` of the selected ammo (18, N).
         observation: "full" or "small".
-        episode_steps: length of an episode.
+        episode_steps: Length of an episode in steps.
     """
     axes, small = facing(s.yaw), observation == "small"
     rows = [_player_rows(s, ammo, axes, episode_steps)]

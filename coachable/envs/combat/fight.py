@@ -1,4 +1,4 @@
-"""One step of N fights from pad to components: what `CombatEnv` wraps."""
+"""One step of N fights from the gamepad's state to the components of the reward, for `CombatEnv`."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from coachable.envs.combat.traps import closeness
 
 
 def run_step(s: State, pad_rows: Tensor, rules: Rules, noise: Noise, ammo_table: Tensor, sections: Tensor) -> Tensor:
-    """Advance the fights by one step. Changes `s`.
+    """Advance the fights by one step, in place.
 
     Args:
-        s: state.
-        pad_rows: (24, N) canonical actions.
-        rules: of the fights.
-        noise: random numbers of the step.
-        ammo_table: of `ammo_table`.
-        sections: of `ammo_sections`.
+        s: State; it changes.
+        pad_rows: Canonical actions (24, N).
+        rules: Rules of the fights.
+        noise: Random numbers of the step.
+        ammo_table: Result of `ammo_table`.
+        sections: Result of `ammo_sections`.
 
     Returns:
-        (44, N) components, see `rewards.COMPONENTS`.
+        Components (44, N); see `rewards.COMPONENTS`.
     """
     traits, pad = rules.traits, read_pad(pad_rows)
     s.features = torch.cat([kept_features(s, traits), s.features[:FEATURES_KEPT]])
@@ -62,7 +62,8 @@ def run_step(s: State, pad_rows: Tensor, rules: Rules, noise: Noise, ammo_table:
     s.sticks = torch.cat([stick, s.sticks[:2]])
     s.wheel, s.quick = pad.l1, pad.left + pad.right
 
-    # What burns was lit by the source at the start of the step if its state ran then, by the last one otherwise.
+    # Damage over time counts for the source at the start of the step if the state was active then, and otherwise for
+    # the latest source.
     source = torch.where(was_active > 0, source_before, s.source)
     return pack_components(
         damage=totals.dealt.sum((0, 1)),
@@ -84,7 +85,7 @@ def run_step(s: State, pad_rows: Tensor, rules: Rules, noise: Noise, ammo_table:
 
 
 def _credit(s: State, totals: Totals, source: Tensor) -> dict[str, Tensor]:
-    """Damage by weapon (6, N), spear and traps (N,); what burns or bursts counts for its source."""
+    """Return the damage by weapon (6, N), spear and traps (N,); that of elemental states counts for their source."""
     lasting = torch.stack([totals.dealt[row] for row in (BY_ACID, BY_FIRE, BY_PLASMA)])  # (3, E, N)
     lit_by = torch.stack([source[element] for element in (ACID, BURNING, PLASMA)])
     by_source = (one_hot_rows(lit_by, NUM_SOURCES) * lasting).sum((1, 2))  # (8, N)
@@ -98,7 +99,7 @@ def _credit(s: State, totals: Totals, source: Tensor) -> dict[str, Tensor]:
 
 
 def _off_screen(s: State, traits: Traits, offset: Tensor, second: Tensor) -> Tensor:
-    """Return how far the nearest enemy is outside a cone of 60 degrees around the camera's axis, in [0, 1.87]."""
+    """Return the difference of cosines by which the nearest enemy is outside a cone of 60 degrees, in [0, 1.87]."""
     rise = pick(s.enemy_z + traits.radius, second) - c.EYE_HEIGHT
     length = (offset.square().sum(0) + rise.square()).sqrt().clamp(min=1e-3)
     ahead = s.pitch.cos() * (offset[0] * s.yaw.cos() + offset[1] * s.yaw.sin()) + rise * s.pitch.sin()

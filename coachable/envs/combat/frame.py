@@ -1,4 +1,4 @@
-"""One step of N fights: the pad held for six frames of 1/30 s."""
+"""The six frames of 1/30 s of a step of N fights, with the same state of the gamepad."""
 
 from __future__ import annotations
 
@@ -40,11 +40,14 @@ class Noise:
     """Random numbers of one step.
 
     Attributes:
-        spread: (6, 2, N) standard normal, aim of the player's shots.
-        aim: (6, 2, E, N) standard normal, aim of the machines' shots.
-        flip, shot: (6, E, N) uniform: strafing, damage of the machines' shots.
-        choice: (4, E, N) uniform: which attack. An attack lasts longer than a step, so one draw a step is enough.
-        pause, hit: (E, N) uniform: pause after an attack, damage of a hit.
+        spread: Standard normal numbers (6, 2, N) for the aim of the player's shots.
+        aim: Standard normal numbers (6, 2, E, N) for the aim of the machines' shots.
+        flip: Uniform numbers (6, E, N) for changes of the strafing direction.
+        shot: Uniform numbers (6, E, N) for the damage of the machines' shots.
+        choice: Uniform numbers (4, E, N) for the choice of the attack. One per step is enough, because an attack lasts
+            longer than a step.
+        pause: Uniform numbers (E, N) for the pause after an attack.
+        hit: Uniform numbers (E, N) for the damage of a hit.
     """
 
     spread: Tensor
@@ -57,7 +60,7 @@ class Noise:
 
     @classmethod
     def draw(cls, enemies: int, n: int, generator: torch.Generator) -> Noise:
-        """Draw everything; how many numbers depends on the shapes only."""
+        """Draw the numbers of a step; their count depends only on the numbers of enemies and of fights `n`."""
         frames, device = c.FRAMES_PER_STEP, generator.device
         normal = torch.randn((frames, 2 + 2 * enemies, n), generator=generator, device=device)
         uniform = torch.rand((2 * frames + ATTACK_SLOTS + 2, enemies, n), generator=generator, device=device)
@@ -72,15 +75,15 @@ class Noise:
 
 @dataclass
 class Rules:
-    """Quantities that stay the same over a step, besides the pad.
+    """Quantities that stay the same over a step.
 
     Attributes:
-        traits: of the machines.
-        site: (4, N) rows of `site_table`.
-        elements: of `ElementNumbers.load`.
-        traps: of `TrapNumbers.of`; None where no fight has traps.
-        pillars: (2, 4) their places; None if no fight has any.
-        assist: cone [rad] and share per frame of the aim assist.
+        traits: Traits of the machines.
+        site: Rows of `site_table` (4, N).
+        elements: Result of `ElementNumbers.load`.
+        traps: Result of `TrapNumbers.of`, or None if there are no traps.
+        pillars: Positions of the pillars (2, 4), or None if no fight has any [m].
+        assist: Cone [rad] and share per frame of the aim assist.
     """
 
     traits: Traits
@@ -92,7 +95,7 @@ class Rules:
 
 
 def run_frames(s: State, intent: Intent, rules: Rules, noise: Noise) -> Totals:
-    """Advance the fights by all frames of a step. Changes `s` and `intent.loaded`."""
+    """Advance the fights by all frames of a step; `s` and `intent.loaded` change in place."""
     totals = Totals.zeros(s.enemy_hp, PART_SLOTS)
     strength = ranged_strength(s, rules.traits)
     for frame in range(c.FRAMES_PER_STEP):
@@ -103,7 +106,7 @@ def run_frames(s: State, intent: Intent, rules: Rules, noise: Noise) -> Totals:
 def run_frame(
     s: State, intent: Intent, rules: Rules, totals: Totals, strength: Tensor, noise: Noise, frame: int
 ) -> None:
-    """Advance one frame: the player, what it does to the machine, the machine, what it does to the player."""
+    """Advance the fights by one frame: the player, its attacks, the machines, and theirs."""
     traits, site = rules.traits, rules.site
     run_timers(s, intent)
     move_player(s, intent, traits, site)

@@ -1,8 +1,8 @@
-"""A PlayStation-like gamepad: policy heads, virtual-hand constraints, canonical combinations, readable actions.
+"""PlayStation-like gamepad with policy heads, constraints of a virtual hand, and names for actions.
 
-An action is one tensor `(..., 24)`: the one-hots of six heads, then the four stick axes (paper, Table "Policy head
-outputs"). 864 raw combinations of the heads mean 315 different things, because a thumb is either on its stick or on its
-buttons. `canonical` maps every raw action to the one that the game acts on.
+An action is one tensor `(..., 24)` of the one-hots of six heads and the four stick axes (paper, Table "Policy head
+outputs"). The 864 raw combinations of the heads have 315 different meanings, because a thumb is either on its stick or
+on its buttons. `canonical` maps every raw action to the one that the game uses.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ for _head, _values in HEADS.items():
 
 
 def _legal(face: str, dpad: str, left_mode: str, right_mode: str) -> bool:
-    """Return whether the thumbs reach what they press: a thumb on its stick presses only L3, and that with the left."""
+    """Return whether the thumbs reach the buttons; a thumb on its stick reaches only L3, which needs the left thumb."""
     left = dpad in ("none", "L3") if left_mode == "joystick" else dpad != "L3"
     return left and (face == "none" or right_mode == "buttons")
 
@@ -70,9 +70,9 @@ _COMBINATIONS = [
 
 
 class Pad(NamedTuple):
-    """A canonical action as the game reads it: rows of numbers, 0 or 1 for buttons; every field is `(...,)`.
+    """Fields of a canonical action: buttons `(...,)`, 0 or 1, and sticks `(2, ...)`, x and y.
 
-    The sticks are `(2, ...)`, x and y, and read 0 while their thumb is on the buttons.
+    A stick is 0 while its thumb is on the buttons.
     """
 
     cross: Tensor
@@ -92,7 +92,7 @@ class Pad(NamedTuple):
 
 
 def canonical_rows(rows: Tensor) -> Tensor:
-    """`canonical` for actions whose components come first, `(24, ...)` to `(24, ...)`."""
+    """Return `canonical` of actions whose components come first, `(24, ...)`."""
     left_joystick, right_joystick = rows[_ROWS["left_mode.joystick"]], rows[_ROWS["right_mode.joystick"]]
     left_buttons, right_buttons = 1.0 - left_joystick, 1.0 - right_joystick
     face = rows[1:4] * right_buttons
@@ -106,13 +106,16 @@ def canonical_rows(rows: Tensor) -> Tensor:
 
 
 def canonical(action: Tensor) -> Tensor:
-    """The action that the game acts on: modes decide, unreachable presses become none, a resting stick reads 0.
+    """Return the action that the game uses; the operation is idempotent.
+
+    The mode heads decide where the thumbs are. Buttons out of their reach become "none", and a stick without a thumb
+    becomes 0.
 
     Args:
-        action: `(..., 24)`, exact one-hots and axes.
+        action: Actions `(..., 24)` of exact one-hots and axes.
 
     Returns:
-        `(..., 24)`, idempotent.
+        Canonical actions `(..., 24)`.
     """
     return canonical_rows(action.movedim(-1, 0)).movedim(0, -1)
 
@@ -127,7 +130,7 @@ def read_pad(rows: Tensor) -> Pad:
 
 
 def combination_index(action: Tensor) -> Tensor:
-    """Number of the legal combination that an action, raw or canonical, means: `(..., 24)` to `(...,)` in [0, 315)."""
+    """Return the number of the legal combination of raw or canonical actions `(..., 24)`, as `(...,)` in [0, 315)."""
     choices = GAMEPAD.choices(canonical(action))
     sizes = GAMEPAD.categorical
     table = torch.full(sizes, -1, dtype=torch.int64, device=action.device)
@@ -137,16 +140,15 @@ def combination_index(action: Tensor) -> Tensor:
 
 
 def press(*buttons: str, left: tuple[float, float] | None = None, right: tuple[float, float] | None = None) -> Tensor:
-    """One action `(24,)` from names, for scripts and tests.
+    """Return an action `(24,)` from names of buttons, for scripts and tests.
 
     Args:
-        *buttons: of `HEADS`, such as "cross", "L1", "up".
-        left: x and y of the left stick; its thumb is then on the stick, otherwise on the buttons (L3 also puts it on
-            the stick).
-        right: the same for the right stick.
+        *buttons: Names in `HEADS`, such as "cross", "L1", "up".
+        left: x and y of the left stick, which put its thumb on the stick, as L3 does. By default it is on the buttons.
+        right: x and y of the right stick, likewise.
 
     Raises:
-        ValueError: if a name is unknown or the hand cannot press this combination; says which.
+        ValueError: If a name is unknown or the hand cannot press this combination.
 
     Example:
         >>> describe(press("L2", "R2", left=(0.0, 1.0), right=(0.5, 0.0)))
@@ -171,10 +173,13 @@ def press(*buttons: str, left: tuple[float, float] | None = None, right: tuple[f
 
 
 def describe(action: Tensor) -> str:
-    """What one action `(24,)`, raw or canonical, does on the pad, readable.
+    """Describe an action in words.
+
+    Args:
+        action: Raw or canonical action `(24,)`.
 
     Raises:
-        ValueError: if it is not one action.
+        ValueError: If it is not a single action.
 
     Example:
         >>> describe(press("L1", right=(0.0, 1.0)))

@@ -1,4 +1,4 @@
-"""The machines: choice of attacks, phases, motion, and what hits the player."""
+"""Attacks, phases and motion of the machines, and their hits on the player."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _SHOCK_FRAMES = load_table("elements").number("shock", "seconds") * c.FPS
 
 
 def ranged_strength(s: State, traits: Traits) -> Tensor:
-    """(E, N) share of the weapon parts left; 1 for machines without."""
+    """Return the share of weapon parts that are left (E, N); it is 1 for machines without any."""
     left = (s.count * traits.part_type[_WEAPON]).sum(0)
     return torch.where(traits.weapon_parts > 0, left / traits.weapon_parts.clamp(min=1.0), 1.0)
 
@@ -52,16 +52,16 @@ def decide(
     """Advance the phases by one frame: idle, telegraph, active, recover, and staggered.
 
     Args:
-        s: state.
-        traits: of the machines.
-        strength: of `ranged_strength`.
-        gap: (E, N) between the bodies [m].
-        shocked: (E, N) 1 where shock begins.
-        choice: (4, E, N) uniform numbers; the attack that can be used with the largest one starts.
-        pause: (E, N) uniform number.
+        s: State; it changes.
+        traits: Traits of the machines.
+        strength: Result of `ranged_strength`.
+        gap: Distances between the bodies (E, N) [m].
+        shocked: Whether shock begins (E, N), 0 or 1.
+        choice: Uniform numbers (4, E, N); of the attacks that can be used, the one with the largest number starts.
+        pause: Uniform numbers (E, N) for the pause after an attack.
 
     Returns:
-        Rows of the current attack (11, E, N), and where a zone is left behind (E, N) bool.
+        Rows of the current attack (11, E, N), and whether a hazard zone is left behind (E, N) bool.
     """
     living, idle = s.enemy_hp > 0, s.phase == IDLE
     timer = s.phase_timer - 1.0
@@ -95,7 +95,7 @@ def decide(
     s.pause = torch.where(to_recover, calm * rage, waiting)
     zone = to_recover & (blow[HAZARD] > 0)
 
-    # Enough damage staggers, shock paralyses; either breaks off what the machine is doing.
+    # Enough damage staggers a machine, and shock paralyses it. Both interrupt its attack.
     staggers = (s.stagger_sum >= c.STAGGER_SHARE * traits.hp + c.STAGGER_BASE) & living
     s.stagger_sum = torch.where(staggers, 0.0, s.stagger_sum)
     frames = torch.maximum(staggers * (c.MACHINE_STAGGER * c.FPS), shocked * _SHOCK_FRAMES)
@@ -107,14 +107,14 @@ def decide(
 
 
 def move_machines(s: State, traits: Traits, site: Tensor, blow: Tensor, flip: Tensor) -> None:
-    """Advance the motion by one frame: approach or strafe, charge, turn, dive; bodies never overlap.
+    """Advance the motion by one frame: approach or strafe, charge, turn, and dive. Bodies never overlap.
 
     Args:
-        s: state.
-        traits: of the machines.
-        site: (4, N) rows of `site_table`.
-        blow: rows of the current attack.
-        flip: (E, N) uniform number; turns the strafe round with a small probability.
+        s: State; it changes.
+        traits: Traits of the machines.
+        site: Rows of `site_table` (4, N).
+        blow: Rows of the current attack (11, E, N).
+        flip: Uniform numbers (E, N) that reverse the strafing direction with a small probability.
     """
     living, idle = s.enemy_hp > 0, s.phase == IDLE
     to_player = s.position.unsqueeze(1) - s.enemy_position  # (2, E, N)
@@ -140,7 +140,7 @@ def move_machines(s: State, traits: Traits, site: Tensor, blow: Tensor, flip: Te
     step = wrap(bearing - s.enemy_yaw).clamp(-c.MACHINE_TURN * c.DT, c.MACHINE_TURN * c.DT)
     s.enemy_yaw = wrap(s.enemy_yaw + step * turns)
 
-    # Flyers come down to dive and when they are staggered, within a telegraph's time.
+    # Flying machines descend to dive and when they are staggered, within the time of a telegraph.
     dives = (blow[KIND] == CHARGE) & (s.phase >= TELEGRAPH) & (s.phase <= ACTIVE)
     aloft = traits.height * ~(dives | (s.phase == STAGGERED))
     climb = traits.height / 12.0
@@ -159,22 +159,22 @@ def strike_player(
     pillars: Tensor | None,
     blocks: Tensor,
 ) -> Tensor:
-    """Advance the attacks by one frame: hits, shots that are fired and that land, and what the player suffers.
+    """Advance the attacks by one frame and apply the damage to the player.
 
     Args:
-        s: state.
-        traits: of the machines.
-        blow: rows of the current attack.
-        strength: of `ranged_strength`.
-        self_damage: (N,) of the player's own traps [HP].
-        roll: (E, N) uniform numbers, damage of hits.
-        shot_roll: (E, N) uniform numbers, damage of shots.
-        noise: (2, E, N) standard normal numbers, aim of the shots.
-        pillars: (2, 4) their places; None if no fight has any.
-        blocks: (N,) bool, sites that have them.
+        s: State; it changes.
+        traits: Traits of the machines.
+        blow: Rows of the current attack (11, E, N).
+        strength: Result of `ranged_strength`.
+        self_damage: Damage by the player's own traps (N,) [HP].
+        roll: Uniform numbers (E, N) for the damage of hits.
+        shot_roll: Uniform numbers (E, N) for the damage of shots.
+        noise: Standard normal numbers (2, E, N) for the aim of shots.
+        pillars: Positions of the pillars (2, 4), or None if no fight has any [m].
+        blocks: Whether the site has pillars (N,) bool.
 
     Returns:
-        (N,) damage to the player [HP].
+        Damage to the player (N,) [HP].
     """
     attacking = (s.phase == ACTIVE) & (s.enemy_hp > 0) & (s.hits_left > 0)
     kind = blow[KIND]
@@ -197,7 +197,7 @@ def strike_player(
     fires = _fire_shots(s, blow, attacking & (kind == RANGED), distance, noise, pillars, blocks)
     ranged = damage * _spread(shot_roll) * weak * (c.RANGED_REST + (1.0 - c.RANGED_REST) * strength)
     s.shot_damage = torch.where(fires, ranged, s.shot_damage)
-    # An attack that reaches a player who is safe is spent: that is what a dodge is for.
+    # An attack on an invulnerable player is spent, too: this is the purpose of a dodge.
     s.hits_left = s.hits_left - 1.0 * (reaches | fires.any(0))
 
     landing = s.land_timer == 1.0  # in this frame
@@ -206,7 +206,7 @@ def strike_player(
     exposed = ~safe & (s.timers[SLIDE] <= 0)
     shots = s.shot_damage * (landing & (miss < c.SHOT_RADIUS**2) & exposed)
 
-    # Only the worst hit of a frame counts: it makes the player safe from the others.
+    # Only the worst hit of a frame counts, because a hit makes the player invulnerable for a moment.
     worst = torch.maximum(direct.amax(0), shots.amax((0, 1)))
     worst = torch.maximum(worst, self_damage * ~safe)
     charged = ((direct >= worst) & charge).any(0)
@@ -221,10 +221,10 @@ def _spread(roll: Tensor) -> Tensor:
 def _fire_shots(
     s: State, blow: Tensor, firing: Tensor, distance: Tensor, noise: Tensor, pillars: Tensor | None, blocks: Tensor
 ) -> Tensor:
-    """Start the shots that are due in this frame, spread evenly over the active phase.
+    """Fire the shots that are due in this frame; they are spread evenly over the active phase.
 
     Returns:
-        (4, E, N) bool, slots that were filled.
+        Whether each slot is filled (4, E, N) bool.
     """
     shot = blow[SHOTS] - s.hits_left  # number of the next one
     elapsed = blow[ACTIVE_FRAMES] - s.phase_timer
@@ -244,7 +244,7 @@ def _fire_shots(
 
 
 def segment_blocked(start: Tensor, end: Tensor, pillars: Tensor) -> Tensor:
-    """Return whether a pillar (2, 4) stands between points (2, E, N): (E, N) bool."""
+    """Return whether one of the pillars (2, 4) is between points (2, E, N), as (E, N) bool."""
     along = end - start
     length = along.square().sum(0).clamp(min=1e-6)
     x, y = pillars.view(2, -1, 1, 1)
@@ -255,7 +255,7 @@ def segment_blocked(start: Tensor, end: Tensor, pillars: Tensor) -> Tensor:
 
 
 def ray_blocked_at(position: Tensor, yaw: Tensor, pillars: Tensor) -> Tensor:
-    """Return the distance (N,) [m] at which a level ray from (2, N) meets a pillar (2, 4); infinite if none."""
+    """Return the distance (N,) at which level rays from (2, N) meet a pillar (2, 4), or infinity [m]."""
     x, y = pillars.unsqueeze(-1)
     cos, sin = facing(yaw)
     offset_x, offset_y = x - position[0], y - position[1]  # (4, N)
@@ -266,7 +266,7 @@ def ray_blocked_at(position: Tensor, yaw: Tensor, pillars: Tensor) -> Tensor:
 
 
 def _suffer(s: State, hit: Tensor, charged: Tensor) -> None:
-    """Apply a hit (N,) [HP] to the player: health, stagger and a moment of safety."""
+    """Apply a hit (N,) [HP] to the player's health, stagger and moment of invulnerability."""
     s.hp = (s.hp - hit).clamp(min=0.0)
     heavy = hit > c.HEAVY_HIT
     stagger = torch.where(charged, c.CHARGE_STAGGER_TIME * c.FPS, c.STAGGER_TIME * c.FPS) * heavy

@@ -1,4 +1,4 @@
-"""The player: what the pad asks for in a step, and motion and camera of each frame."""
+"""Intent of the player in a step, and the motion and camera of each frame."""
 
 from __future__ import annotations
 
@@ -40,19 +40,24 @@ from coachable.envs.combat.traits import RELOAD as RELOAD_FRAMES
 
 @dataclass
 class Intent:
-    """Intent of the player, which holds for all six frames of a step.
+    """Intent of the player, which is valid for all six frames of a step.
 
     Attributes:
-        move: (2, N) left stick, at most of length 1.
-        speed: (N,) of a full stick [m/s].
-        turn, tilt: (N,) of the camera per frame [rad].
-        aiming, shooting, light, heavy, sprint: (N,) bool.
-        ammo: (11, N) numbers of the ammo in hand, rows of `traits`.
-        element: (7, N) one-hot of its element.
-        damage: (E, N) of one shot to the body, resistance included [HP].
-        tear: (N,) added to the damage of parts [HP].
-        buildup: (7, E, N) share of the threshold that one shot builds up, growth of shock's threshold left out.
-        loaded: (N,) rounds in the magazine in use; changes from frame to frame.
+        move: Left stick (2, N), of length 1 or less.
+        speed: Speed at a full stick (N,) [m/s].
+        turn: Turn of the camera per frame (N,) [rad].
+        tilt: Tilt of the camera per frame (N,) [rad].
+        aiming: Whether the player aims (N,) bool.
+        shooting: Whether the player shoots (N,) bool.
+        light: Whether the player starts a light swing of the spear (N,) bool.
+        heavy: Whether the player starts a heavy swing of the spear (N,) bool.
+        sprint: Whether the player sprints (N,) bool.
+        ammo: Rows of `ammo_table` of the selected ammo (18, N).
+        element: One-hot of its element (7, N).
+        damage: Damage of one shot to the body, with the resistance (E, N) [HP].
+        tear: Additional damage to parts (N,) [HP].
+        buildup: Share of the threshold that one shot builds up (7, E, N), without the growth of shock's threshold.
+        loaded: Rounds in the selected magazine (N,); it changes from frame to frame.
     """
 
     move: Tensor
@@ -73,24 +78,24 @@ class Intent:
 
 
 def rows_where(timers: Tensor, row: int, mask: Tensor, value: Tensor | float) -> None:
-    """Write one row of a tensor that nobody else holds, where `mask` (N,)."""
+    """Write `value` to a row of a tensor in place, where `mask` (N,) holds; no other object may hold the tensor."""
     timers[row] = torch.where(mask, value, timers[row])
 
 
 def facing(yaw: Tensor) -> Tensor:
-    """Return unit vectors (2, ...) of angles (...,)."""
+    """Return the unit vectors (2, ...) of angles (...,) [rad]."""
     return torch.stack((yaw.cos(), yaw.sin()))
 
 
 def from_stick(stick: Tensor, forward: Tensor) -> Tensor:
-    """Return a stick (2, N), x right and y forward, as a direction of the world (2, N)."""
+    """Convert a stick (2, N), x to the right and y forward, to a direction of the world (2, N)."""
     x, y = stick
     fx, fy = forward
     return torch.stack((fx * y + fy * x, fy * y - fx * x))
 
 
 def to_stick(direction: Tensor, yaw: Tensor) -> Tensor:
-    """Return directions of the world (2, N) as a stick, x right and y forward; the inverse of `from_stick`."""
+    """Convert directions of the world (2, N) to a stick, x to the right and y forward; the inverse of `from_stick`."""
     x, y = direction
     fx, fy = facing(yaw)
     return torch.stack((fy * x - fx * y, fx * x + fy * y))
@@ -102,15 +107,18 @@ def element_of(section: Tensor, ammo_table: Tensor) -> Tensor:
 
 
 def command(s: State, pad: Pad, traits: Traits, site: Tensor, ammo_table: Tensor, sections: Tensor) -> Intent:
-    """Act on the pad at the start of a step: wheel, berries, tools, traps, evasions. Changes `s`.
+    """Apply the gamepad at the start of a step: weapon wheel, berries, tools, traps and evasions.
 
     Args:
-        s: state.
-        pad: canonical, fields (N,) float and sticks (2, N).
-        traits: of the machines.
-        site: (4, N) rows of `site_table`.
-        ammo_table: of `ammo_table`.
-        sections: of `ammo_sections`.
+        s: State; it changes.
+        pad: Canonical actions with fields (N,) and sticks (2, N).
+        traits: Traits of the machines.
+        site: Rows of `site_table` (4, N).
+        ammo_table: Result of `ammo_table`.
+        sections: Result of `ammo_sections`.
+
+    Returns:
+        The intent for the frames of the step.
     """
     timers = s.timers.clone()
     wheel, aiming = pad.l1 > 0, pad.l2 > 0
@@ -160,7 +168,7 @@ def command(s: State, pad: Pad, traits: Traits, site: Tensor, ammo_table: Tensor
 
 
 def _choose_weapon(s: State, wheel: Tensor, stick: Tensor, timers: Tensor, sections: Tensor) -> None:
-    """Act on the wheel: six sectors of 60 degrees, counter-clockwise from the right, each with its ammo sections."""
+    """Apply the weapon wheel: six sectors of 60 degrees, counter-clockwise from the right, with sections of ammo."""
     x, y = stick
     pointing = wheel & (stick.square().sum(0) > c.WHEEL_REACH**2)
     turns = torch.remainder(torch.atan2(y, x) / (2.0 * torch.pi), 1.0) * len(WEAPONS)
@@ -176,7 +184,7 @@ def _choose_weapon(s: State, wheel: Tensor, stick: Tensor, timers: Tensor, secti
 
 
 def _use_tools(s: State, pad: Pad, able: Tensor, timers: Tensor, forward: Tensor) -> None:
-    """Act on berries, the tool menu, and traps that are set ahead of the player."""
+    """Apply berries, the tool menu, and traps, which are set ahead of the player."""
     eats = able & (pad.up > 0) & (s.hp < c.PLAYER_HP) & (s.berries > 0) & (timers[BERRY] <= 0)
     s.hp = torch.where(eats, (s.hp + c.BERRY_HP).clamp(max=c.PLAYER_HP), s.hp)
     s.berries = s.berries - 1.0 * eats
@@ -197,7 +205,7 @@ def _use_tools(s: State, pad: Pad, able: Tensor, timers: Tensor, forward: Tensor
 
 
 def _evade(s: State, pad: Pad, able: Tensor, timers: Tensor, forward: Tensor) -> None:
-    """Dodge (square), slide (circle) and jump (cross), one at a time."""
+    """Start a dodge (square), slide (circle) or jump (cross), one at a time."""
     ready = able & (timers[NO_MOVE].amax(0) <= 0)
     dodges = ready & (pad.square > 0) & (s.stamina >= c.DODGE_COST)
     slides = ready & (pad.circle > 0)
@@ -259,12 +267,12 @@ def turn_camera(s: State, intent: Intent, cone: float, share: float, bearing: Te
     """Advance the camera by one frame, with the aim assist.
 
     Args:
-        s: state.
-        intent: of the step.
-        cone: yaw error within which the assist pulls [rad].
-        share: of the error that it takes away per frame; 0 is off.
-        bearing: (N,) of the nearest enemy's body centre, in the world [rad].
-        elevation: (N,) of it above the horizon, from the eye [rad].
+        s: State; it changes.
+        intent: Intent of the step.
+        cone: Yaw error within which the assist acts [rad].
+        share: Share of the error that the assist removes per frame; 0 switches it off.
+        bearing: Direction of the nearest enemy's body centre in the world (N,) [rad].
+        elevation: Elevation of this centre above the horizon, from the eye (N,) [rad].
     """
     yaw, pitch = s.yaw + intent.turn, s.pitch + intent.tilt
     if share > 0:
@@ -276,5 +284,5 @@ def turn_camera(s: State, intent: Intent, cone: float, share: float, bearing: Te
 
 
 def wrap(angle: Tensor) -> Tensor:
-    """Return the angle in [-pi, pi)."""
+    """Wrap angles to [-pi, pi)."""
     return torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi

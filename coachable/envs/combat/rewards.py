@@ -1,4 +1,4 @@
-"""Raw components of a step, and the task reward, style features and events made of them; none depends on the style."""
+"""Raw components of a step, and the weights that make the task reward, style features and events of them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from torch import Tensor
 
 from coachable.envs.combat.tables import ELEMENTS, PART_TYPES, STYLES, WEAPONS, load_table
 
-# Components of a step, the rows that evaluation may ask for.
 COMPONENTS: dict[str, int] = {
     "damage": 1,
     "weapon_damage": len(WEAPONS),
@@ -37,7 +36,7 @@ for _name, _width in COMPONENTS.items():
     COMPONENT_SLICES[_name] = slice(_first, _first + _width)
 NUM_COMPONENTS = sum(COMPONENTS.values())
 
-# Styles in the order of theta: which weapon, part type or element each one is about.
+# Weapon of each weapon style.
 _WEAPON_OF = {
     "ancestors_return": "Ancestor's Return",
     "corrosive_blastsling": "Corrosive Blastsling",
@@ -52,10 +51,10 @@ REWARD_SCALES = ("sim", "paper")
 
 
 def pack_components(**parts: Tensor) -> Tensor:
-    """Pack components (44, N) from named rows, `(width, N)` or `(N,)`.
+    """Stack components (44, N) from named rows, `(width, N)` or `(N,)`.
 
     Raises:
-        ValueError: if the names are not those of `COMPONENTS`.
+        ValueError: If the names are not those of `COMPONENTS`.
     """
     if set(parts) != set(COMPONENTS):
         raise ValueError(f"components are {sorted(parts)}, expected {sorted(COMPONENTS)}")
@@ -63,7 +62,7 @@ def pack_components(**parts: Tensor) -> Tensor:
 
 
 def _selection(sources: dict[str, list[tuple[int, float]]]) -> Tensor:
-    """Return (rows, 44) from `{row name: [(component, weight), ...]}`."""
+    """Return the matrix (rows, 44) of `{row name: [(component, weight), ...]}`."""
     matrix = torch.zeros(len(sources), NUM_COMPONENTS)
     for row, entries in enumerate(sources.values()):
         for component, weight in entries:
@@ -80,10 +79,13 @@ def task_weights() -> Tensor:
 
 
 def style_weights(reward_scale: str) -> Tensor:
-    """Return the inner weights (18, 44): row i is g_i as a sum of components (paper; `sim` scales removals down).
+    """Return the inner weights (18, 44), whose row i gives g_i as a sum of components (paper).
+
+    Args:
+        reward_scale: "paper", or "sim" for smaller rewards of removed parts.
 
     Raises:
-        ValueError: if the scale is unknown.
+        ValueError: If the scale is unknown.
     """
     if reward_scale not in REWARD_SCALES:
         raise ValueError(f"reward_scale is {reward_scale!r}: expected one of {REWARD_SCALES}")
@@ -123,7 +125,7 @@ def style_weights(reward_scale: str) -> Tensor:
 
 
 def event_components() -> Tensor:
-    """Return (18, 44) of 0 and 1: an event fires where one of its components is above 0."""
+    """Return which components make an event fire when they are above 0, (18, 44), 0 or 1."""
     weights = style_weights("paper")
     quiet = [COMPONENT_SLICES[name] for name in ("proximity", "lure", "ammo_change", "buildup")]
     fires = (weights != 0).float()
@@ -133,7 +135,7 @@ def event_components() -> Tensor:
 
 
 def style_counts(styles: Sequence[str]) -> Tensor:
-    """Return (len(styles), 44) of 0 and 1: the damage, or for part styles the removals, that count for each style."""
+    """Return which components count for each style, (len(styles), 44), 0 or 1: damage, or removals for part styles."""
     counts = event_components()
     counts[:, COMPONENT_SLICES["part_damage"]] = 0.0
     return counts[[STYLES.index(name) for name in styles]]

@@ -1,6 +1,7 @@
-"""State of N fights against E machines: a structure of tensors, fights last so that every number is one dense row.
+"""State of N fights against E machines as a structure of tensors.
 
-Timers count frames of 1/30 s and are 0 when nothing runs.
+The fights are the last dimension, so that every number is one dense row. Timers count frames of 1/30 s and are 0 when
+they are not running.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from coachable.envs.combat import constants as c
 from coachable.envs.combat.tables import ATTACK_SLOTS, ELEMENTS, TRAPS, WEAPONS
 from coachable.envs.combat.traits import AMMO_SLOTS, Traits
 
-# Rows of `State.timers`, ordered so that what blocks a shot, a swing, a dodge or a step is one slice each.
+# Rows of `State.timers`, in an order in which the timers that block a shot, a swing, a dodge or a step are one slice.
 FIRE, SWAP, RELOAD, MELEE, DODGE, STAGGER, ROOT, SLIDE, AIR, SAFE, BERRY = range(11)
 NUM_TIMERS = 11
 NO_SHOT, NO_SWING, NO_MOVE, HELPLESS = slice(FIRE, SLIDE), slice(MELEE, AIR), slice(DODGE, SAFE), slice(STAGGER, SLIDE)
@@ -23,7 +24,7 @@ NO_SHOT, NO_SWING, NO_MOVE, HELPLESS = slice(FIRE, SLIDE), slice(MELEE, AIR), sl
 IDLE, TELEGRAPH, ACTIVE, RECOVER, STAGGERED = range(5)
 NUM_PHASES = 5
 
-# `State.source`: number of the weapon, or one of these.
+# Values of `State.source` beside the numbers of the weapons.
 FROM_MELEE, FROM_TRAP = len(WEAPONS), len(WEAPONS) + 1
 NUM_SOURCES = len(WEAPONS) + 2
 
@@ -32,47 +33,65 @@ ACTION_HISTORY, FEATURE_HISTORY, FEATURES_KEPT = 3, 2, 12
 
 @dataclass
 class State:
-    """Everything that the next step depends on, besides the random generator. N fights, E enemies.
+    """State of N fights against E enemies, which together with the random generator determines the next step.
 
     Attributes:
-        position, velocity: (2, N) of the player [m], [m/s].
-        yaw, pitch: (N,) of the camera, counter-clockwise from +x and upwards [rad].
-        hp, stamina, weapon_stamina, berries: (N,).
-        inventory: (4, N) traps of each type.
-        tool, weapon, section: (N,) int64, selected trap type, weapon and ammo.
-        magazine: (18, N) rounds by wheel section, three rows per weapon.
-        timers: (11, N), rows above [frames].
-        technique: (N,) 1 while the next shot is doubled.
-        dodge: (2, N) direction of the running dodge or slide.
-        wheel, quick: (N,) 1 if shown in the last step.
-        sticks: (4, N) right stick of the last step and of the one before.
-        anchor: (2, N) centre of the Dynamic Anchor Bound [m].
-        distance: (N,) to the nearest enemy after the last step [m].
-        closeness: (2, N) of a set trap to the enemy and to the player.
-        steps: (N,) since the reset.
-        site: (N,) int64.
-        machine: (E, N) int64.
-        enemy_position, enemy_velocity: (2, E, N) [m], [m/s].
-        enemy_z, enemy_yaw, enemy_hp: (E, N) [m], [rad], [HP].
-        phase, phase_timer: (E, N); the timer in frames.
-        attack: (E, N) int64, attack slot.
-        cooldown: (4, E, N) of the slots [frames].
-        pause: (E, N) until the next attack may start [frames].
-        lock: (2, E, N) locked direction.
-        hits_left: (E, N) of the running attack.
-        stagger_sum: (E, N) damage since the last stagger [HP].
-        strafe: (E, N) +1 or -1.
-        gauge: (7, E, N) build-up of each element, in [0, 1).
-        state_timer: (7, E, N) of each elemental state [frames].
-        source: (7, E, N) what built the element up.
-        plasma_store, shock_growth: (E, N) [HP], factor on shock's threshold.
-        count, part_hp: (12, E, N) units left of each part, health of the current one.
-        land_timer, shot_damage: (4, E, N) of the machine's shots in the air [frames], [HP].
-        shot_point: (2, 4, E, N) where they land [m].
-        trap_position: (2, 4, N) [m]. trap_type: (4, N), -1 where none is set. trap_arm: (4, N) [frames].
-        hazard_position: (2, 2, N) [m]. hazard_timer: (2, N) [frames].
-        actions: (72, N) canonical actions of the last three steps, newest first.
-        features: (24, N) what the agent saw in the last two steps, newest first.
+        position: Position of the player (2, N) [m].
+        velocity: Velocity of the player (2, N) [m/s].
+        yaw: Direction of the camera, counter-clockwise from +x (N,) [rad].
+        pitch: Elevation of the camera (N,) [rad].
+        hp: Health of the player (N,) [HP].
+        stamina: Stamina of the player (N,).
+        weapon_stamina: Stamina for weapon techniques (N,).
+        berries: Number of berries left (N,).
+        inventory: Number of traps of each type (4, N).
+        tool: Selected trap type (N,) int64.
+        weapon: Selected weapon (N,) int64.
+        section: Selected ammo of the weapon (N,) int64.
+        magazine: Rounds by wheel section, three rows per weapon (18, N).
+        timers: Timers with the rows `FIRE` to `BERRY` (11, N) [frames].
+        technique: 1 while the next shot deals double damage (N,).
+        dodge: Direction of the current dodge or slide (2, N).
+        wheel: 1 if the weapon wheel was open in the last step (N,).
+        quick: 1 if the tool menu was used in the last step (N,).
+        sticks: Right stick of the last step and of the one before (4, N).
+        anchor: Centre of the Dynamic Anchor Bound (2, N) [m].
+        distance: Distance to the nearest enemy after the last step (N,) [m].
+        closeness: Closeness of the nearest enemy and of the player to a set trap (2, N).
+        steps: Number of steps since the reset (N,).
+        site: Number of the site (N,) int64.
+        machine: Number of the machine type (E, N) int64.
+        enemy_position: Positions of the machines (2, E, N) [m].
+        enemy_velocity: Velocities of the machines (2, E, N) [m/s].
+        enemy_z: Heights of the machines (E, N) [m].
+        enemy_yaw: Directions of the machines (E, N) [rad].
+        enemy_hp: Health of the machines (E, N) [HP].
+        phase: Phase of the machines, `IDLE` to `STAGGERED` (E, N).
+        phase_timer: Time left of the phase (E, N) [frames].
+        attack: Slot of the latest attack (E, N) int64.
+        cooldown: Time until each attack slot can be used again (4, E, N) [frames].
+        pause: Time until the next attack may start (E, N) [frames].
+        lock: Direction of the active attack (2, E, N).
+        hits_left: Number of hits left in the active attack (E, N).
+        stagger_sum: Damage since the last stagger (E, N) [HP].
+        strafe: Direction of strafing, +1 or -1 (E, N).
+        gauge: Build-up of each element, in [0, 1) (7, E, N).
+        state_timer: Time left of each elemental state (7, E, N) [frames].
+        source: Latest source of each element's build-up (7, E, N).
+        plasma_store: Damage that plasma has stored (E, N) [HP].
+        shock_growth: Factor on shock's threshold (E, N).
+        count: Number of units left of each part (12, E, N).
+        part_hp: Health of the current unit of each part (12, E, N) [HP].
+        land_timer: Time until each shot of a machine lands (4, E, N) [frames].
+        shot_damage: Damage of each shot of a machine (4, E, N) [HP].
+        shot_point: Place where each shot of a machine lands (2, 4, E, N) [m].
+        trap_position: Positions of the set traps (2, 4, N) [m].
+        trap_type: Types of the set traps, or -1 in an empty slot (4, N).
+        trap_arm: Time until each trap is armed (4, N) [frames].
+        hazard_position: Positions of the hazard zones (2, 2, N) [m].
+        hazard_timer: Time left of each hazard zone (2, N) [frames].
+        actions: Canonical actions of the last three steps, newest first (72, N).
+        features: Features of the last two steps, newest first (24, N); see `features.kept_features`.
     """
 
     position: Tensor
@@ -133,7 +152,7 @@ class State:
     features: Tensor
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return every field by name."""
+        """Return the fields by name."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def replaced_where(self, mask: Tensor, other: State) -> State:
@@ -143,7 +162,7 @@ class State:
 
 
 def nearest(state: State) -> Tensor:
-    """(N,) bool: the second enemy is the nearest living one; False where there is one enemy."""
+    """Return whether the second enemy is the nearest living one, (N,) bool; it is False if there is one enemy."""
     if state.enemy_hp.shape[0] == 1:
         return torch.zeros_like(state.hp, dtype=torch.bool)
     offset = state.enemy_position - state.position.unsqueeze(1)
@@ -159,15 +178,15 @@ def pick(values: Tensor, second: Tensor) -> Tensor:
 def start_fights(
     machine: Tensor, site: Tensor, traits: Traits, magazines: Tensor, traps: float, generator: torch.Generator
 ) -> State:
-    """Return new fights: random places in the disc, orientations, weapon, cooldowns (paper: spawns within 25 m).
+    """Draw new fights with random positions, orientations, weapons and cooldowns (paper: spawns within 25 m).
 
     Args:
-        machine: (E, N) int64.
-        site: (N,) int64.
-        traits: of these machines.
-        magazines: (18, 1) capacities.
-        traps: in the inventory, of each type.
-        generator: all random numbers are drawn from it; how many depends on the shapes only.
+        machine: Machine numbers (E, N) int64.
+        site: Site numbers (N,) int64.
+        traits: Traits of these machines.
+        magazines: Capacities of the magazines (18, 1).
+        traps: Number of traps of each type in the inventory.
+        generator: Random generator; the count of numbers drawn depends on the shapes only.
     """
     device, (enemies, n) = machine.device, machine.shape
 
@@ -244,7 +263,7 @@ def start_fights(
 
 
 def _spawn(enemies: int, uniform) -> tuple[Tensor, Tensor]:
-    """Draw places of player (2, N) and enemies (2, E, N), uniform in the disc, at least `SPAWN_GAP` apart."""
+    """Draw positions of player (2, N) and enemies (2, E, N), uniform in the disc, at least `SPAWN_GAP` apart."""
     tries = 12  # one try is too close with probability 0.1 to 0.2; all of them, with less than 1e-8
     radius = c.SPAWN_RADIUS * uniform(0.0, 1.0, tries, 1 + enemies).sqrt()
     angle = uniform(-torch.pi, torch.pi, tries, 1 + enemies)

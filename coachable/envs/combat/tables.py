@@ -1,6 +1,6 @@
-"""The domain's tables (`data/*.csv`), read and checked. The second row of each file says where each column is from.
+"""Tables of the game (`data/*.csv`), with checks.
 
-Origins: `paper` (tables of Appendix C and D) or `ours`.
+The second row of each file gives the origin of each column: `paper` (tables of Appendix C and D) or `ours`.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ ATTACK_SLOTS = 4
 
 @dataclass(frozen=True)
 class Table:
-    """One data file.
+    """Contents of a data file.
 
     Attributes:
-        file: its name.
-        origin: where the numbers of each column are from, "paper" or "ours".
-        rows: by the first column, each a mapping from column to text.
+        file: Name of the file.
+        origin: Origin of the numbers of each column, "paper" or "ours".
+        rows: Rows by the text of their first column, each a mapping from column to text.
     """
 
     file: str
@@ -34,14 +34,14 @@ class Table:
     rows: Mapping[str, Mapping[str, str]]
 
     def fail(self, row: str, problem: str) -> ValueError:
-        """Return the error for a row."""
+        """Return an error that names file and row."""
         return ValueError(f"coachable/envs/combat/data/{self.file}, row {row!r}: {problem}")
 
     def number(self, row: str, column: str) -> float:
-        """A finite or infinite number of the table.
+        """Return a finite or infinite number of the table.
 
         Raises:
-            ValueError: if it is none; names file, row and column.
+            ValueError: If the cell is not a number.
         """
         text = self.rows[row][column]
         try:
@@ -53,14 +53,14 @@ class Table:
         return value
 
     def column(self, name: str) -> list[float]:
-        """All numbers of a column, in the order of the rows."""
+        """Return all numbers of a column, in the order of the rows."""
         return [self.number(row, name) for row in self.rows]
 
     def words(self, row: str, column: str, allowed: tuple[str, ...]) -> tuple[str, ...]:
-        """Space-separated names of a cell, checked.
+        """Return the space-separated names of a cell.
 
         Raises:
-            ValueError: if one is not allowed; names file, row and column.
+            ValueError: If one is not allowed.
         """
         found = tuple(self.rows[row][column].split())
         for word in found:
@@ -70,10 +70,14 @@ class Table:
 
 
 def parse_table(file: str, text: str) -> Table:
-    """Read the text of a data file: a line of column names, a line of origins, one line per row.
+    """Parse the text of a data file: a line of column names, a line of origins, and a line per row.
+
+    Args:
+        file: Name of the file, for errors.
+        text: Contents of the file.
 
     Raises:
-        ValueError: if a row is incomplete or repeated, or an origin is unknown; names file and row.
+        ValueError: If a row is incomplete or repeated, or an origin is unknown.
     """
     lines = list(csv.reader(text.splitlines()))
     names, origin, rows = lines[0], dict(zip(lines[0][1:], lines[1][1:], strict=False)), {}
@@ -93,7 +97,7 @@ def parse_table(file: str, text: str) -> Table:
 
 @cache
 def load_table(name: str) -> Table:
-    """A table of `data/`, such as "machines"."""
+    """Return a table of `data/`, such as "machines"."""
     file = f"{name}.csv"
     return parse_table(
         file, resources.files("coachable.envs.combat").joinpath("data", file).read_text(encoding="utf-8")
@@ -102,19 +106,19 @@ def load_table(name: str) -> Table:
 
 @dataclass(frozen=True)
 class Machine:
-    """One machine type; see machines.csv.
+    """A machine type of machines.csv.
 
     Attributes:
-        name: as in the paper.
-        hp: health [HP].
-        strong: elements of which it takes half the damage.
-        weak: elements of which it takes twice the damage.
-        parts: removable shields, weapons and canisters.
-        kind: class that gives its attacks.
-        radius: of the body [m].
-        speed: [m/s].
-        threat: factor of its hits.
-        height: at which it flies [m].
+        name: Name in the paper.
+        hp: Health [HP].
+        strong: Elements of which it takes half the damage.
+        weak: Elements of which it takes twice the damage.
+        parts: Numbers of removable shields, weapons and canisters.
+        kind: Class that determines its attacks.
+        radius: Radius of the body [m].
+        speed: Speed [m/s].
+        threat: Factor of its hits.
+        height: Height at which it flies [m].
     """
 
     name: str
@@ -134,7 +138,10 @@ class Machine:
         return 6.0 * self.hp**0.36 * self.threat
 
     def slots(self) -> tuple[int, int, int]:
-        """Part slots of each type: one if present, then each free slot to the type with most units per slot."""
+        """Return the number of part slots of each type.
+
+        Each type that is present has a slot. Each free slot then goes to the type with the most units per slot.
+        """
         slots = [int(count > 0) for count in self.parts]
         while sum(slots) < PART_SLOTS:
             load = [count / slot if slot else 0.0 for count, slot in zip(self.parts, slots, strict=True)]
@@ -145,10 +152,10 @@ class Machine:
 
 
 def machines_of(table: Table) -> dict[str, Machine]:
-    """Checked machines of a table.
+    """Return the machines of a table by name.
 
     Raises:
-        ValueError: if a row contradicts itself; names file and row.
+        ValueError: If a row is invalid.
     """
     found = {}
     for name in table.rows:
@@ -194,20 +201,23 @@ STYLES: tuple[str, ...] = tuple(load_table("styles").rows)
 
 
 def resistance(machine: Machine) -> list[float]:
-    """Factor on damage and build-up of each element: 2 weak, 0.5 strong, 1 otherwise."""
+    """Return the factor on damage and build-up of each element: 2 if weak, 0.5 if strong, 1 otherwise."""
     return [2.0 if e in machine.weak else 0.5 if e in machine.strong else 1.0 for e in ELEMENTS]
 
 
 def attacks_of(kind: str) -> list[str]:
-    """Attacks of a class, at most four.
+    """Return the names of the attacks of a class, one to four.
 
     Raises:
-        ValueError: if there are none or more.
+        ValueError: If there are none or more.
     """
     table = load_table("attacks")
     found = [name for name, row in table.rows.items() if row["class"] == kind]
     if not 1 <= len(found) <= ATTACK_SLOTS:
-        raise ValueError(f"coachable/envs/combat/data/{table.file}: class {kind!r} has {len(found)} attacks")
+        raise ValueError(
+            f"coachable/envs/combat/data/{table.file}: class {kind!r} has {len(found)} attacks, expected 1 to "
+            f"{ATTACK_SLOTS}"
+        )
     for name in found:
         if len(table.words(name, "kind", KINDS)) != 1:
             raise table.fail(name, f"expected one kind of {KINDS}")
@@ -215,10 +225,10 @@ def attacks_of(kind: str) -> list[str]:
 
 
 def check_styles(styles: Sequence[str] | None) -> tuple[str, ...]:
-    """The chosen styles in the order given; all 18 if None.
+    """Return the chosen styles in the order given; None chooses all 18.
 
     Raises:
-        ValueError: if one is unknown or repeated.
+        ValueError: If one is unknown or repeated, or if there are none.
     """
     chosen = STYLES if styles is None else tuple(styles)
     unknown = [name for name in chosen if name not in STYLES]

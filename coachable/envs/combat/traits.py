@@ -1,4 +1,4 @@
-"""What the tables say about the machines, weapons and sites of every fight, as tensors with the fights last."""
+"""Numbers of the tables for the machines, weapons and sites of every fight, as tensors with the fights last."""
 
 from __future__ import annotations
 
@@ -38,17 +38,25 @@ IMPACT, ELEMENTAL, TEAR, BUILDUP, INTERVAL, MAGAZINE, RELOAD, SPEED, SPREAD, RAN
 
 @dataclass
 class Traits:
-    """Of the machine types of E enemies in N fights; looked up at reset.
+    """Traits of the machine types of E enemies in N fights, which are looked up at a reset.
 
     Attributes:
-        hp, radius, speed, hit, approach, height, weapon_parts, threshold, part_radius: (E, N).
-        resistance: (7, E, N).
-        attacks: (11, 4, E, N), rows as above; an empty slot is in range nowhere.
-        offset: (3, 12, E, N) of the parts from the body's centre, in the machine's frame [m].
-        unit_hp: (12, E, N) of one unit of a part [HP].
-        units: (12, E, N) units of each part at the start.
-        part_type: (3, 12, E, N) one-hot: shield, weapon, canister; zero in unused slots.
-        hit_factor: (12, E, N) body damage through a part, less 1.
+        hp: Health (E, N) [HP].
+        radius: Radius of the body (E, N) [m].
+        speed: Speed (E, N) [m/s].
+        hit: Damage of the unscaled attack (E, N) [HP].
+        approach: Distance to which the machine approaches the player (E, N) [m].
+        height: Height at which the machine flies (E, N) [m].
+        weapon_parts: Number of weapon parts (E, N).
+        threshold: Build-up that starts an elemental state (E, N).
+        part_radius: Radius of a part (E, N) [m].
+        resistance: Factor on damage and build-up of each element (7, E, N).
+        attacks: Numbers of the attacks (11, 4, E, N) with the rows `DAMAGE` to `KIND`; an empty slot is never in range.
+        offset: Positions of the parts relative to the body's centre in the machine's frame (3, 12, E, N) [m].
+        unit_hp: Health of one unit of a part (12, E, N) [HP].
+        units: Number of units of each part at the start (12, E, N).
+        part_type: One-hot of shield, weapon, canister (3, 12, E, N); it is zero in unused slots.
+        hit_factor: Factor on the body's damage through a part, less 1 (12, E, N).
     """
 
     hp: Tensor
@@ -82,7 +90,7 @@ _SHAPES = {
 
 
 def machine_table(device: torch.device) -> Tensor:
-    """Return a table of all machines, (22, S) float32, for `look_up_traits`."""
+    """Return the table of all machines, (22, S) float32, for `look_up_traits`."""
     rows = [_machine_row(index, machine) for index, machine in enumerate(ALL_MACHINES.values())]
     return torch.from_numpy(np.stack(rows)).to(device)
 
@@ -162,7 +170,7 @@ def _attack_rows(machine: Machine) -> np.ndarray:
 
 
 def ammo_table(device: torch.device) -> Tensor:
-    """Return numbers and element one-hots of every wheel section, (18, 11 + 7) float32; section 3 i + j of weapon i."""
+    """Return numbers and element one-hots of every wheel section, (18, 11 + 7) float32; row 3 i + j is of weapon i."""
     table = load_table("weapons")
     numbers = ("impact", "elemental", "tear", "buildup", "interval", "magazine", "reload", "speed", "spread_deg")
     rows = np.zeros((len(AMMO) * AMMO_SLOTS, 11 + len(ELEMENTS)))

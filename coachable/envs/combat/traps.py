@@ -1,4 +1,4 @@
-"""Traps that the player sets, and the zones that a machine leaves."""
+"""Traps that the player sets, and hazard zones that a machine leaves."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from coachable.envs.combat.traits import Traits
 
 @dataclass
 class TrapNumbers:
-    """traps.csv for the machines of the fights.
+    """Numbers of traps.csv for the machines of the fights.
 
     Attributes:
-        damage: (4, E, N) of each trap type, resistance included [HP].
-        gain: (4, E, N) build-up as a share of the threshold, growth of shock's threshold left out.
-        element: (7, 4) one-hot columns, zero for a trap without element.
+        damage: Damage of each trap type, with the resistance (4, E, N) [HP].
+        gain: Build-up as a share of the threshold (4, E, N), without the growth of shock's threshold.
+        element: One-hot columns (7, 4), zero for a trap without an element.
     """
 
     damage: Tensor
@@ -29,7 +29,7 @@ class TrapNumbers:
 
     @classmethod
     def of(cls, traits: Traits) -> TrapNumbers:
-        """Look the numbers up."""
+        """Compute the numbers from the data file and the machines' resistance."""
         table, device = load_table("traps"), traits.hp.device
         element = torch.zeros((len(ELEMENTS), len(TRAPS)), device=device)
         for i, trap in enumerate(TRAPS):
@@ -45,10 +45,10 @@ class TrapNumbers:
 
 
 def spring_traps(s: State, traits: Traits, numbers: TrapNumbers) -> tuple[Tensor, Tensor, Tensor]:
-    """Advance the traps by one frame: an armed trap fires when a machine is near, and disappears.
+    """Advance the traps by one frame; an armed trap fires when a machine is near, and disappears.
 
     Returns:
-        (E, N) damage [HP], (7, E, N) build-up, (N,) damage to the player [HP].
+        Damage to the machines (E, N) [HP], build-up (7, E, N), and damage to the player (N,) [HP].
     """
     s.trap_arm = (s.trap_arm - 1.0).clamp(min=0.0)
     offset = s.enemy_position.unsqueeze(1) - s.trap_position.unsqueeze(2)  # (2, 4, E, N)
@@ -67,11 +67,11 @@ def spring_traps(s: State, traits: Traits, numbers: TrapNumbers) -> tuple[Tensor
 
 
 def closeness(s: State, trap_type: Tensor) -> Tensor:
-    """Return how close the nearest enemy and the player are to a set trap, (2, N) in [0, 1].
+    """Return the closeness of the nearest enemy and of the player to a set trap, (2, N) in [0, 1].
 
     Args:
-        s: state.
-        trap_type: (4, N) of the traps that count, -1 where none is.
+        s: State.
+        trap_type: Types of the traps that count (4, N), or -1 in an empty slot.
     """
     bodies = torch.stack((pick(s.enemy_position, nearest(s)), s.position), 1)  # (2 coordinates, 2 bodies, N)
     distance = (bodies.unsqueeze(2) - s.trap_position.unsqueeze(1)).square().sum(0).sqrt()  # (2, 4, N)
@@ -87,7 +87,10 @@ def burn_player(s: State) -> Tensor:
 
 
 def leave_zone(s: State, left: Tensor) -> None:
-    """New zones under the machines where `left` (E, N); each takes the place of the one with least time."""
+    """Start hazard zones under the machines where `left` (E, N) holds.
+
+    A new zone replaces the one with the least time left.
+    """
     for enemy, leaves in enumerate(left):
         oldest = s.hazard_timer[0] > s.hazard_timer[1]  # (N,) the second slot
         slot = torch.stack((~oldest, oldest)) & leaves

@@ -1,4 +1,4 @@
-"""Tyre-limited car racing in batched torch: wear, fuel, several cars."""
+"""Simulation of tyre-limited car racing in batched torch, with wear, fuel and several cars."""
 
 from coachable.envs.racing.circuit.circuits import load_track
 from coachable.envs.racing.circuit.track import Track

@@ -1,4 +1,4 @@
-"""`RacingEnv`: B races of A cars as one TorchRL environment with a row per car."""
+"""`RacingEnv`, a TorchRL environment of B races of A cars with one row per car."""
 
 from __future__ import annotations
 
@@ -35,48 +35,54 @@ SCENARIO = "scenario"
 TELEMETRY_KEY = "telemetry"
 
 Driver = Callable[[Field, Tensor], Tensor]
-"""Drives cars that the agent does not: (field, observations (M, D)) to actions (M, 2) of the last M cars."""
+"""Function of a field and observations (M, D) that returns the actions (M, 2) of its last M cars.
+
+Drivers control the cars that the agent does not.
+"""
 
 
 class RacingEnv(EnvBase):
-    """B races of A cars; a row is a car, and row k * B + b is car k of race b.
+    """Environment of B races of A cars, in which row k * B + b is car k of race b.
 
-    Rows, not nested agents: styles, rewards, replay and losses then treat a car like any other environment. Cars of a
-    race start together and end together: when one terminates (wrong way, stopped, outside the walls), the others of
-    its race are truncated, unless stranded cars are put back. None of this depends on the style.
+    A car is a row and not a nested agent, so that styles, rewards, replay and losses treat it like any other
+    environment. The cars of a race start and end their episode together. When one car terminates (wrong way, stopped,
+    outside the walls), the others of its race are truncated, unless stranded cars are put back. None of this depends
+    on the style.
 
     Args:
-        num_envs: rows, the cars that the agent drives: races times `controlled`.
-        cars: A, in each race.
-        controlled: cars of each race that the agent drives, the first ones; default all. The others are driven by
-            `driver`.
-        driver: of the other cars.
-        track: name of a shipped circuit, or a `Track`.
-        car: name of a shipped car, or "pool" for cars drawn from a pool, one model per race.
-        scenarios: how episodes start; default the mixture of `race_scenarios`.
-        conditions: tyres and fuel at the start.
-        resources: wear and fuel rates.
-        weights: of the task reward.
-        course_points: points of each edge of the track that a driver sees.
-        opponents: whether drivers see opponents; default: in races. A car alone sees none, in as many columns.
-        episode_steps: control steps (0.1 s) after which an episode is truncated.
-        wrong_way_time: of going backwards that ends an episode [s].
-        put_back: whether stranded cars (wrong way, stopped, outside the walls) are put back on the track, at 15 m/s, as
-            soon as nobody is near, and no episode terminates: for races. They pay `TaskWeights.stranded` in every step
-            until then.
-        copies: of each start: race b starts like race b + races / copies, to compare styles on equal terms.
-        substeps: of physics in a control step; 40 for accurate runs.
-        compiled: whether to compile the physics and the task: minutes at first, then several times faster. (TorchRL
-            takes `compile` for itself.)
-        device: where everything runs.
-        seed: of the starts; each race, up to `copies`, gets a stream of its own.
-        num_threads: ignored; torch's own threads are used.
+        num_envs: Number of rows: the cars that the agent drives, which are races times `controlled`.
+        cars: Number A of cars in each race.
+        controlled: Number of cars of each race that the agent drives, the first ones; all by default. `driver` drives
+            the others.
+        driver: Driver of the other cars.
+        track: Name of a shipped circuit, or a `Track`.
+        car: Name of a shipped car, or "pool" for cars drawn from a pool, one model per race.
+        scenarios: Kinds of starts of the episodes; by default the mixture of `race_scenarios`.
+        conditions: Tyres and fuel at the start.
+        resources: Wear and fuel rates.
+        weights: Weights of the task reward.
+        course_points: Number of points of each edge of the track in the observation.
+        opponents: Whether the observation has columns for opponents; by default it has them if there are several cars.
+            They are 0 for a car that is alone.
+        episode_steps: Number of control steps (0.1 s) after which an episode is truncated.
+        wrong_way_time: Time of driving backwards that ends an episode [s].
+        put_back: Whether to put stranded cars (wrong way, stopped, outside the walls) back on the track at 15 m/s as
+            soon as no other car is near, and to terminate no episode. Use it for races. A stranded car pays
+            `TaskWeights.stranded` in every step until then.
+        copies: Number of races with equal starts: race b starts like race b + races / copies. Use it to compare styles
+            on equal terms.
+        substeps: Number of substeps of the physics in a control step; use 40 for accurate runs.
+        compiled: Whether to compile the physics and the task. This takes minutes at first and is several times faster
+            then. (TorchRL reserves the name `compile`.)
+        device: Device of all tensors.
+        seed: Seed of the starts; each race, up to `copies`, has a random stream of its own.
+        num_threads: Ignored; torch's own threads are used.
 
     Keys written: `observation` (N, D), `task_reward` (N, 1), `style_features` (N, 8 + 3 (A - 1)), `telemetry` (N, 12),
     `scenario` (N, 1) int64, `done`, `terminated`, `truncated` (N, 1).
 
     Raises:
-        ValueError: for an unknown car or track, or numbers of cars that do not fit.
+        ValueError: If the car or the track is unknown, or if the numbers of cars and races do not fit together.
 
     Example:
         >>> env = RacingEnv(num_envs=2, track="ring", seed=0)
@@ -111,19 +117,19 @@ class RacingEnv(EnvBase):
     ) -> None:
         controlled = cars if controlled is None else controlled
         if not 1 <= controlled <= cars:
-            raise ValueError(f"controlled is {controlled}: expected 1 to {cars}, the cars of a race")
+            raise ValueError(f"controlled is {controlled}: expected 1 to {cars}, the number of cars in a race")
         if num_envs < 1 or num_envs % controlled:
             raise ValueError(
                 f"num_envs is {num_envs}: expected a positive multiple of the {controlled} controlled cars"
             )
         COUNT.check("episode_steps", episode_steps)
         if controlled < cars and driver is None:
-            raise ValueError(f"{cars - controlled} cars of each race have no driver: pass driver=")
+            raise ValueError(f"{cars - controlled} cars of each race have no driver: pass one as driver=")
         if copies < 1 or (num_envs // controlled) % copies:
             raise ValueError(f"copies is {copies}: expected a divisor of the {num_envs // controlled} races")
         opponents = cars > 1 if opponents is None else opponents
         if cars > 1 and not opponents:
-            raise ValueError(f"opponents is False for {cars} cars: expected True, drivers see whom they race against")
+            raise ValueError(f"opponents is False for {cars} cars: expected True, or None, in a race of several cars")
         super().__init__(device=device, batch_size=torch.Size((num_envs,)))
         self.num_envs, self.cars, self.controlled = num_envs, cars, controlled
         self.races, self.driver, self.episode_steps = num_envs // controlled, driver, episode_steps
@@ -215,7 +221,7 @@ class RacingEnv(EnvBase):
             wanted = partial.reshape(self.controlled, self.races)
             races = wanted.any(0)
             if bool((wanted != races).any()):
-                raise ValueError("a race starts anew with all of its cars: reset all rows of a race together")
+                raise ValueError("_reset has only some rows of a race: expected all rows of a race or none")
         self._start_races(races)
         self._observation = self.referee.observe(
             self.state, self.run, self.compound, self.garage.car, self.simulation.wheels, self._groups
@@ -279,16 +285,19 @@ class RacingEnv(EnvBase):
     # -- state -----------------------------------------------------------------------------------------------------
 
     def simulator_state(self) -> dict[str, Any]:
-        """Everything that the next step depends on, as tensors, for exact resumption."""
+        """Return all tensors that the next step depends on, for exact resumption."""
         tensors = {name: getattr(self, name).clone() for name in _STATE}
         state = tensors | {"observation_now": self._observation.clone()} | self.garage.state()
         return state | ({"rivals": self.driver.state()} if isinstance(self.driver, Rivals) else {})
 
     def load_simulator_state(self, state: dict[str, Any]) -> None:
-        """Restores what `simulator_state` returned.
+        """Restore what `simulator_state` returned.
+
+        Args:
+            state: Result of `simulator_state` of an environment with as many races and cars.
 
         Raises:
-            ValueError: if it comes from other numbers of races or cars.
+            ValueError: If it comes from other numbers of races or cars.
         """
         if state["group"].shape != self.group.shape:
             cars, races = state["group"].shape
@@ -302,20 +311,20 @@ class RacingEnv(EnvBase):
             self.driver.load_state(state["rivals"])
 
     def follow(self, policy: nn.Module) -> None:
-        """Set the policy that rivals copy."""
+        """Set the policy that rivals copy; it has no effect without rivals."""
         if isinstance(self.driver, Rivals):
             self.driver.follow(policy)
 
     @property
     def field(self) -> Field:
-        """All cars as they are now, for those that drive some of them."""
+        """All cars in their present state, for drivers."""
         wheels, grip = self.simulation.wheels, self.compound[0]
         cars = (self.state, self.run, self.garage.car, wheels, grip)
         return Field(*cars, self.course, self.group, self.seeds, self.episode)
 
     @property
     def scenario_names(self) -> tuple[str, ...]:
-        """What the numbers of `scenario` mean."""
+        """Names of the scenarios, in the order of the numbers in `scenario`."""
         return tuple(scenario.name for scenario in self.starter.scenarios)
 
     @property
@@ -345,7 +354,7 @@ class RacingEnv(EnvBase):
         return verdict._replace(state=state, run=packed_run, observation=observation)
 
     def _start_races(self, races: Tensor) -> None:
-        """New episodes of the races (B,) bool; the others stay as they are."""
+        """Start new episodes of the races (B,) bool and leave the others unchanged."""
         self.episode = self.episode + races
         if self.garage.pooled:
             self.garage.draw(races, self.seeds, self.episode, Run(*self.run.unbind(0)).spins)

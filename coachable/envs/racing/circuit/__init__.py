@@ -1,1 +1,1 @@
-"""Circuits: centre line, width, the racing line and its speed profile."""
+"""Circuits with their centre lines and widths, racing lines and speed profiles."""

@@ -1,4 +1,4 @@
-"""The shipped circuits, and a generator of others. All are our own: no track data of anybody else is shipped."""
+"""Shipped circuits and a generator of random ones. All were made for this library and use no third-party data."""
 
 from __future__ import annotations
 
@@ -48,7 +48,12 @@ _APART = 60.0  # [m], between sections of a generated track
 
 
 def ring(radius: float = 200.0, width: float = 12.0) -> Track:
-    """A circle driven to the left, for tests."""
+    """Return a circle driven to the left, for tests.
+
+    Args:
+        radius: Radius of the centre line [m].
+        width: Width of the track [m].
+    """
     import torch
 
     count = max(8, round(2 * math.pi * radius / 4.0))
@@ -60,23 +65,29 @@ def ring(radius: float = 200.0, width: float = 12.0) -> Track:
 
 
 def oval(straight: float = 600.0, radius: float = 120.0, width: float = 12.0) -> Track:
-    """Two straights and two half circles, driven to the left, for tests."""
+    """Return a circuit of two straights and two half circles driven to the left, for tests.
+
+    Args:
+        straight: Length of each straight [m].
+        radius: Radius of the half circles [m].
+        width: Width of the track [m].
+    """
     turns = [(straight / 2, 180.0, radius), (straight, 180.0, radius), (straight / 2, 0.0, radius)]
     return Track.from_turns(turns, width=width, name="oval")
 
 
 def lakeside() -> Track:
-    """5.7 km with long straights and slow corners, for tyre and fuel saving."""
+    """Return a circuit of 5.7 km with long straights and slow corners, for tyre and fuel saving."""
     return Track.from_turns(_LAKESIDE, solve=(6, 8), name="lakeside")
 
 
 def ridge() -> Track:
-    """4.1 km of flowing corners, for drifting."""
+    """Return a circuit of 4.1 km with flowing corners, for drifting."""
     return Track.from_turns(_RIDGE, solve=(4, 8), width=14.0, name="ridge")
 
 
 def endurance() -> Track:
-    """13.6 km, fast, for races."""
+    """Return a fast circuit of 13.6 km, for races."""
     return Track.from_turns(_ENDURANCE, solve=(4, 8), width=14.0, name="endurance")
 
 
@@ -86,10 +97,13 @@ CIRCUITS = tuple(_BUILDERS)
 
 @lru_cache
 def load_track(name: str) -> Track:
-    """A shipped circuit.
+    """Return a shipped circuit.
+
+    Args:
+        name: One of `CIRCUITS`.
 
     Raises:
-        ValueError: if there is no such circuit.
+        ValueError: If there is no such circuit.
     """
     if name not in _BUILDERS:
         raise ValueError(f"unknown track {name!r}: expected one of {', '.join(_BUILDERS)}, or a Track")
@@ -99,18 +113,18 @@ def load_track(name: str) -> Track:
 def generate_track(
     seed: int, length: float = 5000.0, *, width: float = 12.0, name: str | None = None, attempts: int = 5000
 ) -> Track:
-    """A random circuit of about a given length whose sections keep clear of each other.
+    """Generate a random circuit of about a given length whose sections keep clear of each other.
 
     Args:
-        seed: the same seed gives the same circuit.
-        length: 2 to 14 km; met within 10 % [m].
-        width: of the track [m].
-        name: default: from the seed.
-        attempts: candidates to try.
+        seed: Seed of the circuit.
+        length: Length, 2,000 to 14,000; the circuit's differs by less than 10 % [m].
+        width: Width of the track [m].
+        name: Name of the circuit; by default it is made from the seed.
+        attempts: Number of candidates to try.
 
     Raises:
-        ValueError: if the length is out of range.
-        RuntimeError: if no candidate fits.
+        ValueError: If the length is out of range.
+        RuntimeError: If no candidate fits.
     """
     if not 2000.0 <= length <= 14000.0:
         raise ValueError(f"length is {length:g} m: expected 2000 to 14000")
@@ -129,7 +143,7 @@ def generate_track(
 
 
 def _candidate(random: np.random.Generator, turns: int, length: float) -> list[tuple[float, float, float]]:
-    """Draw the sections of a closed circuit as (straight [m], angle [deg], radius [m]), with more turns one way."""
+    """Draw sections (straight [m], angle [deg], radius [m]) of a closed circuit, most of which turn the same way."""
     sign = random.choice([-1.0, 1.0])
     angles = random.uniform(30.0, 130.0, turns) * np.where(random.random(turns) < 0.68, 1.0, -1.0)
     angles *= 1.0 - 0.4 * (angles < 0)

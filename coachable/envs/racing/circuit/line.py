@@ -1,4 +1,4 @@
-"""The line of least curvature through a track, which fast laps stay close to."""
+"""Computation of the line of least curvature through a track, which fast laps stay close to."""
 
 from __future__ import annotations
 
@@ -12,15 +12,18 @@ BODY_MARGIN = 1.2  # [m] between the line and the edge of the track: half a car 
 
 
 def minimum_curvature_line(track: Track, margin: float = BODY_MARGIN, rounds: int = 60) -> np.ndarray:
-    """Offsets (n,) from the centre line that minimise Σ (change of direction)² within the track [m].
+    """Return the offsets from the centre line that minimise Σ (change of direction)² within the track.
 
-    Quadratic in the offsets for fixed normals, solved by the alternating direction method of multipliers: a circulant
-    system in each round would need equal normals, so the banded one is solved with sparse factors once.
+    The sum is quadratic in the offsets for fixed normals. It is minimised by the alternating direction method of
+    multipliers. Its banded linear system is factorised only once.
 
     Args:
-        track: circuit.
-        margin: kept to the edges [m].
-        rounds: of the iteration.
+        track: Circuit.
+        margin: Distance that the line keeps to the edges [m].
+        rounds: Number of iterations, in tens.
+
+    Returns:
+        Offsets (n,) to the left [m].
     """
     from scipy import sparse
     from scipy.sparse.linalg import factorized

@@ -1,4 +1,4 @@
-"""Quasi-steady-state speeds along a line: what friction, power and brakes allow."""
+"""Quasi-steady-state speeds that friction, power and brakes allow along a line."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _LAPS = 2  # so that the end of the lap fits its start
 
 @dataclass(frozen=True)
 class Envelope:
-    """Largest accelerations of a car as a point mass [m/s²], of numpy arrays of speeds [m/s].
+    """Largest accelerations of a car as a point mass [m/s²]; the methods take arrays of speeds [m/s].
 
     Attributes:
-        car: parameters, numbers.
-        fuel: [l].
-        grip: factor of the friction coefficient.
-        braking: share of the friction that the brakes can use.
+        car: Parameters of one car, as numbers.
+        fuel: Fuel on board [l].
+        grip: Factor of the friction coefficient.
+        braking: Share of the friction that the brakes can use.
     """
 
     car: Car
@@ -35,22 +35,22 @@ class Envelope:
 
     @property
     def mass(self) -> float:
-        """Car and fuel [kg]."""
+        """Mass of the car and its fuel [kg]."""
         return self.car.mass + FUEL_DENSITY * self.fuel
 
     def friction(self, speed: np.ndarray) -> np.ndarray:
-        """Along the road in any direction."""
+        """Return the largest acceleration in any direction along the road [m/s²]."""
         load = self.mass * GRAVITY + 0.5 * AIR_DENSITY * self.car.lift_area * speed**2
         coefficient = self.car.grip + self.car.grip_per_load * 1e-3 * (load / 4 - self.car.reference_load)
         return LOAD_TRANSFER * self.grip * coefficient * load / self.mass
 
     def drag(self, speed: np.ndarray) -> np.ndarray:
-        """Of air and rolling."""
+        """Return the deceleration by air drag and rolling resistance [m/s²]."""
         air = 0.5 * AIR_DENSITY * self.car.drag_area * speed**2 / self.mass
         return air + self.car.rolling_resistance * GRAVITY
 
     def engine(self, speed: np.ndarray) -> np.ndarray:
-        """At full throttle in the best gear, less what it takes to spin up the wheels and the engine."""
+        """Return the acceleration at full throttle in the best gear, with the inertia of wheels and engine [m/s²]."""
         car = self.car
         wheel = np.maximum(speed, 3.0) / car.wheel_radius  # [rad/s]
         wheels = 2 * (car.wheel_inertia_front + car.wheel_inertia_rear)
@@ -66,7 +66,7 @@ class Envelope:
         return best
 
     def traction(self, speed: np.ndarray) -> np.ndarray:
-        """Share of the friction that the driven axle has, with the load moved to it."""
+        """Return the largest acceleration that the tyres of the driven axle allow, after the load transfer [m/s²]."""
         car = self.car
         share = car.front_axle / (car.front_axle + car.rear_axle)
         driven = (1 - car.drive_share_front) * share + car.drive_share_front * (1 - share)
@@ -75,7 +75,7 @@ class Envelope:
 
 
 def cornering_speed(envelope: Envelope, curvature: np.ndarray) -> np.ndarray:
-    """Highest steady speed at each curvature, by bisection [m/s]."""
+    """Return the highest steady speed [m/s] at each curvature [1/m], found by bisection."""
     low, high = np.full(curvature.shape, 3.0), np.full(curvature.shape, SPEED_MAX)
     for _ in range(40):
         middle = 0.5 * (low + high)
@@ -85,12 +85,15 @@ def cornering_speed(envelope: Envelope, curvature: np.ndarray) -> np.ndarray:
 
 
 def speed_profile(envelope: Envelope, curvature: np.ndarray, spacing: np.ndarray | float) -> np.ndarray:
-    """Fastest speeds (n,) on a closed line within the friction ellipse, engine and brakes [m/s].
+    """Return the highest speeds on a closed line within the friction ellipse and the limits of engine and brakes.
 
     Args:
-        envelope: of the car.
-        curvature: (n,) of the line [1/m].
-        spacing: distance from each point to the next [m].
+        envelope: Largest accelerations of the car.
+        curvature: Curvature (n,) of the line [1/m].
+        spacing: Distance from each point to the next, (n,) or one number [m].
+
+    Returns:
+        Speeds (n,) [m/s].
     """
     n = len(curvature)
     step = np.broadcast_to(np.asarray(spacing, dtype=float), (n,))
@@ -115,11 +118,11 @@ def speed_profile(envelope: Envelope, curvature: np.ndarray, spacing: np.ndarray
 
 
 def _left(friction: float, used: float) -> float:
-    """Longitudinal part of the friction circle."""
+    """Return the longitudinal acceleration that the friction circle leaves beside a lateral one."""
     return float(np.sqrt(max(friction**2 - used**2, 0.0)))
 
 
 def lap_time(speed: np.ndarray, spacing: np.ndarray | float) -> float:
-    """Of a speed profile [s]."""
+    """Return the lap time [s] of a speed profile (n,) [m/s] with the distances `spacing` between its points [m]."""
     following = np.roll(speed, -1)
     return float(np.sum(2 * np.asarray(spacing) / (speed + following)))

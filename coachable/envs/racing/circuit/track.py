@@ -1,4 +1,4 @@
-"""Tracks: a closed centre line with curvature and widths, sampled at equal distances."""
+"""Tracks, which are closed centre lines with curvature and widths, sampled at equal distances."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _FINE = 0.25  # [m], step of the integration
 
 @dataclass(frozen=True)
 class Track:
-    """A circuit.
+    """A circuit as a table of points along its centre line.
 
     Attributes:
-        name: for reports.
-        table: (n, 8) float64, rows at equal distances along the centre line with the columns of `COLUMNS`: position,
-            unit tangent, curvature (positive to the left), half-widths to the left and right, distance from the edge
-            to the wall [m].
-        spacing: distance between rows [m].
+        name: Name in reports and error messages.
+        table: Tensor (n, 8) float64 with rows at equal distances along the centre line and the columns of `COLUMNS`:
+            position [m], unit tangent, curvature (positive to the left) [1/m], half-widths to the left and right [m],
+            distance from the edge to the wall [m].
+        spacing: Distance between rows [m].
     """
 
     name: str
@@ -42,22 +42,23 @@ class Track:
 
     @property
     def length(self) -> float:
-        """Of the centre line [m]."""
+        """Length of the centre line [m]."""
         return self.spacing * len(self.table)
 
     @classmethod
     def from_csv(cls, path: str | Path, name: str | None = None, margin: float = 10.0) -> Track:
-        """A circuit from a file with the columns x, y, w_right, w_left [m], one line per point of the centre line.
+        """Read a circuit from a file with the columns x, y, w_right, w_left [m] and a line per point.
 
-        Lines that start with # are comments. The points are joined by a periodic cubic spline.
+        Lines that start with # are comments. A periodic cubic spline joins the points.
 
         Args:
-            path: file.
-            name: default: the file's name.
-            margin: distance from the edge of the track to the wall [m].
+            path: File to read.
+            name: Name of the circuit; by default the file's name without its suffix.
+            margin: Distance from the edge of the track to the wall [m].
 
         Raises:
-            ValueError: if a line is no four finite numbers, the track is open, crosses itself, or is too narrow.
+            ValueError: If a line does not hold four finite numbers, or if the track is open, crosses itself or is too
+                narrow.
         """
         path = Path(path)
         rows = []
@@ -83,7 +84,18 @@ class Track:
     def from_points(
         cls, points: np.ndarray, left: np.ndarray, right: np.ndarray, name: str = "track", margin: float = 10.0
     ) -> Track:
-        """A circuit through the points (n, 2) of its centre line, with half-widths (n,) [m]."""
+        """Make a circuit whose centre line is a periodic cubic spline through points.
+
+        Args:
+            points: Points (n, 2) of the centre line [m].
+            left: Distances (n,) from the centre line to the left edge [m].
+            right: Distances (n,) from the centre line to the right edge [m].
+            name: Name of the circuit.
+            margin: Distance from the edge of the track to the wall [m].
+
+        Raises:
+            ValueError: If the track is open, crosses itself or is too narrow.
+        """
         from scipy.interpolate import CubicSpline  # slow to import, and needed here only
 
         ends = np.linalg.norm(points[0] - points[-1])
@@ -116,18 +128,18 @@ class Track:
         margin: float = 10.0,
         name: str = "track",
     ) -> Track:
-        """A circuit of straights and turns whose curvature rises and falls linearly.
+        """Make a circuit of straights and turns whose curvature rises and falls linearly.
 
         Args:
-            turns: (straight before [m], angle [deg, positive to the left], radius [m]) each; the angles add up to
-                ±360.
-            solve: indices of the two turns whose straights are adjusted so that the track closes.
-            width: of the track [m].
-            margin: distance from the edge to the wall [m].
-            name: for reports.
+            turns: Length of the straight before the turn [m], angle [deg, positive to the left] and radius [m] of each
+                turn; the angles add up to ±360.
+            solve: Indices of the two turns whose straights are adjusted so that the track closes.
+            width: Width of the track [m].
+            margin: Distance from the edge to the wall [m].
+            name: Name of the circuit.
 
         Raises:
-            ValueError: if the angles do not close, no such straights exist, or the track crosses itself.
+            ValueError: If the angles do not add up to ±360, no such straights exist, or the track crosses itself.
         """
         total = sum(angle for _, angle, _ in turns)
         if abs(abs(total) - 360.0) > 1e-6:
@@ -153,7 +165,7 @@ class Track:
 
 
 def _turn(angle: float, radius: float) -> list[tuple[float, float, float]]:
-    """Ramp, arc and ramp as (length, curvature at the start, curvature at the end)."""
+    """Return ramp, arc and ramp of a turn as (length, curvature at the start, curvature at the end)."""
     arc = radius * math.radians(abs(angle))
     ramp = min(0.45 * arc, 45.0)
     curvature = math.copysign(1.0 / radius, angle)
@@ -161,7 +173,7 @@ def _turn(angle: float, radius: float) -> list[tuple[float, float, float]]:
 
 
 def _integrate(pieces: list[tuple[float, float, float]]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, headings, curvatures and distances along pieces of linear curvature, at most `_FINE` apart."""
+    """Return positions, headings, curvatures and distances at most `_FINE` apart along pieces of linear curvature."""
     nodes, weights = np.polynomial.legendre.leggauss(4)
     position, heading, distance = np.zeros(2), 0.0, 0.0
     points, headings = [position[None]], [np.zeros(1)]
@@ -188,7 +200,7 @@ def _integrate(pieces: list[tuple[float, float, float]]) -> tuple[np.ndarray, np
 def _close(
     turns: Sequence[tuple[float, float, float]], straights: list[float], solve: tuple[int, int], name: str
 ) -> list[float]:
-    """The straights with two of them changed so that the track ends where it starts."""
+    """Return the lengths of the straights with two of them changed so that the track ends where it starts."""
     pieces, headings, heading = [], [], 0.0
     for index, (_, angle, radius) in enumerate(turns):
         headings.append(heading)
@@ -209,7 +221,13 @@ def _close(
 
 
 def clearance(track: Track, apart: float = 60.0) -> float:
-    """Smallest distance between centre-line points that lie at least `apart` m from each other along the track [m]."""
+    """Return the smallest distance between points of the centre line that are far from each other along the track [m].
+
+    Args:
+        track: Circuit.
+        apart: Distance along the track from which two points count as far from each other [m]; it is limited to a
+            quarter of the length.
+    """
     points = track.table[:, :2]
     distance = torch.cdist(points, points)
     index = torch.arange(len(points))
@@ -243,12 +261,12 @@ def _check(track: Track) -> None:
 
 
 class Course(torch.nn.Module):
-    """A track's table on a device, and where points are on it.
+    """The table of a track on a device, with conversions between positions and distances along the track.
 
     Args:
-        track: circuit.
-        device: of the table.
-        dtype: of the table.
+        track: Circuit.
+        device: Device of the table.
+        dtype: Type of the table.
     """
 
     def __init__(self, track: Track, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
@@ -258,25 +276,26 @@ class Course(torch.nn.Module):
         self.table: Tensor
 
     def node(self, s: Tensor) -> Tensor:
-        """Index of the node nearest to a distance along the track."""
+        """Return the index of the node nearest to a distance along the track [m]."""
         return torch.remainder(torch.round(s / self.spacing).to(torch.int64), self.count)
 
     def frame(self, node: Tensor) -> Tensor:
-        """Rows of the table, (8, ...)."""
+        """Return the rows of the table at nodes (...), as (8, ...)."""
         return torch.stack([self.table[:, column][node] for column in range(8)])
 
     def project(self, x: Tensor, y: Tensor, s: Tensor) -> tuple[Tensor, Arc, Tensor]:
-        """Distance along the track, position relative to the centre line, and frame of the nearest node.
+        """Project points on the centre line, starting from an estimate.
 
-        Two look-ups: each projects on the arc at a node, which moves the second to the nearest node.
+        Each of two look-ups projects the points on the arc at a node; the first finds the node of the second.
 
         Args:
-            x: (N,) [m].
-            y: (N,) [m].
-            s: (N,) a distance along the track close to the result, within a few dozen metres.
+            x: Positions (N,) [m].
+            y: Positions (N,) [m].
+            s: Estimates (N,) of the distance along the track, within a few dozen metres of the result [m].
 
         Returns:
-            s in [0, length), the arc, and the frame (8, N).
+            The distance along the track (N,) in [0, length) [m], the position relative to the arc, and the frame
+            (8, N) of the nearest node.
         """
         node = self.node(s)
         frame = self.frame(node)
@@ -288,12 +307,20 @@ class Course(torch.nn.Module):
         return s, arc, frame
 
     def find(self, x: Tensor, y: Tensor) -> tuple[Tensor, Arc, Tensor]:
-        """Like `project`, from anywhere: looks at every node."""
+        """Project points (N,) on the centre line like `project`, without an estimate, by comparing all nodes."""
         distance = (x[..., None] - self.table[:, 0]) ** 2 + (y[..., None] - self.table[:, 1]) ** 2
         return self.project(x, y, distance.argmin(-1) * self.spacing)
 
     def place(self, s: Tensor, offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Position of a point beside the centre line, and the direction of the track there [rad]."""
+        """Return the positions of points beside the centre line, and the direction of the track there.
+
+        Args:
+            s: Distances (...) along the track [m].
+            offset: Distances (...) from the centre line to the left [m].
+
+        Returns:
+            x and y [m] and the heading of the track [rad], (...) each.
+        """
         node = self.node(s)
         x, y, tx, ty, curvature = self.frame(node)[:5].unbind(0)
         ahead = torch.remainder(s - node * self.spacing + self.length / 2, self.length) - self.length / 2

@@ -1,1 +1,1 @@
-"""Cars: tyres, powertrain, body, contacts; batched, without control flow."""
+"""Batched physics of cars without control flow: tyres, powertrain, body and contacts."""

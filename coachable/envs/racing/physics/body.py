@@ -1,4 +1,4 @@
-"""Planar rigid body: forces of steered and unsteered wheels, implicit velocities, impulses."""
+"""Planar rigid body with forces of steered and unsteered wheels, implicit velocities and impulses."""
 
 from __future__ import annotations
 
@@ -19,23 +19,32 @@ class PlanarForce(NamedTuple):
 
 
 def wheel_velocity(vx: Tensor, vy: Tensor, yaw_rate: Tensor, x: Any, y: Any) -> tuple[Tensor, Tensor]:
-    """Velocity of the point (x, y) of the body, in the car's frame [m/s]."""
+    """Return the velocity of the point (x, y) of the body in the car's frame [m/s]."""
     return vx - yaw_rate * y, vy + yaw_rate * x
 
 
 def rotate(x: Tensor, y: Tensor, cos: Any, sin: Any) -> tuple[Tensor, Tensor]:
-    """A vector turned counter-clockwise by the angle of `cos` and `sin`."""
+    """Rotate a vector counter-clockwise by the angle whose cosine and sine are given."""
     return x * cos - y * sin, x * sin + y * cos
 
 
 def wheel_force(fx: Tensor, fy: Tensor, cos: Any, sin: Any, x: Any, y: Any) -> PlanarForce:
-    """What a wheel at (x, y), steered by the angle of `cos` and `sin`, does to the body."""
+    """Return the force on the body by a wheel at (x, y) that is steered by the angle of `cos` and `sin`.
+
+    Args:
+        fx: Force along the wheel, (N,) [N].
+        fy: Force across the wheel, to the left, (N,) [N].
+        cos: Cosine of the steering angle.
+        sin: Sine of the steering angle.
+        x: Position of the wheel, forward of the centre of gravity [m].
+        y: Position of the wheel, to the left [m].
+    """
     bx, by = rotate(fx, fy, cos, sin)
     return PlanarForce(bx, by, x * by - y * bx)
 
 
 class Damping(NamedTuple):
-    """Symmetric matrix Σ c d dᵀ of how lateral tyre forces resist (vx, vy, yaw rate)."""
+    """Symmetric damping matrix Σ c d dᵀ of the lateral tyre forces for (vx, vy, yaw rate)."""
 
     xx: Tensor
     xy: Tensor
@@ -46,7 +55,15 @@ class Damping(NamedTuple):
 
 
 def wheel_damping(c: Tensor, cos: Any, sin: Any, x: Any, y: Any) -> Damping:
-    """Of one wheel with lateral damping c [N s/m]; d is the row that gives its lateral speed."""
+    """Return the damping c d dᵀ of one wheel, where d is the row that gives its lateral speed.
+
+    Args:
+        c: Lateral damping (N,) [N s/m].
+        cos: Cosine of the steering angle.
+        sin: Sine of the steering angle.
+        x: Position of the wheel, forward of the centre of gravity [m].
+        y: Position of the wheel, to the left [m].
+    """
     dr = x * cos + y * sin
     return Damping(c * sin * sin, -c * sin * cos, -c * sin * dr, c * cos * cos, c * cos * dr, c * dr * dr)
 
@@ -55,17 +72,27 @@ _Sum = TypeVar("_Sum", PlanarForce, Damping)
 
 
 def sum_wheels(parts: _Sum) -> _Sum:
-    """Add up the wheels, the first axis of every field, first to last."""
+    """Sum every field over the wheels, its first axis, in a fixed order."""
     return type(parts)(*(reduce(operator.add, field.unbind(0)) for field in parts))
 
 
 def implicit_change(
     force: PlanarForce, damping: Damping, mass: Any, inertia: Any, h: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Change of (vx, vy, yaw rate) in a substep: (M + h D) Δv = h F.
+    """Solve (M + h D) Δv = h F for the change of (vx, vy, yaw rate) in a substep.
 
-    Lateral tyre forces are stiff at walking pace, where an explicit step would chatter. D is positive semi-definite, so
-    the system always has a solution and dissipates. It is solved by elimination without pivots.
+    Lateral tyre forces are stiff at walking pace, where an explicit step would oscillate. D is positive semi-definite,
+    so that the system always has a solution and dissipates energy. It is solved by elimination without pivots.
+
+    Args:
+        force: F.
+        damping: D.
+        mass: Mass of the car [kg].
+        inertia: Moment of inertia about the vertical axis [kg m²].
+        h: Substep [s].
+
+    Returns:
+        Changes of vx [m/s], vy [m/s] and the yaw rate [rad/s], (N,) each.
     """
     a, b, c = mass + h * damping.xx, h * damping.xy, h * damping.xr
     d, e = mass + h * damping.yy, h * damping.yr
@@ -83,7 +110,7 @@ def implicit_change(
 
 
 class Impulse(NamedTuple):
-    """Change of (vx, vy, yaw rate) by a contact at a point of the body, in the car's frame."""
+    """Change of (vx, vy, yaw rate) by a contact at a point of the body, in the car's frame, (N,) each."""
 
     vx: Tensor
     vy: Tensor
@@ -100,17 +127,17 @@ def wall_impulse(
     restitution: float,
     friction: float,
 ) -> Impulse:
-    """Impulse of an immovable wall; everything in the car's frame.
+    """Return the impulse of an immovable wall; all vectors are in the car's frame.
 
     Args:
-        velocity: vx, vy and yaw rate.
-        point: of the body that touches.
-        normal: out of the road, into the wall.
-        touching: (N,) bool.
-        mass: of the car [kg].
-        inertia: of the car about the vertical axis [kg m²].
-        restitution: share of the approach speed that returns.
-        friction: largest tangential over normal impulse.
+        velocity: vx [m/s], vy [m/s] and yaw rate [rad/s], (N,) each.
+        point: Point of the body that touches the wall, (N,) each [m].
+        normal: Unit vector from the road into the wall, (N,) each.
+        touching: Whether each car touches the wall, (N,) bool.
+        mass: Mass of the car [kg].
+        inertia: Moment of inertia about the vertical axis [kg m²].
+        restitution: Ratio of the speeds normal to the wall after and before the contact.
+        friction: Largest ratio of the tangential to the normal impulse.
     """
     (px, py), (nx, ny) = point, normal
     ux, uy = wheel_velocity(*velocity, px, py)

@@ -26,11 +26,11 @@ _DEGREES = ("peak_slip_angle", "steer_max", "steer_rate")
 
 @dataclass(frozen=True)
 class Car:
-    """One car, or many: each field is a number, or a tensor (N,) with one value per car.
+    """Parameters of one car or of many: each field is a number, or a tensor (N,) with one value per car.
 
-    Units are SI; angles in radians (the data files have degrees), `grip_per_load` in 1/kN, engine speeds in rpm. What
-    each field means is written in the data files, `coachable/envs/racing/cars/*.toml`. `gears` has eight ratios, the
-    last repeated, and `top_gear` counts the real ones.
+    Units are SI, with angles in radians (the data files have degrees), `grip_per_load` in 1/kN and engine speeds in
+    rpm. The data files, `coachable/envs/racing/cars/*.toml`, explain each field. `gears` has eight ratios, of which the
+    last real one is repeated, and `top_gear` is the number of real ones.
     """
 
     mass: Any
@@ -73,13 +73,13 @@ class Car:
     top_gear: Any
 
     def pack(self, dtype: torch.dtype = torch.float32) -> Tensor:
-        """All numbers of one car in one tensor (P,), gears last but one; the inverse is `unpack`."""
+        """Return all numbers of one car as a tensor (P,) that ends with the gears and `top_gear`; see `unpack`."""
         scalars = [getattr(self, name) for name in _SCALARS]
         return torch.tensor([*scalars, *self.gears, self.top_gear], dtype=dtype)
 
     @classmethod
     def unpack(cls, packed: Tensor) -> Car:
-        """Cars from a tensor (P, N): every field becomes a tensor (N,)."""
+        """Return cars whose fields are the rows (N,) of a tensor (P, N)."""
         rows = packed.unbind(0)
         count = len(_SCALARS)
         named = dict(zip(_SCALARS, rows[:count], strict=True))
@@ -90,13 +90,13 @@ _SCALARS = tuple(f.name for f in fields(Car) if f.name not in ("gears", "top_gea
 
 
 def load_car(name: str) -> Car:
-    """One of the shipped cars.
+    """Return the parameters of a shipped car.
 
     Args:
         name: "gt3", "x2019" or "street".
 
     Raises:
-        ValueError: if there is no such car.
+        ValueError: If there is no such car.
 
     Example:
         >>> load_car("gt3").mass
@@ -113,7 +113,7 @@ def load_car(name: str) -> Car:
 
 
 def compound_table() -> Tensor:
-    """Grip and wear factors of each compound, (9, 2)."""
+    """Return the grip and wear factors of each compound, (9, 2)."""
     rows = []
     for name in COMPOUNDS:
         kind, hardness = name.split("_")
@@ -124,12 +124,12 @@ def compound_table() -> Tensor:
 
 @dataclass(frozen=True)
 class Resources:
-    """How fast tyres wear and fuel burns; 0 switches either off.
+    """Rates at which tyres wear and fuel burns; a rate of 0 switches it off.
 
     Attributes:
-        wear: multiple of the physical wear rate, k_wear.
-        fuel: multiple of the physical fuel rate, k_fuel.
-        fuel_exponent: n of the fuel law: 1 is physical, 2.5 is the game-like law that rewards part throttle.
+        wear: Multiple k_wear of the physical wear rate.
+        fuel: Multiple k_fuel of the physical fuel rate.
+        fuel_exponent: Exponent n of the fuel law. 1 is physical; 2.5 is the game-like law that rewards part throttle.
     """
 
     wear: float = 0.0
@@ -138,13 +138,13 @@ class Resources:
 
     @classmethod
     def calibrated(cls, car: str) -> Resources:
-        """Rates at which a stint on Lakeside lasts about ten laps, from `resources.toml`.
+        """Return the rates of `resources.toml`, at which a stint on Lakeside lasts about ten laps.
 
         Args:
             car: "gt3" or "x2019".
 
         Raises:
-            ValueError: if there are none for this car.
+            ValueError: If the file has no rates for this car.
         """
         table = tomllib.loads((files("coachable.envs.racing") / "resources.toml").read_text())
         if car not in table:
@@ -153,15 +153,19 @@ class Resources:
 
 
 def car_pool(count: int = 530, seed: int = 0, archetype: str | None = None) -> Tensor:
-    """Packed parameters (P, count) of a seeded pool of different cars (our choice, for the paper's 530).
+    """Draw a pool of different cars (our choice, for the paper's 530).
 
-    Six archetypes (GT3, open wheel and street car, and the GT3 car with front-, all-wheel drive and mid engine) are
-    perturbed in mass, power, torque, centre of gravity, grip and aerodynamics. The first 50 are GT3-like.
+    Six archetypes (GT3, open-wheel and street car, and the GT3 car with front-wheel drive, all-wheel drive and mid
+    engine) are perturbed in mass, power, torque, centre of gravity, grip and aerodynamics. The first 50 cars are
+    derived from the GT3 car.
 
     Args:
-        count: number of cars.
-        seed: of the perturbations.
-        archetype: use only this shipped car as the archetype.
+        count: Number of cars.
+        seed: Seed of the perturbations.
+        archetype: Name of a shipped car to use as the only archetype.
+
+    Returns:
+        Packed parameters (P, count); see `Car.unpack`.
     """
     gt3 = load_car("gt3")
     archetypes = [

@@ -1,7 +1,7 @@
-"""Contact between cars as rotated rectangles: separating axes, impulses, position correction.
+"""Contact between cars as rotated rectangles, with separating axes, impulses and position correction.
 
-Cars of B races are laid out (A, B). Rolling the first axis by k pairs car i with i + k, so that k = 1 to A // 2
-visits every pair, for even A the last k twice; those count half.
+Cars of B races are laid out as (A, B). Rolling the first axis by k pairs car i with car i + k, so that k = 1 to A // 2
+visits every pair. For even A the last k visits its pairs twice, so that they count half.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _EDGE_BLEND = 0.05  # nearly parallel sides touch with their middles, not with a
 
 
 class Bodies(NamedTuple):
-    """Rectangles (A, B): poses, velocities in the world's frame, sizes and masses."""
+    """Rectangles (A, B) with poses, velocities in the world's frame, sizes and masses."""
 
     x: Tensor
     y: Tensor
@@ -35,7 +35,7 @@ class Bodies(NamedTuple):
 
 
 class Push(NamedTuple):
-    """What contacts change, (A, B) each; velocities in the world's frame."""
+    """Changes by contacts, (A, B) each, in the world's frame."""
 
     x: Tensor
     y: Tensor
@@ -45,7 +45,7 @@ class Push(NamedTuple):
 
 
 class Overlap(NamedTuple):
-    """How the first rectangle of a pair overlaps the second."""
+    """Overlap of the two rectangles of a pair, (A, B) each."""
 
     depth: Tensor  # [m], not positive if apart
     nx: Tensor  # unit normal, from the second to the first
@@ -55,18 +55,18 @@ class Overlap(NamedTuple):
 
 
 def partner(bodies: Bodies, k: int) -> Bodies:
-    """The k-th next car of each race."""
+    """Return the k-th next car of each car, in the same race."""
     return Bodies(*(f.roll(-k, 0) if isinstance(f, Tensor) and f.ndim else f for f in bodies))
 
 
 def extent(nx: Tensor, ny: Tensor, body: Bodies) -> Tensor:
-    """Half the length of a rectangle's projection on a unit vector."""
+    """Return half the length of a rectangle's projection on a unit vector [m]."""
     along, across = rotate(nx, ny, body.cos, -body.sin)
     return along.abs() * body.half_length + across.abs() * body.half_width
 
 
 def _support(nx: Tensor, ny: Tensor, body: Bodies) -> tuple[Tensor, Tensor]:
-    """Vertex furthest along a unit vector, relative to the centre; the middle of a side that faces it squarely."""
+    """Return the vertex furthest along a unit vector, relative to the centre, or the middle of a side normal to it."""
     along, across = rotate(nx, ny, body.cos, -body.sin)
     along = body.half_length * torch.clamp(along / _EDGE_BLEND, -1.0, 1.0)
     across = body.half_width * torch.clamp(across / _EDGE_BLEND, -1.0, 1.0)
@@ -74,7 +74,7 @@ def _support(nx: Tensor, ny: Tensor, body: Bodies) -> tuple[Tensor, Tensor]:
 
 
 def overlap(a: Bodies, b: Bodies) -> Overlap:
-    """Separating axis test of two rectangles: the axis of least overlap, and the deepest vertex."""
+    """Return the overlap of two rectangles at the deepest vertex, along the axis of least depth (separating axes)."""
     dx, dy = a.x - b.x, a.y - b.y
     depth, nx, ny, ours = None, a.cos, a.sin, None
     for owner, (ex, ey) in ((0, (a.cos, a.sin)), (0, (-a.sin, a.cos)), (1, (b.cos, b.sin)), (1, (-b.sin, b.cos))):
@@ -104,12 +104,12 @@ def overlap(a: Bodies, b: Bodies) -> Overlap:
 
 
 def collide(bodies: Bodies, group: Tensor, impact: Tensor) -> tuple[Push, Tensor]:
-    """Contacts of all pairs at once.
+    """Resolve the contacts of all pairs at once.
 
     Args:
-        bodies: (A, B).
-        group: (A, B); only cars of one group touch.
-        impact: (A // 2, A, B), largest squared relative speed of each pair's contacts so far [m²/s²].
+        bodies: Cars (A, B).
+        group: Groups (A, B); only cars of one group touch.
+        impact: Largest squared relative speed of each pair's contacts so far, (A // 2, A, B) [m²/s²].
 
     Returns:
         The changes, and the updated `impact`.
@@ -130,7 +130,7 @@ def collide(bodies: Bodies, group: Tensor, impact: Tensor) -> tuple[Push, Tensor
 
 
 def _pair(a: Bodies, b: Bodies, same: Tensor, share: float) -> tuple[Push, Push, Tensor]:
-    """Changes of both cars of a pair, and the squared relative speed where they touch."""
+    """Return the changes of both cars of each pair, and the squared relative speed of those that touch."""
     o = overlap(a, b)
     touching = same & (o.depth > 0.0)
     depth = torch.where(touching, o.depth, 0.0) * (share * _CORRECTION)
@@ -170,7 +170,7 @@ def _pair(a: Bodies, b: Bodies, same: Tensor, share: float) -> tuple[Push, Push,
 
 
 def body_gaps(a: Bodies, b: Bodies) -> tuple[Tensor, Tensor]:
-    """Distances between two rectangles along the first one's axes, 0 where their projections overlap [m]."""
+    """Return the distances between two rectangles along and across the first one, 0 if the projections overlap [m]."""
     dx, dy = b.x - a.x, b.y - a.y
     ahead, aside = rotate(dx, dy, a.cos, -a.sin)
     long = ahead.abs() - a.half_length - extent(a.cos, a.sin, b)

@@ -1,6 +1,7 @@
-"""One substep of the double-track model for N cars: pure, without branches on values, fit for `torch.compile`.
+"""One substep of the double-track model for N cars, as a pure function without branches on values (`torch.compile`).
 
-Wheels are the first axis, (4, N): four times fewer operations than one tensor per wheel, and rows stay contiguous.
+Wheels are the first axis, (4, N). This takes a quarter of the operations of one tensor per wheel, and rows stay
+contiguous.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ _CORNER_BLEND = 0.05  # a body nearly parallel to a wall touches it with its sid
 
 @dataclass(frozen=True)
 class WheelSet:
-    """What differs between the wheels of a car, (4, 1) each, or (4, N) for different cars."""
+    """Parameters that differ between the wheels of a car, (4, 1) each, or (4, N) for different cars."""
 
     front: Tensor  # 1 for front wheels
     x: Tensor  # position [m]
@@ -69,7 +70,13 @@ class WheelSet:
 
     @classmethod
     def of(cls, car: Car, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> WheelSet:
-        """The wheels of one car, or of N."""
+        """Return the wheels of one car, or of N.
+
+        Args:
+            car: Parameters, as numbers or tensors (N,).
+            device: Device of the tensors.
+            dtype: Type of the tensors.
+        """
 
         def wheels(*values: Any) -> Tensor:
             rows = [torch.as_tensor(value, dtype=dtype, device=device).reshape(-1) for value in values]
@@ -102,12 +109,24 @@ class WheelSet:
 
 
 def total_mass(car: Car, fuel: Tensor) -> Tensor:
-    """Car and fuel [kg]."""
+    """Return the mass of the cars with their fuel (N,) [l] in kg."""
     return car.mass + FUEL_DENSITY * fuel
 
 
 def wheel_loads(car: Car, wheels: WheelSet, s: CarState, front_lift: Tensor | float = 1.0) -> Tensor:
-    """Return the vertical loads (4, N) [N]: braking loads the front wheels, cornering the outer ones."""
+    """Return the vertical loads on the wheels.
+
+    Braking loads the front wheels, cornering the outer ones.
+
+    Args:
+        car: Parameters.
+        wheels: Wheels of that car.
+        s: State of N cars.
+        front_lift: Factor of the downforce on the front axle.
+
+    Returns:
+        Loads (4, N) [N].
+    """
     mass = total_mass(car, s.fuel)
     lift = 0.5 * AIR_DENSITY * car.lift_area * (s.vx * s.vx + s.vy * s.vy)
     lift = lift * (1.0 + wheels.front * (front_lift - 1.0))
@@ -116,12 +135,20 @@ def wheel_loads(car: Car, wheels: WheelSet, s: CarState, front_lift: Tensor | fl
 
 
 def steering(wheels: WheelSet, steer: Tensor) -> tuple[Tensor, Tensor]:
-    """Cosine and sine of each wheel's angle, (4, N)."""
+    """Return cosine and sine of each wheel's angle, (4, N), for steering angles (N,) [rad]."""
     return 1.0 + wheels.front * (torch.cos(steer) - 1.0), wheels.front * torch.sin(steer)
 
 
 def wheel_grip(car: Car, load: Tensor, heat: Tensor, wear: Tensor, compound: Tensor) -> Tensor:
-    """Friction coefficient of tyres on the track."""
+    """Return the friction coefficients of tyres on the track, (4, N).
+
+    Args:
+        car: Parameters.
+        load: Vertical loads (4, N) [N].
+        heat: Temperatures (4, N) [°C].
+        wear: Wear (4, N) in [0, 1].
+        compound: Grip factor of the compound (N,).
+    """
     base = friction(load, car.grip, car.grip_per_load, car.reference_load)
     return base * compound * heat_factor(heat) * wear_factor(wear)
 
@@ -129,18 +156,18 @@ def wheel_grip(car: Car, load: Tensor, heat: Tensor, wear: Tensor, compound: Ten
 def substep(
     packed: Tensor, packed_inputs: Tensor, car: Car, wheels: WheelSet, resources: Resources, h: float
 ) -> Tensor:
-    """Advance the cars by h.
+    """Advance the cars by a substep.
 
     Args:
-        packed: (29, N) rows of `CarState`.
-        packed_inputs: (15, N) rows of `CarInputs`.
-        car: parameters, numbers or tensors (N,).
-        wheels: of that car.
-        resources: wear and fuel rates.
-        h: substep [s].
+        packed: State (29, N) with the rows of `CarState`.
+        packed_inputs: Inputs (15, N) with the rows of `CarInputs`.
+        car: Parameters, as numbers or tensors (N,).
+        wheels: Wheels of that car.
+        resources: Wear and fuel rates.
+        h: Substep [s].
 
     Returns:
-        (29, N).
+        The new state (29, N).
     """
     s, u = CarState(*packed.unbind(0)), CarInputs(*packed_inputs.unbind(0))
     spins, heats, wears = packed[SPINS], packed[HEATS], packed[WEARS]
@@ -160,7 +187,7 @@ def substep(
     drive = drive_wheels(car, resources, throttle, mean_speed, s.gear, s.shift_time, s.fuel, h)
     lock = rear_lock + wheels.front * (front_lock - rear_lock)
 
-    # Where the wheels stand.
+    # Position of the wheels on the road.
     arc = locate(s.x, s.y, u.node_x, u.node_y, u.node_tx, u.node_ty, u.curvature)
     cos, sin = torch.cos(s.yaw), torch.sin(s.yaw)
     toward_x, toward_y = rotate(arc.nx, arc.ny, cos, -sin)  # normal of the road in the car's frame

@@ -1,4 +1,4 @@
-"""Engine, automatic gearbox, differential and fuel."""
+"""Model of the engine, the automatic gearbox, the differential and the fuel."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _RPM = 60.0 / (2.0 * math.pi)
 
 
 class Drive(NamedTuple):
-    """What the engine does to the wheels in one substep, (N,) each."""
+    """Effect of the engine on the wheels in one substep, and its new state, (N,) each."""
 
     torque: Tensor  # of all driven wheels together [N m]
     resistance: Tensor  # engine brake at the wheels, not negative [N m]
@@ -33,7 +33,7 @@ class Drive(NamedTuple):
 
 
 def gear_ratio(car: Car, gear: Tensor) -> Tensor:
-    """Total ratio, engine to wheels."""
+    """Return the total ratio of engine speed to wheel speed in the gears (N,)."""
     ratio = torch.zeros_like(gear) + car.gears[0] * car.final_drive
     for index in range(1, MAX_GEARS):
         ratio = torch.where(gear > index + 0.5, car.gears[index] * car.final_drive, ratio)
@@ -41,13 +41,13 @@ def gear_ratio(car: Car, gear: Tensor) -> Tensor:
 
 
 def engine_speed(car: Car, ratio: Tensor, wheel_speed: Tensor) -> Tensor:
-    """Speed of the engine [rpm], from the mean speed of the driven wheels [rad/s]; never below idle."""
+    """Return the engine speed [rpm], at least that at idle, from the mean speed of the driven wheels [rad/s]."""
     rpm = wheel_speed * ratio * _RPM
     return torch.maximum(rpm, torch.zeros_like(rpm) + car.rpm_idle)
 
 
 def full_torque(car: Car, omega: Tensor) -> Tensor:
-    """Torque at full throttle [N m] at an engine speed [rad/s]."""
+    """Return the torque at full throttle [N m] at engine speeds (N,) [rad/s]."""
     return torch.minimum(torch.zeros_like(omega) + car.torque, car.power / omega)
 
 
@@ -63,17 +63,17 @@ def drive_wheels(
 ) -> Drive:
     """Advance the engine and the automatic gearbox by one substep.
 
-    Partial throttle shifts up earlier, which saves fuel under the game-like law.
+    At partial throttle the gearbox shifts up earlier, which saves fuel under the game-like law.
 
     Args:
-        car: parameters.
-        resources: fuel rate and law.
-        throttle: (N,) in [0, 1].
-        wheel_speed: (N,) mean of the driven wheels [rad/s].
-        gear: (N,).
-        shift_time: (N,) left of the torque cut [s].
-        fuel: (N,) [l].
-        h: substep [s].
+        car: Parameters.
+        resources: Fuel rate and fuel law.
+        throttle: Throttle (N,) in [0, 1].
+        wheel_speed: Mean speed of the driven wheels (N,) [rad/s].
+        gear: Gear (N,), as a float.
+        shift_time: Time left of the torque cut (N,) [s].
+        fuel: Fuel (N,) [l].
+        h: Substep [s].
     """
     ratio = gear_ratio(car, gear)
     rpm = engine_speed(car, ratio, wheel_speed)
@@ -109,10 +109,10 @@ def drive_wheels(
 
 
 def differential(left: Tensor, right: Tensor) -> Tensor:
-    """Torque that a viscous differential moves from the faster left wheel to the right one [N m]."""
+    """Return the torque that a viscous differential moves from a faster left wheel to the right one [N m]."""
     return torch.clamp(DIFFERENTIAL * (left - right), -DIFFERENTIAL_MAX, DIFFERENTIAL_MAX)
 
 
 def driven(share: Any) -> Any:
-    """1 where an axle is driven, 0 where its share of the torque is 0."""
+    """Return 1 if an axle is driven and 0 if its share of the torque is 0."""
     return (share > 0.0).to(share.dtype) if isinstance(share, Tensor) else float(share > 0.0)

@@ -1,4 +1,4 @@
-"""Control steps of N cars: substeps, contacts, and their compilation."""
+"""Control steps of N cars with substeps, contacts and their compilation."""
 
 from __future__ import annotations
 
@@ -23,7 +23,14 @@ _LOG = logging.getLogger(__name__)
 
 
 def maybe_compile(function: Callable[..., Any], device: torch.device, wanted: bool) -> Callable[..., Any]:
-    """`torch.compile` where it is wanted and possible, otherwise the function itself; says so once."""
+    """Compile a function if this is wanted and possible, otherwise return it unchanged.
+
+    Args:
+        function: Function to compile.
+        device: Device that it runs on. On a CPU, `torch.compile` needs a C++ compiler; a warning is logged if there is
+            none.
+        wanted: Whether to compile.
+    """
     if not wanted:
         return function
     if device.type == "cpu" and not any(shutil.which(name) for name in ("g++", "clang++", "c++")):
@@ -33,16 +40,20 @@ def maybe_compile(function: Callable[..., Any], device: torch.device, wanted: bo
 
 
 class Simulation:
-    """The physics of B races of A cars, without track or task: a pure function of state and inputs.
+    """Physics of B races of A cars, without track or task, as a pure function of state and inputs.
 
     Args:
-        car: parameters of all cars, or of each.
-        resources: wear and fuel rates.
-        cars: A.
-        substeps: per control step; 10 by default, 40 for accurate runs.
-        compile: whether to compile the substeps (about half a minute, then 5 to 10 times faster on a CPU).
-        device: where.
-        dtype: float32, or float64 for checks.
+        car: Parameters of all cars, or of each.
+        resources: Wear and fuel rates.
+        cars: Number A of cars in a race.
+        substeps: Number of substeps per control step: 10 by default, 40 for accurate runs.
+        compile: Whether to compile the substeps, which takes about half a minute and makes them 5 to 10 times faster on
+            a CPU.
+        device: Device of all tensors.
+        dtype: Type of the parameters of the wheels: float32, or float64 for checks.
+
+    Raises:
+        ValueError: If `substeps` is less than 1.
     """
 
     def __init__(
@@ -65,19 +76,20 @@ class Simulation:
         self._advance = maybe_compile(self._substeps, self.device, compile)
 
     def set_cars(self, car: Car) -> None:
-        """Replaces the parameters of cars that have one each, as tensors (N,)."""
+        """Replace the parameters of the cars by tensors (N,), with one value per car."""
         self.car, self.wheels = _apart(car), WheelSet.of(car, self.device, self.wheels.x.dtype)
 
     def step(self, state: Tensor, inputs: Tensor, group: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
-        """One control step.
+        """Advance the cars by one control step.
 
         Args:
-            state: (29, N), car-major: car k of race b is column k * B + b.
-            inputs: (15, N).
-            group: (A, B), which cars interact; needed if A > 1.
+            state: State (29, N), in which column k * B + b is car k of race b.
+            inputs: Inputs (15, N).
+            group: Groups (A, B) of cars that interact; required if A > 1.
 
         Returns:
-            The new state, and for A > 1 each pair's largest squared relative speed in contact (A // 2, A, B).
+            The new state (29, N), and for A > 1 each pair's largest squared relative speed in contact, (A // 2, A, B)
+            [m²/s²].
         """
         impact = None
         if self.cars > 1:
@@ -94,7 +106,8 @@ class Simulation:
         group: Tensor | None,
         impact: Tensor | None,
     ) -> tuple[Tensor, Tensor | None]:
-        # Compiled as a whole, so that guards are checked once per control step, but the code of a substep once.
+        # The loop is compiled as a whole, so that guards are checked once per control step. The nested region lets the
+        # compiler reuse the code of one substep for all.
         if group is None or impact is None:
 
             @nested_compile_region
@@ -126,7 +139,7 @@ class Simulation:
 
 
 def _apart(car: Car) -> Car:
-    """The cars in tensors that share no memory: a compiled region refuses views of one."""
+    """Copy the parameters to tensors that share no memory, because a compiled region refuses views of one tensor."""
 
     def copied(value: Any) -> Any:
         if isinstance(value, tuple):
@@ -137,7 +150,7 @@ def _apart(car: Car) -> Car:
 
 
 def bodies_of(state: Tensor, car: Car, cars: int) -> Bodies:
-    """The cars as rectangles, (A, B)."""
+    """Return the cars of a state (29, A * B) as rectangles (A, B)."""
     yaw, vx, vy = state[ROW["yaw"]], state[ROW["vx"]], state[ROW["vy"]]
     cos, sin = torch.cos(yaw), torch.sin(yaw)
     rectangle = (

@@ -1,4 +1,4 @@
-"""What a car's state and its inputs consist of, one row of a packed tensor each."""
+"""Names of the rows of the packed tensors of a car's state and inputs."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from torch import Tensor
 
 
 class CarState(NamedTuple):
-    """State of N cars, one tensor (N,) each; packed as the rows of one tensor (29, N).
+    """State of N cars with one tensor (N,) per field, packed as the rows of one tensor (29, N).
 
-    SI units, temperatures in °C, wear in [0, 1], fuel in litres. Wheels in the order front left, front right, rear
-    left, rear right; x forward, y left; positive steer and lateral acceleration to the left.
+    Units are SI, with temperatures in °C, wear in [0, 1] and fuel in litres. The order of the wheels is front left,
+    front right, rear left, rear right. x points forward and y to the left; steering angle and lateral acceleration are
+    positive to the left.
     """
 
     x: Tensor
@@ -46,7 +47,7 @@ class CarState(NamedTuple):
 
 
 class CarInputs(NamedTuple):
-    """What is constant during a control step, one tensor (N,) each; packed as the rows of one tensor (15, N)."""
+    """Constants of N cars in a control step with a tensor (N,) per field, packed as the rows of one tensor (15, N)."""
 
     steer_step: Tensor  # change of the steering command per substep
     throttle: Tensor

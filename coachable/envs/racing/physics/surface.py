@@ -1,4 +1,4 @@
-"""The road near a car: signed distance to an arc of the centre line, surfaces beside the track, walls."""
+"""The road near a car, with signed distances to an arc of the centre line, surfaces beside the track and walls."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ WALL_RESTITUTION, WALL_FRICTION = 0.2, 0.3
 
 
 class Arc(NamedTuple):
-    """Where a point is relative to an arc through (x, y) with tangent (tx, ty) and curvature, (N,) each."""
+    """Position of points relative to arcs of the centre line, (N,) each."""
 
     ahead: Tensor  # distance along the arc [m]
     offset: Tensor  # distance from the arc, positive to the left [m]
@@ -24,7 +24,17 @@ class Arc(NamedTuple):
 
 
 def locate(x: Tensor, y: Tensor, node_x: Tensor, node_y: Tensor, tx: Tensor, ty: Tensor, curvature: Tensor) -> Arc:
-    """Projects points on arcs, exactly and without cancellation where the arc is nearly straight."""
+    """Project points on arcs, exactly and without cancellation where an arc is nearly straight.
+
+    Args:
+        x: Positions of the points (N,) [m].
+        y: Positions of the points (N,) [m].
+        node_x: Positions of one point of each arc (N,) [m].
+        node_y: Positions of one point of each arc (N,) [m].
+        tx: Unit tangents at these points (N,).
+        ty: Unit tangents at these points (N,).
+        curvature: Curvatures, positive to the left (N,) [1/m].
+    """
     dx, dy = x - node_x, y - node_y
     u = dx * tx + dy * ty
     v = dy * tx - dx * ty
@@ -42,18 +52,18 @@ def locate(x: Tensor, y: Tensor, node_x: Tensor, node_y: Tensor, tx: Tensor, ty:
 
 
 def beyond(offset: Tensor, left: Tensor, right: Tensor) -> Tensor:
-    """How far a point is off the track [m]; negative on it."""
+    """Return the distance of points beyond the edge of the track, negative on it [m]."""
     return torch.maximum(offset - left, -offset - right)
 
 
 def surface_grip(outside: Tensor) -> Tensor:
-    """Grip factor of the surface at a distance beyond the edge."""
+    """Return the grip factor of the surface at distances beyond the edge of the track [m]."""
     grip = torch.where(outside > 0.0, GRIP["kerb"], GRIP["track"])
     grip = torch.where(outside > KERB_WIDTH, GRIP["run_off"], grip)
     return torch.where(outside > RUN_OFF_WIDTH, GRIP["grass"], grip)
 
 
 def surface_rolling(outside: Tensor) -> Tensor:
-    """Rolling resistance of the surface beyond that of tarmac."""
+    """Return the rolling resistance that the surface adds to that of tarmac, at distances beyond the edge [m]."""
     drag = torch.where(outside > KERB_WIDTH, RUN_OFF_ROLLING, 0.0)
     return torch.where(outside > RUN_OFF_WIDTH, GRASS_ROLLING, drag)

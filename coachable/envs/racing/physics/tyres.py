@@ -1,4 +1,4 @@
-"""Tyres: combined slip, implicit wheel spin, heat and wear."""
+"""Tyre model with combined slip, implicit wheel spin, heat and wear."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ WEAR_ENERGY = 1e8  # [J] of slip for wear 1
 
 
 def tangent(angle: Any) -> Any:
-    """Tangent of a number or a tensor."""
+    """Return the tangent of a number or a tensor [rad]."""
     return torch.tan(angle) if isinstance(angle, Tensor) else math.tan(angle)
 
 
 def slip_curve(rho: Tensor, shape: Any) -> Tensor:
-    """Normalised force over normalised slip, sin(C atan(B ρ)) / ρ; B puts the peak at ρ = 1."""
+    """Return the ratio of normalised force to normalised slip, sin(C atan(B ρ)) / ρ, where B puts the peak at ρ = 1."""
     stiffness = tangent(math.pi / 2 / shape)
     return torch.sin(shape * torch.atan(stiffness * rho)) / rho
 
 
 class WheelForces(NamedTuple):
-    """Of one wheel of N cars, in the wheel's frame."""
+    """Forces and spin of a wheel of N cars in the wheel's frame, (N,) each, or of four wheels, (4, N) each."""
 
     spin: Tensor  # [rad/s] at the end of the substep
     fx: Tensor  # [N]
@@ -56,22 +56,22 @@ def roll_wheel(
 ) -> WheelForces:
     """Advance a wheel's spin implicitly and return the tyre's forces.
 
-    The spin settles within a fraction of a substep, so the force is linearised as a secant, k (ωR - v). Brake torque is
-    Coulomb friction: it stops the wheel exactly and never turns it backwards.
+    The spin settles within a fraction of a substep, so that the force is linearised as a secant, k (ωR - v). The brake
+    torque is Coulomb friction: it stops the wheel exactly and never turns it backwards.
 
     Args:
-        v_long: (N,) speed of the wheel's centre along the wheel [m/s].
-        v_lat: (N,) across the wheel, to the left [m/s].
-        spin: (N,) [rad/s].
-        grip_force: (N,) largest force, μ Fz [N].
-        drive: (N,) torque of the engine and the differential [N m].
-        brake: (N,) torque of everything that resists the rotation, not negative [N m].
-        inertia: of the wheel and what turns with it [kg m²].
-        h: substep [s].
-        radius: [m].
-        peak_ratio: slip ratio of the largest force.
-        peak_tangent: tangent of the slip angle of the largest force.
-        shape: C of the curve.
+        v_long: Speed of the wheel's centre along the wheel (N,) [m/s].
+        v_lat: Speed across the wheel, to the left (N,) [m/s].
+        spin: Angular speed (N,) [rad/s].
+        grip_force: Largest force μ Fz (N,) [N].
+        drive: Torque of the engine and the differential (N,) [N m].
+        brake: Torque of everything that resists the rotation, not negative (N,) [N m].
+        inertia: Moment of inertia of the wheel and of the parts that turn with it [kg m²].
+        h: Substep [s].
+        radius: Radius of the wheel [m].
+        peak_ratio: Slip ratio of the largest force.
+        peak_tangent: Tangent of the slip angle of the largest force.
+        shape: Constant C of the slip curve.
     """
     den = torch.sqrt(v_long * v_long + SLIP_SPEED * SLIP_SPEED)
     sy = v_lat / (den * peak_tangent)
@@ -101,32 +101,39 @@ def roll_wheel(
 
 
 def heat_rate(slip_power: Tensor, load: Tensor, speed: Tensor, heat: Tensor) -> Tensor:
-    """Rate of a tyre's temperature [K/s]; `speed` is that of its centre along the wheel, not negative."""
+    """Return the rate at which a tyre's temperature changes [K/s].
+
+    Args:
+        slip_power: Power of the slip [W].
+        load: Vertical load [N].
+        speed: Speed of the wheel's centre along the wheel, not negative [m/s].
+        heat: Temperature [°C].
+    """
     gain = HEAT_SHARE * slip_power + HEAT_PER_LOAD * load * speed
     return (gain - (COOLING[0] + COOLING[1] * speed) * (heat - AMBIENT)) / HEAT_CAPACITY
 
 
 def heat_factor(heat: Tensor) -> Tensor:
-    """Grip at a temperature, relative to that at 90 °C."""
+    """Return the grip at temperatures [°C] relative to that at 90 °C."""
     return torch.clamp(1.0 - _off_best(heat), min=0.8)
 
 
 def heat_loss(heat: Tensor) -> Tensor:
-    """Share of its grip that a tyre loses by being hotter than 90 °C, without the bound of `heat_factor`."""
+    """Return the share of the grip that is lost at temperatures above 90 °C, without the bound of `heat_factor`."""
     return _off_best(torch.clamp(heat, min=BEST_HEAT))
 
 
 def _off_best(heat: Tensor) -> Tensor:
-    """Share of the grip that is lost at a temperature, hot or cold."""
+    """Return the share of the grip that is lost at temperatures below or above 90 °C."""
     off = (heat - BEST_HEAT) / 60.0
     return 0.2 * off * off
 
 
 def wear_factor(wear: Tensor) -> Tensor:
-    """Grip of a worn tyre, relative to a new one; falls faster beyond 75 %."""
+    """Return the grip of worn tyres relative to new ones, which falls faster beyond a wear of 0.75."""
     return 1.0 - 0.10 * wear - 0.5 * torch.clamp(wear - 0.75, min=0.0)
 
 
 def friction(load: Tensor, grip: Any, grip_per_load: Any, reference_load: Any) -> Tensor:
-    """Friction coefficient at a load, before the factors of compound, heat, wear and surface."""
+    """Return the friction coefficient at loads [N], before the factors of compound, heat, wear and surface."""
     return grip + grip_per_load * 1e-3 * (load - reference_load)

@@ -1,1 +1,1 @@
-"""What happens on a circuit: rules, starts, rivals, what a driver sees."""
+"""Races on a circuit with rules, starts, rivals and observations."""

@@ -1,4 +1,4 @@
-"""Random numbers that are a function of a race's seed and episode, whatever other races do."""
+"""Random numbers that are a function of a race's seed and episode, independent of the other races."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ _RACE, _EPISODE = 0x2545F4914F6CDD1D, 0x5851F42D4C957F2D
 
 
 def _shift(value: Tensor, bits: int) -> Tensor:
-    """Logical shift to the right."""
+    """Shift to the right logically, without copies of the sign bit."""
     return (value >> bits) & ((1 << (64 - bits)) - 1)
 
 
 def uniforms(seed: Tensor, episode: Tensor, rows: int, cars: int) -> Tensor:
-    """Uniform numbers in [0, 1).
+    """Draw uniform numbers in [0, 1).
 
     Args:
-        seed: (B,) int64, of each race.
-        episode: (B,) int64, how many episodes the race has started.
-        rows: numbers per car.
-        cars: A.
+        seed: Seed of each race (B,) int64.
+        episode: Number of episodes that each race has started (B,) int64.
+        rows: Count of numbers per car.
+        cars: Number A of cars in a race.
 
     Returns:
-        (rows, A, B) float32.
+        Numbers (rows, A, B) float32.
     """
     counter = torch.arange(1, rows * cars + 1, device=seed.device).reshape(rows, cars, 1)
     z = (seed * _RACE) ^ (episode * _EPISODE)
@@ -42,5 +42,5 @@ def _finish(z: Tensor) -> Tensor:
 
 
 def normal(u1: Tensor, u2: Tensor) -> Tensor:
-    """Standard normal numbers from two uniform ones (Box and Muller)."""
+    """Transform two uniform numbers in [0, 1) to a standard normal one (Box and Muller)."""
     return torch.sqrt(-2.0 * torch.log1p(-u1)) * torch.cos(2.0 * math.pi * u2)

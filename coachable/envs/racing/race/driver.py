@@ -1,4 +1,4 @@
-"""`LineFollower`: a scripted driver with traction control, as baseline and as opponent."""
+"""`LineFollower`, a scripted driver with traction control that serves as baseline and as opponent."""
 
 from __future__ import annotations
 
@@ -16,32 +16,35 @@ from coachable.envs.racing.physics.state import CarState
 from coachable.envs.racing.physics.tyres import tangent
 from coachable.envs.racing.race.run import Field, Run, TyreView, look_around, tyre_view
 
-_PREVIEW = (5.0, 0.4)  # [m] and [s], distance at which it aims
+_PREVIEW = (5.0, 0.4)  # [m] and [s], constant and speed-dependent part of the distance to the point of aim
 _LAG = 0.1  # [s], until a steering command is carried out
-_YAW_TIME = 0.3  # [s], in which it corrects its yaw rate
-_FRONT_MAX = 0.97  # of the front tyres' grip that it steers for
-_PEDAL_TIME = 0.4  # [s], in which it corrects its speed
-_REACTION = 0.1  # [s], looked ahead in the speed profile: one control step
+_YAW_TIME = 0.3  # [s], in which the steering corrects the yaw rate
+_FRONT_MAX = 0.97  # largest share of the front tyres' grip that the steering uses
+_PEDAL_TIME = 0.4  # [s], in which the pedals correct the speed
+_REACTION = 0.1  # [s], preview in the speed profile: one control step
 _GAP_TIME = 0.35  # [s], to a car ahead in the same lane
-_BRAKING = 0.75  # of the friction: with fixed brake shares the rear wheels lock first
-_LANE = 2.2  # [m]
-_LOST_SPEED = 14.0  # [m/s], off the road or across it
+_BRAKING = 0.75  # share of the friction that braking uses, because the rear wheels lock first
+_LANE = 2.2  # [m], lateral distance below which two cars are in the same lane
+_LOST_SPEED = 14.0  # [m/s], largest speed off the road or across it
 
 
 class LineFollower:
-    """Aims at a point ahead on its line and keeps to a speed profile; slows down behind others.
+    """Scripted driver that aims at a point ahead on a line, follows a speed profile, and slows down behind other cars.
 
-    It asks of the front tyres the slip angle that the wanted lateral force needs, counted from the direction in which
-    the front axle moves: that steers into slides by itself. Pedals follow the accelerations of the profile, as far as
-    the tyres' combined slip allows. It feels the grip of its tyres, and slows down where there is less than the profile
-    counts on.
+    It steers for the slip angle at which the front tyres give the lateral force that the path needs. The angle is
+    relative to the direction in which the front axle moves, which steers into slides. The pedals follow the
+    accelerations of the profile, as far as the tyres' combined slip allows. The driver slows down if the tyres have
+    less grip than the profile assumes.
 
     Args:
-        track: circuit.
-        car: parameters, numbers.
-        grip: share of the tyres' grip that the profile uses.
-        line: (n,) offset of its line from the centre line at each node [m]; default 0.
-        lanes: offsets [m] from that line that successive cars of a race take, so that they do not queue up.
+        track: Circuit.
+        car: Parameters of one car, as numbers.
+        grip: Share of the tyres' grip that the profile uses.
+        line: Offsets (n,) of the line from the centre line at each node, 0 by default [m].
+        lanes: Offsets from that line that successive cars of a race take, so that they do not queue up [m].
+
+    Raises:
+        ValueError: If `grip` is not in (0, 1.2].
 
     Example:
         >>> from coachable.envs.racing import RacingEnv
@@ -62,7 +65,7 @@ class LineFollower:
         lanes: tuple[float, ...] = (0.0,),
     ) -> None:
         if not 0.0 < grip <= 1.2:
-            raise ValueError(f"grip is {grip}: expected a share of the tyres' grip, such as 0.9")
+            raise ValueError(f"grip is {grip}: expected a share of the tyres' grip above 0 and up to 1.2, such as 0.9")
         curvature, spacing = line_geometry(track, line)
         self.line = torch.as_tensor(np.zeros(len(track.table)) if line is None else line, dtype=torch.float32)
         envelope = Envelope(car, grip=grip, braking=_BRAKING)
@@ -71,7 +74,7 @@ class LineFollower:
         self.speeds = torch.as_tensor(profile, dtype=torch.float32)
         self.gains = torch.as_tensor(gain, dtype=torch.float32)  # acceleration that engine or brakes must provide
         self.car, self.lanes = car, lanes
-        # How far the tyre curve of `slip_curve` is inverted: force share sin(C atan(B ρ)), ρ = tan α / tan α_p.
+        # `_steer` inverts the force share sin(C atan(B ρ)) of `slip_curve` with ρ = tan α / tan α_p.
         self._stiffness = math.tan(math.pi / 2 / car.shape)
         self._peak = tangent(car.peak_slip_angle)
 
@@ -79,9 +82,9 @@ class LineFollower:
         """Return actions (M, 2) for the last M cars of a field.
 
         Args:
-            field: whose cars it drives.
-            observation: (M, D), not used: it looks at the state.
-            share: of its grip that each car of the field uses, (N,).
+            field: All cars.
+            observation: Observations (M, D), of which only the number M is used.
+            share: Share of `grip` that each car of the field uses, (N,) or one number.
         """
         m = len(observation)
         if self.speeds.device != observation.device:
@@ -95,7 +98,7 @@ class LineFollower:
         return torch.stack([steer, pedal], dim=-1)[len(speed) - m :]
 
     def _steer(self, field: Field, state: CarState, run: Run, tyres: TyreView, speed: Tensor) -> Tensor:
-        """Steering in [-1, 1] towards a point ahead on the line."""
+        """Return the steering command in [-1, 1] towards a point ahead on the line."""
         car, course = self.car, field.course
         number = torch.arange(len(speed), device=speed.device) // field.races
         lanes = torch.tensor(self.lanes, device=speed.device)[number % len(self.lanes)]
@@ -123,7 +126,7 @@ class LineFollower:
     def _pedal(
         self, field: Field, state: CarState, run: Run, tyres: TyreView, speed: Tensor, share: Tensor | float
     ) -> Tensor:
-        """Throttle (positive) or brake (negative) in [-1, 1]."""
+        """Return throttle (positive) or brake (negative) in [-1, 1]."""
         car = self.car
         node = field.course.node(run.s + _REACTION * speed)
         expected = car.grip + car.grip_per_load * 1e-3 * (tyres.load.mean(0) - car.reference_load)
@@ -143,7 +146,7 @@ class LineFollower:
 
     @staticmethod
     def _behind(field: Field, run: Run, speed: Tensor) -> Tensor:
-        """Speed that keeps the time gap to the next car in the same lane."""
+        """Return the speed that keeps the time gap to the next car in the same lane [m/s]."""
         split = (field.cars, field.races)
         others = look_around(run.s.reshape(split), run.offset.reshape(split), field.group, field.course.length)
         in_lane = (others.gap > 0.0) & (others.aside.abs() < _LANE)
@@ -155,7 +158,15 @@ class LineFollower:
 
 
 def line_geometry(track: Track, line: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Curvature (n,) of a line beside the centre line, and the distances (n,) between its points [m]."""
+    """Return the curvature of a line beside the centre line, and the distances between its points.
+
+    Args:
+        track: Circuit.
+        line: Offsets (n,) from the centre line at each node [m], or None for the centre line itself.
+
+    Returns:
+        Curvature (n,) [1/m], and the distance (n,) from each point to the next [m].
+    """
     table = track.table.numpy()
     if line is None:
         return table[:, 4], np.full(len(table), track.spacing)

@@ -1,4 +1,4 @@
-"""Style features of racing: slip, metres gained, wear, fuel, and gaps to other cars."""
+"""Style features of racing, which are slip, metres gained, wear, fuel, and gaps to other cars."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DRIFT_SPEED_MIN = 5.0  # [m/s], below which slip counts as none
 
 
 def style_features_size(cars: int) -> int:
-    """Columns of `style_features` in races of so many cars."""
+    """Return the number of columns of `style_features` in races of `cars` cars."""
     return GAPS + len(GAP_COLUMNS) * (cars - 1)
 
 
@@ -29,16 +29,16 @@ def anyone_near(features: Tensor) -> Tensor:
 
 
 def anyone_beside(features: Tensor, *, within: float) -> Tensor:
-    """Return whether an opponent overlaps lengthwise and is less than so many metres away sideways, (...) bool."""
+    """Return whether an opponent overlaps lengthwise and is less than `within` metres away sideways, (...) bool."""
     long, lat, near = gap_columns(features)
     return ((near > 0.0) & (long == 0.0) & (lat < within)).any(-1)
 
 
 def gap_columns(features: Tensor) -> tuple[Tensor, ...]:
-    """Longitudinal gaps, lateral gaps [m] and near flags of all opponents, (..., A - 1) each."""
+    """Return longitudinal gaps [m], lateral gaps [m] and near flags of all opponents, (..., A - 1) each."""
     return tuple(features[..., GAPS + column :: len(GAP_COLUMNS)] for column in range(len(GAP_COLUMNS)))
 
 
 def pack_style_features(drift: Sequence[Tensor], resources: Sequence[Tensor], gaps: Sequence[Tensor]) -> Tensor:
-    """Columns in the order above, (N, F), from tensors (N,)."""
+    """Stack tensors (N,) to the columns of `style_features`, (N, F)."""
     return torch.stack([*drift, *resources, *gaps], dim=-1)

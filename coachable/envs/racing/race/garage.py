@@ -1,4 +1,4 @@
-"""Which car each race drives."""
+"""`Garage`, which assigns a car model to each race."""
 
 from __future__ import annotations
 
@@ -15,16 +15,19 @@ _BASE, _RATE = 0.1, 0.05  # of the adaptive sampling: p in proportion to 0.1 + m
 
 
 class Garage:
-    """One shipped car for everybody, or a pool from which each race draws one model for all of its cars.
+    """One shipped car for all races, or a pool from which each race draws one model for all of its cars.
 
-    Cars that spin are drawn more often: p in proportion to 0.1 + EMA(spins per car and episode) (our choice, for the
-    paper's adaptive sampling).
+    Models that spin are drawn more often, with p proportional to 0.1 + EMA(spins per car and episode) (our choice, for
+    the paper's adaptive sampling).
 
     Args:
-        name: of a shipped car, or "pool".
-        cars: A.
-        races: B.
-        device: where.
+        name: Name of a shipped car, or "pool".
+        cars: Number A of cars in a race.
+        races: Number B of races.
+        device: Device of the parameters.
+
+    Raises:
+        ValueError: If there is no such car.
     """
 
     def __init__(self, name: str, cars: int, races: int, device: torch.device) -> None:
@@ -39,12 +42,19 @@ class Garage:
             self._assemble()
 
     def reset(self, seed: int) -> None:
-        """Forget which cars spin."""
+        """Forget how often the models have spun."""
         if self.pooled:
             self.spinning.zero_()
 
     def draw(self, races: Tensor, seeds: Tensor, episode: Tensor, spins: Tensor) -> None:
-        """New models for the races (B,) bool, after noting how often (A · B,) their old ones spun."""
+        """Draw new models, after updating how often the old ones spin.
+
+        Args:
+            races: Whether each race draws a model, (B,) bool.
+            seeds: Seed of each race (B,) int64.
+            episode: Number of episodes that each race has started (B,) int64.
+            spins: Number of spins of each car in the episode that ends (A * B,).
+        """
         mean = spins.reshape(self.cars, -1).mean(0)
         ended = races & (episode > 1)
         total = torch.zeros_like(self.spinning).index_add_(0, self.model, torch.where(ended, mean, 0.0))
@@ -58,7 +68,7 @@ class Garage:
         self._assemble()
 
     def state(self) -> dict[str, Any]:
-        """Tensors for exact resumption."""
+        """Return the tensors for exact resumption."""
         return {"spinning": self.spinning.clone(), "model": self.model.clone()} if self.pooled else {}
 
     def load_state(self, state: dict[str, Any]) -> None:

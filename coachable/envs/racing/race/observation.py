@@ -1,4 +1,4 @@
-"""What a driver sees, scaled by known ranges."""
+"""Observations of a driver, scaled by known ranges."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from coachable.envs.racing.race.run import Others, Run, TyreView
 
 COURSE_POINTS = 20
 COURSE_TIME = 6.0  # [s] of travel that the course points cover
-_COURSE_SPEED_MIN = 10.0  # [m/s], so that a slow car sees further than its bonnet
+_COURSE_SPEED_MIN = 10.0  # [m/s], so that the course points of a slow car are not all beside it
 OPPONENTS = 4
 _OPPONENT_GROUPS = (("opponents", 8 * OPPONENTS), ("slipstream", 1))
 OPPONENT_COLUMNS = sum(width for _, width in _OPPONENT_GROUPS)
@@ -25,7 +25,13 @@ _SEEN = 150.0  # [m]
 
 
 def observation_groups(opponents: bool, pool: bool, course_points: int = COURSE_POINTS) -> tuple[tuple[str, int], ...]:
-    """Name and width of each block, in order. What drivers see of opponents comes last."""
+    """Return name and width of each block of the observation, in order; those of opponents come last.
+
+    Args:
+        opponents: Whether drivers see opponents.
+        pool: Whether cars differ.
+        course_points: Number of points of each edge of the track.
+    """
     groups = [
         ("motion", 5),
         ("tyre_load", 4),
@@ -50,10 +56,13 @@ def observation_groups(opponents: bool, pool: bool, course_points: int = COURSE_
 
 
 def own_columns(name: str) -> slice:
-    """Where a block up to the compound is, which is the same in every race.
+    """Return the columns of a block; those of all blocks up to the compound are the same in every race.
+
+    Args:
+        name: Name of a block in `observation_groups`.
 
     Raises:
-        KeyError: if there is no such block.
+        KeyError: If there is no such block.
     """
     first = 0
     for block, width in observation_groups(False, pool=False):
@@ -64,7 +73,16 @@ def own_columns(name: str) -> slice:
 
 
 def own_car(car: Car, wheels: WheelSet, packed: Tensor, run: Run, tyres: TyreView, length: float) -> list[Tensor]:
-    """Columns of the car itself, up to the fuel."""
+    """Return the columns (N,) of the car itself, up to the fuel.
+
+    Args:
+        car: Parameters.
+        wheels: Wheels of that car.
+        packed: State (29, N).
+        run: Task state.
+        tyres: Loads, slip and grip in that state.
+        length: Length of the track [m].
+    """
     s = CarState(*packed.unbind(0))
     share = car.drive_share_front
     spins = packed[SPINS]
@@ -105,9 +123,18 @@ def car_columns(car: Car) -> Tensor:
 
 
 def course_ahead(course: Course, packed: Tensor, run: Run, points: int) -> Tensor:
-    """Left and right edge of the track ahead in the car's frame, (N, 4 points) [100 m].
+    """Return the left and right edge of the track ahead in the car's frame.
 
     Points are spaced evenly in time, up to six seconds at the present speed.
+
+    Args:
+        course: Track.
+        packed: State (29, N).
+        run: Task state.
+        points: Number of points of each edge.
+
+    Returns:
+        Coordinates (N, 4 * points) [100 m].
     """
     s = CarState(*packed.unbind(0))
     speed = torch.clamp(torch.sqrt(s.vx * s.vx + s.vy * s.vy), min=_COURSE_SPEED_MIN)
@@ -131,12 +158,20 @@ def course_ahead(course: Course, packed: Tensor, run: Run, points: int) -> Tenso
 
 
 def _squeezed(distance: Tensor) -> Tensor:
-    """Scale a distance [m] to about 1 at 50 m, such that half a metre between cars side by side stays visible."""
+    """Scale a distance [m] to about 1 at 50 m, with a higher resolution for cars that are close."""
     return torch.asinh(distance * 0.5) * 0.25
 
 
 def opponents_seen(bodies: Bodies, others: Others) -> Tensor:
-    """The four nearest others by signed gap, (N, 32): place, velocity, heading, gap, mask, each in the ego frame."""
+    """Return the four nearest other cars in the order of their gaps, (N, 32).
+
+    Each has eight columns in the frame of the observing car: position, velocity, sine and cosine of the heading, gap
+    and mask. Columns without a car are 0.
+
+    Args:
+        bodies: Cars (A, B).
+        others: Their positions relative to each other.
+    """
     cars = bodies.x.shape[0]
     blocks = []
     for k in range(1, cars):

@@ -1,4 +1,4 @@
-"""The task between two control steps: inputs of the cars, verdict, observation. Pure functions that can be compiled."""
+"""`Referee`, pure functions for the inputs, rewards and observations of a control step, which can be compiled."""
 
 from __future__ import annotations
 
@@ -73,14 +73,14 @@ class Referee:
     """The task of B races of A cars on a course.
 
     Attributes:
-        course: track.
-        weights: of the task reward.
-        cars: A.
-        course_points: points of each edge that a driver sees.
-        substeps: of a control step.
-        pool: whether cars differ, so that drivers are told which they have.
-        opponents: whether drivers see opponents.
-        wrong_way_time: of going backwards that ends an episode [s].
+        course: Track.
+        weights: Weights of the task reward.
+        cars: Number A of cars in a race.
+        substeps: Number of substeps of a control step.
+        course_points: Number of points of each edge of the track in the observation.
+        pool: Whether cars differ, in which case the observation describes the car.
+        opponents: Whether the observation has columns for opponents.
+        wrong_way_time: Time of driving backwards that ends an episode [s].
     """
 
     course: Course
@@ -96,10 +96,13 @@ class Referee:
         """Return the state and the inputs of the next control step.
 
         Args:
-            packed: (29, N).
-            packed_run: (25, N).
-            action: (N, 2): steer in [-1, 1], throttle (positive) or brake (negative).
-            compound: (11, N): factors of grip and wear, then the compound's one-hot.
+            packed: State (29, N).
+            packed_run: Task state (25, N).
+            action: Steering in [-1, 1] and throttle (positive) or brake (negative), (N, 2).
+            compound: Factors of grip and wear, then the compound as one-hot, (11, N).
+
+        Returns:
+            The state (29, N) with its timers at 0, and the inputs (15, N).
         """
         run = Run(*packed_run.unbind(0))
         steer, pedal = action[:, 0], action[:, 1]
@@ -128,18 +131,18 @@ class Referee:
         group: Tensor | None = None,
         impact: Tensor | None = None,
     ) -> Verdict:
-        """Return the verdict on a control step.
+        """Compute the result of a control step.
 
         Args:
-            old: (29, N) state before it.
-            new: (29, N) state after it.
-            packed_run: (25, N) before it.
-            action: (N, 2).
-            compound: (11, N).
-            car: parameters.
-            wheels: of that car.
-            group: (A, B), for several cars.
-            impact: (A // 2, A, B), likewise.
+            old: State (29, N) before the step.
+            new: State (29, N) after the step.
+            packed_run: Task state (25, N) before the step.
+            action: Actions (N, 2).
+            compound: Factors of grip and wear, then the compound as one-hot, (11, N).
+            car: Parameters.
+            wheels: Wheels of that car.
+            group: Groups (A, B), if there are several cars in a race.
+            impact: Largest squared relative speed of each pair's contacts (A // 2, A, B) [m²/s²], if there are several.
         """
         broken = ~torch.isfinite(new.sum(0))
         new = torch.where(broken, old, new)
@@ -205,7 +208,7 @@ class Referee:
         wheels: WheelSet,
         group: Tensor | None = None,
     ) -> Tensor:
-        """Observations (N, D)."""
+        """Return the observations (N, D); the arguments are those of `judge`."""
         run = Run(*packed_run.unbind(0))
         tyres = tyre_view(car, wheels, packed, compound[0])
         parts = [torch.stack(own_car(car, wheels, packed, run, tyres, self.course.length), dim=-1), compound[2:].T]
@@ -221,7 +224,15 @@ class Referee:
         return torch.cat(parts, dim=1)
 
     def begin(self, packed: Tensor, s: Tensor, distance: Tensor, car: Car, group: Tensor | None) -> Tensor:
-        """Task state (25, N) of cars that have just been placed at s (N,)."""
+        """Return the task state (25, N) of cars that have just been placed on the track.
+
+        Args:
+            packed: State (29, N).
+            s: Estimates (N,) of the distance along the track, within a few dozen metres [m].
+            distance: Distance (N,) that counts as covered at the start [m].
+            car: Parameters.
+            group: Groups (A, B), if there are several cars in a race.
+        """
         state = CarState(*packed.unbind(0))
         place, arc, frame = self.course.project(state.x, state.y, s)
         cos, sin = torch.cos(state.yaw), torch.sin(state.yaw)

@@ -1,4 +1,4 @@
-"""Stranded cars are put back on the track, as games do in a race."""
+"""Functions that put stranded cars back on the track, as racing games do."""
 
 from __future__ import annotations
 
@@ -12,17 +12,20 @@ from coachable.envs.racing.race.run import Run, look_around, others_of
 from coachable.envs.racing.race.scenarios import rolling_cars
 
 RESCUE_SPEED = 15.0  # [m/s]
-_CLEAR_BEHIND, _CLEAR_AHEAD = 60.0, 15.0  # [m], nobody may be there
+_CLEAR_BEHIND, _CLEAR_AHEAD = 60.0, 15.0  # [m], stretch without other cars
 
 
 def way_clear(course: Course, run: Run, stranded: Tensor, group: Tensor) -> Tensor:
-    """Return whether the track near a car is clear, (N,) bool; the first of several stranded cars has priority.
+    """Return whether the track near each car is clear; the first of several stranded cars has priority.
 
     Args:
-        course: track.
-        run: task state of N = A B cars.
-        stranded: (N,) bool.
-        group: (A, B).
+        course: Track.
+        run: Task state of N = A * B cars.
+        stranded: Whether each car is stranded, (N,) bool.
+        group: Groups (A, B) of cars that meet.
+
+    Returns:
+        Flags (N,) bool.
     """
     cars = group.shape[0]
     if cars == 1:
@@ -35,13 +38,16 @@ def way_clear(course: Course, run: Run, stranded: Tensor, group: Tensor) -> Tens
 
 
 def back_on_track(course: Course, car: Car, packed: Tensor, run: Run) -> Tensor:
-    """State (29, N) of cars that roll along the centre line where they were, with the tyres and the fuel they had.
+    """Return the state of cars that roll along the centre line beside their old places, with the same tyres and fuel.
 
     Args:
-        course: track.
-        car: parameters.
-        packed: (29, N).
-        run: task state of the N cars.
+        course: Track.
+        car: Parameters.
+        packed: State (29, N).
+        run: Task state of the N cars.
+
+    Returns:
+        The new state (29, N).
     """
     nothing = torch.zeros_like(run.s)
     state = rolling_cars(course, car, run.s, nothing, nothing, nothing + RESCUE_SPEED)

@@ -1,4 +1,4 @@
-"""`Rivals`: whom the agent races against, scripted drivers and copies of its own past."""
+"""`Rivals`, a mixture of scripted opponents and past copies of the agent's policy."""
 
 from __future__ import annotations
 
@@ -19,21 +19,22 @@ _STREAM = 7919  # keeps the draws apart from those of the starts
 
 
 class Rivals:
-    """Drives each car either by script, at a share of the grip that is its own, or as the policy drove some time ago.
+    """Driver that controls each car either by script, with a random share of the grip, or by a past copy of the policy.
 
-    Who is who is drawn at the start of each race, and so is the style of the copies. Without a policy to follow, all
-    are scripted.
+    The driver of each car and the style of the copies are drawn at the start of each race. Without a policy to follow,
+    all cars are scripted.
 
     Args:
-        driver: the scripted driver.
-        styles: lowest and highest value of each entry of theta, (d,) each; copies draw theirs between them.
-        scripted: share of scripted cars.
-        slowest: smallest share of the driver's grip; the largest is 1.
-        keep: number of copies, the newest ones.
-        interval: control steps between copies.
+        driver: Scripted driver.
+        styles: Lowest and highest value of each entry of theta, (d,) each, between which the styles of the copies are
+            drawn.
+        scripted: Share of scripted cars.
+        slowest: Smallest share of the scripted driver's grip; the largest is 1.
+        keep: Number of copies that are kept, the newest ones.
+        interval: Number of control steps between copies.
 
     Raises:
-        ValueError: if a share is not in [0, 1], or `keep` or `interval` below 1.
+        ValueError: If a share is not in [0, 1], or if `keep` or `interval` is less than 1.
     """
 
     def __init__(
@@ -47,7 +48,7 @@ class Rivals:
         interval: int = 2000,
     ) -> None:
         if not 0.0 <= scripted <= 1.0 or not 0.0 < slowest <= 1.0:
-            raise ValueError(f"scripted is {scripted} and slowest {slowest}: expected shares of the cars and of grip")
+            raise ValueError(f"scripted is {scripted} and slowest is {slowest}: expected 0 to 1, and more than 0 to 1")
         if keep < 1 or interval < 1:
             raise ValueError(f"keep is {keep} and interval {interval}: expected at least one copy and one step")
         self.driver, self.styles, self.scripted, self.slowest, self.interval = (
@@ -62,14 +63,18 @@ class Rivals:
         self._steps = 0
 
     def follow(self, policy: nn.Module) -> None:
-        """Takes copies of this policy from now on; it reads `observation` and `style` and writes `action`."""
+        """Copy this policy from now on.
+
+        Args:
+            policy: Module that reads `observation` and `style` and writes `action`.
+        """
         self.policy = policy
 
     @torch.no_grad()
     def __call__(self, field: Field, observation: Tensor) -> Tensor:
         """Return actions (M, 2) for the last M cars of a field."""
         m = len(observation)
-        # Of each car: whether it is scripted, its share of the grip, which copy it is.
+        # Uniform numbers of each car that decide whether it is scripted, its share of the grip, and its copy.
         who, grip, which = uniforms(field.seeds + _STREAM, field.episode, 3, field.cars).reshape(3, -1)
         action = self.driver(field, observation, self.slowest + (1.0 - self.slowest) * grip)
         self._copy_if_due()
@@ -85,17 +90,20 @@ class Rivals:
         return action
 
     def state(self) -> dict[str, Any]:
-        """The copies, and when the next one is due."""
+        """Return the copies and the number of steps taken, for exact resumption."""
         return {"steps": self._steps, "copies": [copy.deepcopy(policy.state_dict()) for policy in self.copies]}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Restores `state`.
+        """Restore what `state` returned.
+
+        Args:
+            state: Result of `state`.
 
         Raises:
-            ValueError: if there are copies, but no policy to follow.
+            ValueError: If there are copies, but no policy to follow.
         """
         if state["copies"] and self.policy is None:
-            raise ValueError("the state has copies of a policy: call follow(policy) before")
+            raise ValueError("the state has copies of a policy, but none is followed: call follow(policy) before")
         self._steps = state["steps"]
         self.copies.clear()
         for weights in state["copies"]:
@@ -111,14 +119,14 @@ class Rivals:
             self.copies.append(_frozen(self.policy))
 
     def _styles(self, field: Field) -> Tensor:
-        """A style for each car (N, d), the same throughout a race."""
+        """Draw a style for each car (N, d), which stays the same throughout a race."""
         low, high = self.styles
         u = uniforms(field.seeds + 2 * _STREAM, field.episode, len(low), field.cars).reshape(len(low), -1)
         return (low[:, None] + (high - low)[:, None] * u).T
 
 
 def _frozen(policy: nn.Module | None) -> nn.Module:
-    """A copy that does not learn."""
+    """Return a copy of a policy without gradients."""
     if policy is None:
         raise ValueError("there is no policy to copy: call follow(policy) before")
     return copy.deepcopy(policy).requires_grad_(False)

@@ -1,4 +1,4 @@
-"""What the task remembers of each car beside the physics, and quantities derived from the state."""
+"""State of the task beside that of the physics, and quantities derived from both."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _FAR = 1e4  # [m], gap to a car of another group
 
 
 class Run(NamedTuple):
-    """Task state of N cars, one tensor (N,) each; packed as the rows of one tensor (25, N)."""
+    """Task state of N cars with one tensor (N,) per field, packed as the rows of one tensor (25, N)."""
 
     s: Tensor  # distance along the centre line [m]
     offset: Tensor  # from it, to the left [m]
@@ -52,7 +52,7 @@ class Run(NamedTuple):
 
 
 class Field(NamedTuple):
-    """All cars of an environment as drivers see them: B races of A cars, car k of race b in column k * B + b."""
+    """All cars of an environment, for drivers: B races of A cars, in which column k * B + b is car k of race b."""
 
     state: Tensor  # (STATE_ROWS, A * B), packed `CarState`
     run: Tensor  # (RUN_ROWS, A * B), packed `Run`
@@ -66,12 +66,12 @@ class Field(NamedTuple):
 
     @property
     def cars(self) -> int:
-        """A, in each race."""
+        """Number A of cars in each race."""
         return self.group.shape[0]
 
     @property
     def races(self) -> int:
-        """B."""
+        """Number B of races."""
         return self.group.shape[1]
 
 
@@ -80,7 +80,7 @@ FRAME = slice(Run._fields.index("node_x"), RUN_ROWS)
 
 
 class TyreView(NamedTuple):
-    """Slip and grip of each wheel, (4, N)."""
+    """Loads, slip and grip of the wheels, (4, N) each."""
 
     load: Tensor  # [N]
     ratio: Tensor  # slip ratio
@@ -90,7 +90,14 @@ class TyreView(NamedTuple):
 
 
 def tyre_view(car: Car, wheels: WheelSet, packed: Tensor, compound_grip: Tensor) -> TyreView:
-    """Slip and grip of the tyres in a state (29, N)."""
+    """Return loads, slip and grip of the tyres.
+
+    Args:
+        car: Parameters.
+        wheels: Wheels of that car.
+        packed: State (29, N).
+        compound_grip: Grip factor of the compound (N,).
+    """
     s = CarState(*packed.unbind(0))
     load = wheel_loads(car, wheels, s)
     cos, sin = steering(wheels, s.steer)
@@ -106,12 +113,12 @@ def tyre_view(car: Car, wheels: WheelSet, packed: Tensor, compound_grip: Tensor)
 
 
 def wrap(distance: Tensor, length: float) -> Tensor:
-    """Signed distance on a loop, in [-length / 2, length / 2)."""
+    """Return signed distances on a loop of the given length, in [-length / 2, length / 2) [m]."""
     return torch.remainder(distance + 0.5 * length, length) - 0.5 * length
 
 
 class Others(NamedTuple):
-    """The other cars of each car, (A - 1, A, B), in the order of their places in the race."""
+    """Positions of the other cars relative to each car, (A - 1, A, B) each; entry k - 1 is of the k-th next car."""
 
     gap: Tensor  # distance along the track from this car to the other, positive ahead [m]
     aside: Tensor  # offset of the other less this one's [m]
@@ -119,12 +126,19 @@ class Others(NamedTuple):
 
 
 def others_of(values: Tensor) -> Tensor:
-    """Values (A, B) of the other cars, (A - 1, A, B): entry k - 1 is that of the k-th next car."""
+    """Return the values (A, B) of the other cars as (A - 1, A, B); entry k - 1 is that of the k-th next car."""
     return torch.stack([values.roll(-k, 0) for k in range(1, values.shape[0])])
 
 
 def look_around(s: Tensor, offset: Tensor, group: Tensor, length: float) -> Others:
-    """Where the others are, from s, offset and group (A, B)."""
+    """Return the positions of the other cars relative to each car.
+
+    Args:
+        s: Distances (A, B) along the track [m].
+        offset: Offsets (A, B) from the centre line [m].
+        group: Groups (A, B) of cars that meet.
+        length: Length of the track [m].
+    """
     gap = wrap(others_of(s) - s, length)
     met = others_of(group) == group
     return Others(torch.where(met, gap, _FAR), others_of(offset) - offset, met)

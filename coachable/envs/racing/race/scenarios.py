@@ -1,4 +1,4 @@
-"""How episodes start: who races whom, where, how fast, on which tyres and with how much fuel."""
+"""Starts of episodes: opponents, positions, speeds, tyres and fuel."""
 
 from __future__ import annotations
 
@@ -30,16 +30,19 @@ _SHARES_ALONE = {"solo": 0.8, "recovery": 0.2}
 
 @dataclass(frozen=True)
 class Scenario:
-    """One way to start an episode.
+    """One kind of start of an episode.
 
     Attributes:
-        name: also of its replay table.
-        share: of the episodes.
-        start: "solo" (anywhere, alone), "field" (cars one behind the other), "rolling" (two columns before the line),
-            "slipstream" (one behind the other, close, on the longest straight), "passing" (there too, but spread across
-            the track and some up to a fifth faster than others), "recovery" (off course, spun, slow) or "launch" (any
-            heading and up to 60 m/s, every second time an ordinary start).
-        group: cars that see and touch each other; cars of different groups share the road without meeting.
+        name: Name of the scenario and of its replay table.
+        share: Share of the episodes.
+        start: Positions and speeds: "solo" (anywhere, alone), "field" (cars in a line), "rolling" (two columns before
+            the starting line), "slipstream" (close together in a line, on the longest straight), "passing" (there too,
+            but spread across the track and some up to a fifth faster than others), "recovery" (off course, spun, slow)
+            or "launch" (any heading and up to 60 m/s; every second start is an ordinary one).
+        group: Number of cars that see and touch each other. Cars of different groups share the road without meeting.
+
+    Raises:
+        ValueError: If there is no such start.
     """
 
     name: str
@@ -53,7 +56,10 @@ class Scenario:
 
 
 def drift_scenarios() -> tuple[Scenario, ...]:
-    """Launches at random positions, speeds and orientations (paper); half of the starts are ordinary (our choice)."""
+    """Return launches at random positions, speeds and orientations (paper).
+
+    Half of the starts are ordinary (our choice).
+    """
     return (Scenario("launch", 1.0, "launch"),)
 
 
@@ -61,11 +67,11 @@ def race_scenarios(cars: int, shares: Mapping[str, float] | None = None) -> tupl
     """Return the kinds of starts that a training mixes (paper, Appendix C: scenarios of Gran Turismo).
 
     Args:
-        cars: of a race.
-        shares: of each kind of start, by its name; by default `_SHARES`, and with one car those without opponents.
+        cars: Number of cars in a race.
+        shares: Share of each kind of start, by its name; by default `_SHARES`, or for one car `_SHARES_ALONE`.
 
     Raises:
-        ValueError: if there is no such kind.
+        ValueError: If there is no such kind.
     """
     if shares is None:
         shares = _SHARES if cars > 1 else _SHARES_ALONE
@@ -90,13 +96,13 @@ def rolling_start(cars: int) -> tuple[Scenario, ...]:
 
 @dataclass(frozen=True)
 class Conditions:
-    """Tyres and fuel at the start.
+    """Conditions of tyres and fuel at the start.
 
     Attributes:
-        wear: whether tyres start worn: X ~ U(0, 0.75), each tyre N(X, 0.05) clipped (paper).
-        fuel: litres, or None for U(10, 100) (paper).
-        heat: °C of the tyres, or None for U(30, 130).
-        compounds: indices into `COMPOUNDS`, drawn uniformly.
+        wear: Whether tyres start worn, with X ~ U(0, 0.75) and each tyre from N(X, 0.05), clipped (paper).
+        fuel: Fuel, or None for U(10, 100) (paper) [l].
+        heat: Temperature of the tyres, or None for U(30, 130) [°C].
+        compounds: Indices into `COMPOUNDS`, of which one is drawn uniformly per race.
     """
 
     wear: bool = False
@@ -117,7 +123,7 @@ class Conditions:
 
 @dataclass(frozen=True)
 class Starts:
-    """Start of every race, (A, B) or (…, A, B)."""
+    """Starts of B races of A cars, (A, B) or (…, A, B)."""
 
     state: Tensor  # (29, A, B)
     s: Tensor  # [m]
@@ -128,14 +134,17 @@ class Starts:
 
 
 class Starter:
-    """Draws starts on one course.
+    """Sampler of starts on one course.
 
     Args:
-        course: track.
-        scenarios: mixture.
-        conditions: tyres and fuel.
-        speeds: (n,) sensible speed at each node [m/s].
-        cars: A.
+        course: Track.
+        scenarios: Mixture of scenarios.
+        conditions: Tyres and fuel.
+        speeds: Sensible speed at each node (n,) [m/s].
+        cars: Number A of cars in a race.
+
+    Raises:
+        ValueError: If there are more cars than grid slots, or if the shares do not add up to 1.
     """
 
     def __init__(
@@ -157,9 +166,15 @@ class Starter:
         self._straight = _longest_straight(course)
 
     def draw(self, seed: Tensor, episode: Tensor, car: Car) -> Starts:
-        """Draw the starts of all races from their seeds (B,) and episode numbers (B,)."""
+        """Draw the starts of all races.
+
+        Args:
+            seed: Seed of each race (B,) int64.
+            episode: Number of episodes that each race has started (B,) int64.
+            car: Parameters.
+        """
         u = uniforms(seed, episode, _DRAWS, self.cars)
-        first = u[:, 0]  # (rows, B), what cars of a race share
+        first = u[:, 0]  # (rows, B), numbers that the cars of a race share
         scenario = torch.bucketize(first[0], self._bounds, right=True)
         kind, size = self._start[scenario], self._group[scenario]
         # Cars in a random order, so that no row always starts in front.
@@ -212,7 +227,7 @@ class Starter:
         return Starts(state, s, distance, group, compound.expand_as(order).contiguous(), scenario)
 
     def _state(self, car: Car, s: Tensor, offset: Tensor, yaw_error: Tensor, speed: Tensor, u: Tensor) -> Tensor:
-        """Packed state (29, A, B): rolling wheels, a fitting gear, tyres and fuel as the conditions ask."""
+        """Return the state (29, A, B) of rolling cars with tyres and fuel drawn from the conditions."""
         state = rolling_cars(self.course, car, s, offset, yaw_error, speed)
         conditions = self.conditions
         low, high = _HEAT
@@ -234,15 +249,18 @@ class Starter:
 
 
 def rolling_cars(course: Course, car: Car, s: Tensor, offset: Tensor, yaw_error: Tensor, speed: Tensor) -> Tensor:
-    """Packed state (29, ...) of cars that roll freely, in a fitting gear, without heat, wear and fuel.
+    """Return the state of cars that roll freely in a suitable gear, with heat, wear and fuel at 0.
 
     Args:
-        course: track.
-        car: parameters.
-        s: distance along the track [m]; likewise the following, all of one shape.
-        offset: from the centre line [m].
-        yaw_error: heading relative to the track [rad].
-        speed: [m/s].
+        course: Track.
+        car: Parameters.
+        s: Distance along the track (...) [m].
+        offset: Offset from the centre line to the left (...) [m].
+        yaw_error: Heading relative to the track (...) [rad].
+        speed: Speed (...) [m/s].
+
+    Returns:
+        State (29, ...).
     """
     state = torch.zeros(STATE_ROWS, *s.shape, dtype=course.table.dtype, device=s.device)
     x, y, direction = course.place(s, offset)
@@ -255,7 +273,7 @@ def rolling_cars(course: Course, car: Car, s: Tensor, offset: Tensor, yaw_error:
 
 
 def _longest_straight(course: Course) -> tuple[float, float]:
-    """Start and length of the longest stretch with hardly any curvature [m]."""
+    """Return start and length of the longest stretch with hardly any curvature [m]."""
     straight = (course.table[:, 4].abs() < 1e-3).tolist()
     best, start, run = (0, 0), 0, 0
     for index, flag in enumerate(straight * 2):

@@ -22,21 +22,22 @@ class TaskWeights:
     """Weights of the task reward: those of GT Sophy at Lago Maggiore (Wurman et al. 2022, supplement).
 
     Attributes:
-        progress: per metre along the track, 0 while off course.
-        off_course: per second with three wheels off the track, times the squared speed in km/h.
-        wall: per second against a wall, times the squared speed in km/h.
-        tyre_slip: of Σ min(|slip ratio|, 1) |slip angle|.
-        passing: per metre gained on cars near.
-        contact: of any contact.
-        rear_end: of contact with a car ahead, times the squared relative speed.
-        stranded: once, when a car that stands, goes backwards or is outside the walls ends its episode (our choice:
-            without it drivers learn to park beside the track for good, as that costs nothing).
-        steering_change: of the squared change of the steering command (our choice, after Lee et al. 2025). Wheels turn
-            at a limited rate, so that commands from lock to lock and back steer as well as steady ones: drivers that
-            pay nothing get stuck in that habit, which scrubs the tyres.
-        tyre_heat: per mean share of grip that tyres lose by being too hot, charged as they heat up and paid back as
-            they cool down (our choice: 0 but in the tyre and fuel family). Undiscounted it would change nothing; but
-            heat takes a minute to go, and what a slide costs by then is beyond the discount.
+        progress: Reward per metre along the track; there is none while the car is off course.
+        off_course: Penalty per second with three wheels off the track, times the squared speed in km/h.
+        wall: Penalty per second against a wall, times the squared speed in km/h.
+        tyre_slip: Penalty on Σ min(|slip ratio|, 1) |slip angle|.
+        passing: Reward per metre gained on cars nearby.
+        contact: Penalty of any contact.
+        rear_end: Penalty of contact with a car ahead, times the squared relative speed.
+        stranded: Penalty when a car that stands, drives backwards or is outside the walls ends its episode (our
+            choice). Without it, policies learn to park beside the track for good, because that costs nothing.
+        steering_change: Penalty on the squared change of the steering command (our choice, after Lee et al. 2025).
+            Wheels turn at a limited rate, so that commands from lock to lock and back steer as well as steady ones.
+            Without the penalty, policies do not unlearn such commands, which wear the tyres.
+        tyre_heat: Penalty on the mean share of grip that tyres lose by being too hot. It is charged as they heat up and
+            paid back as they cool down (our choice; it is 0 except in the tyre and fuel family). Without discounting it
+            would change nothing. Heat takes a minute to dissipate, however, and the time that a slide costs by then is
+            beyond the horizon of the discount.
     """
 
     progress: float = 1.0
@@ -52,7 +53,7 @@ class TaskWeights:
 
 
 class Outcome(NamedTuple):
-    """What happened to each car in a control step, (N,) each."""
+    """Events of each car in a control step, (N,) each."""
 
     progress: Tensor  # [m]
     overtake: Tensor  # metres gained on cars ahead
@@ -64,8 +65,15 @@ class Outcome(NamedTuple):
 def metres_gained(before: Others, after: Others) -> tuple[Tensor, Tensor]:
     """Return the metres gained on cars ahead and on cars behind, (A, B) each.
 
-    A car counts while it is at most 40 m ahead or 20 m behind, before or after the step. It is ahead or behind by where
-    it was before.
+    A car counts while it is at most 40 m ahead or 20 m behind, before or after the step. Its position before the step
+    decides whether it is ahead or behind.
+
+    Args:
+        before: Positions of the other cars before the step.
+        after: Positions of the other cars after the step.
+
+    Returns:
+        Metres gained on cars ahead, and on cars behind, (A, B) each [m].
     """
     gained = before.gap - after.gap
 
@@ -79,7 +87,7 @@ def metres_gained(before: Others, after: Others) -> tuple[Tensor, Tensor]:
 
 
 def impacts_of(impact: Tensor, cars: int) -> Tensor:
-    """Return each car's contacts with the others, (A - 1, A, B), from those of the pairs (A // 2, A, B)."""
+    """Return each car's contacts with the others, (A - 1, A, B), from those of the pairs, (A // 2, A, B) [m²/s²]."""
     rows: list[Tensor] = []
     for k in range(1, cars):
         rows.append(impact[k - 1] if k <= cars // 2 else impact[cars - k - 1].roll(-k, 0))
@@ -87,14 +95,22 @@ def impacts_of(impact: Tensor, cars: int) -> Tensor:
 
 
 def contacts(impact: Tensor, before: Others, cars: int) -> tuple[Tensor, Tensor]:
-    """Return whether a car was touched, and Σ squared relative speed where the other car was ahead, (A, B) each."""
+    """Return whether a car was touched, and Σ squared relative speed of contacts with cars ahead, (A, B) each."""
     each = impacts_of(impact, cars)
     touched = (each > 0.0).any(0).to(impact.dtype)
     return touched, torch.where(before.gap > 0.0, each, 0.0).sum(0)
 
 
 def task_reward(weights: TaskWeights, state: CarState, run: Run, tyres: TyreView, outcome: Outcome) -> Tensor:
-    """Σ weight · term, (N,)."""
+    """Return the task reward Σ weight · term of each car, (N,).
+
+    Args:
+        weights: Weights of the terms.
+        state: State after the step.
+        run: Task state after the step.
+        tyres: Slip after the step.
+        outcome: Events of the step.
+    """
     squared = (_KMH * _KMH) * (state.vx * state.vx + state.vy * state.vy)
     slip = (torch.clamp(tyres.ratio.abs(), max=1.0) * tyres.angle).unbind(0)
     reward = weights.progress * torch.where(run.off > 0.5, 0.0, outcome.progress)
@@ -112,12 +128,12 @@ def style_features(
     """Return the raw quantities of all style terms, (N, F).
 
     Args:
-        old: (29, N) state before the step.
-        new: (29, N) state after it.
-        tyres: after it.
-        outcome: of the step.
-        bodies: (A, B) after it, if there are several cars.
-        group: (A, B), likewise.
+        old: State (29, N) before the step.
+        new: State (29, N) after the step.
+        tyres: Slip after the step.
+        outcome: Events of the step.
+        bodies: Cars (A, B) after the step, if there are several in a race.
+        group: Groups (A, B), if there are several cars in a race.
     """
     state = CarState(*new.unbind(0))
     moving = (state.vx * state.vx + state.vy * state.vy > DRIFT_SPEED_MIN * DRIFT_SPEED_MIN).to(new.dtype)
