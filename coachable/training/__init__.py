@@ -1,4 +1,4 @@
-"""Training: the loop, what it collects with and learns with, checkpoints and metrics."""
+"""Training: the loop, collectors, the learner, checkpoints and metrics."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING
@@ -12,4 +12,4 @@ __all__ = ["Learner"]
 def __getattr__(name: str) -> object:
     if name != "Learner":
         raise AttributeError(f"module 'coachable.training' has no attribute {name!r}; it offers Learner")
-    return import_module("coachable.training.learner").Learner  # most modules do without: it loads TorchRL's losses
+    return import_module("coachable.training.learner").Learner  # lazily, because it imports TorchRL's losses
