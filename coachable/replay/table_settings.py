@@ -26,7 +26,7 @@ def make_regions(capacities: Mapping[str, int], route: Route | None, events: Eve
     stray = [name for name in capacities if name not in (*routed, *fed)]
     if missing or stray:
         raise ValueError(
-            f"table_capacities lacks {missing} and has the unknown {stray}: expected exactly the routed tables "
+            f"table_capacities lacks {missing} and has no use for {stray}: expected exactly the routed tables "
             f"{list(routed)} (route=) and the event tables {list(fed)} (events=)"
         )
     return Regions({name: capacities[name] for name in (*routed, *fed)})

@@ -28,7 +28,7 @@ class TableWriter(Writer):
         events: Event predicate; None without event tables.
         horizon: H_max.
         n_step: n-step assembly; None for one-step transitions.
-        num_envs: Number of environments in a batch; None if the data contains trajectory numbers.
+        num_envs: Number of environments in a batch; None if batches are `(num_envs, time)` or have trajectory numbers.
     """
 
     _storage: LazyTensorStorage  # set when the buffer registers it

@@ -26,10 +26,10 @@ class Copies:
 class WindowHistory:
     """Finder of the at most `horizon` steps up to an event that the event's table does not contain yet.
 
-    The window is the event step and the `horizon - 1` steps before it (tau = H_max - 1 in SSET, Kompella 2023). It ends
-    at the episode's start and at the previous event of the same table, whose window contains the earlier steps. Between
-    batches the history keeps, for every open episode, the slots of the last `horizon - 1` steps and the last step at
-    which each event fired.
+    The window is the event step and the `horizon - 1` steps before it (tau = H_max - 1 in SSET, Kompella 2023). It
+    begins no earlier than the episode, and after the previous event of the same table, whose window contains the steps
+    before. Between batches the history keeps, for every open episode, the slots of the last `horizon - 1` steps and the
+    last step at which each event fired.
 
     Args:
         events: Number of event tables.

@@ -120,7 +120,7 @@ def _rest(**probabilities: float) -> float:
     rest = 1.0 - sum(probabilities.values())
     if rest < -1e-9:
         given = ", ".join(f"{name} {value}" for name, value in probabilities.items())
-        raise ValueError(f"{given} exceed 1 together: expected probabilities with a sum of at most 1")
+        raise ValueError(f"{given} exceed 1 together: expected probabilities that sum to 1 at most")
     return max(rest, 0.0)
 
 

@@ -257,7 +257,7 @@ def check_fits(saved: Mapping[str, Tensor], present: Mapping[str, Tensor], what:
     for name, value in present.items():
         there = saved.get(name, value)
         if not isinstance(there, Tensor) or there.is_floating_point() != value.is_floating_point():
-            problems.append(f"{name} is not a tensor of {value.dtype} in the checkpoint")
+            problems.append(f"{name} is no tensor of {value.dtype} in the checkpoint")
         elif there.shape != value.shape:
             problems.append(f"{name} is {tuple(there.shape)} in the checkpoint, {tuple(value.shape)} here")
     if problems:
@@ -298,10 +298,7 @@ def check_writable(directory: Path | str, required_bytes: int = 0) -> None:
     probe = directory / ".write_test"
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        with probe.open("wb") as file:
-            file.write(b"\0" * 2**20)
-            file.flush()
-            os.fsync(file.fileno())
+        write_text(probe, "\0" * 2**20)
     except OSError as error:
         raise CheckpointError(
             f"cannot write to {directory}: {error}. Choose another folder with run_dir=PATH"

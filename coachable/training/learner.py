@@ -88,8 +88,8 @@ class Learner:
         self._options = {name: value for name, value in locals().items() if name not in ("self", "loss_module")}
         if update_order not in get_args(UpdateOrder):
             raise ValueError(f"update_order must be one of {get_args(UpdateOrder)}, got {update_order!r}")
-        rates = {"actor": actor_lr, "critic": critic_lr, "alpha": alpha_lr}
-        for name, rate in rates.items():
+        self._rates = {"actor": actor_lr, "critic": critic_lr, "alpha": alpha_lr}
+        for name, rate in self._rates.items():
             NOT_NEGATIVE.check(f"{name}_lr", rate)
         POSITIVE.check("adam_eps", adam_eps)
         Range("(0, 1]").check("tau", tau)
@@ -111,7 +111,6 @@ class Learner:
         self.precision = resolve_precision(precision, device)
         self._device_type = device.type
         self.target_updater = SoftUpdate(loss_module, tau=tau)
-        self._rates = rates
         loss: Any = loss_module
         fixed = hasattr(loss, "log_alpha") and not params["alpha"]
         self._log_alpha = float(loss.log_alpha) if fixed else None

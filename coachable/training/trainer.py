@@ -243,13 +243,11 @@ class Trainer:
                 self._log()
             self._checkpoint()
 
-    def _checkpoint(self) -> Path | None:
-        if self.checkpoints is None:
-            return None
-        with self._timed("checkpoint"):
-            path = self.checkpoints.try_save({**self.describe(), **self.state_dict()}, self._position(), self.replay)
-            self._saved = time.monotonic()
-        return path
+    def _checkpoint(self) -> None:
+        if self.checkpoints is not None:
+            with self._timed("checkpoint"):
+                self.checkpoints.try_save({**self.describe(), **self.state_dict()}, self._position(), self.replay)
+                self._saved = time.monotonic()
 
     def _finish(self, *, interrupted: bool) -> None:
         # Neither row is repeated if the training was resumed at its end or has just been evaluated.
