@@ -1,1 +1,1 @@
-"""Distributions over actions and returns: pure numerics."""
+"""Distributions over actions and returns, in pure torch."""

@@ -1,7 +1,8 @@
-"""What a mixed discrete-continuous action consists of, and the TorchRL spec of its one tensor."""
+"""Components of a mixed discrete-continuous action, and the TorchRL spec of its tensor."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,7 +18,7 @@ from coachable.distributions.categorical import HeadLayout, hard_one_hots
 
 @dataclass(frozen=True)
 class ActionHeads:
-    """Components of an action held in one tensor: the one-hots of the categorical heads, then the axes.
+    """Components of an action in one tensor: the one-hots of the categorical heads, then the axes.
 
     Args:
         categorical: Number of values of each categorical head; empty for a purely continuous action.
@@ -48,12 +49,12 @@ class ActionHeads:
 
     @cached_property
     def layout(self) -> HeadLayout:
-        """How the categorical heads lie in the tensor."""
+        """Layout of the categorical heads in the tensor."""
         return HeadLayout(self.categorical)
 
     @property
     def num_categorical(self) -> int:
-        """Width of all one-hots together."""
+        """Total width of the one-hots."""
         return sum(self.categorical)
 
     @property
@@ -63,15 +64,15 @@ class ActionHeads:
 
     @property
     def num_parameters(self) -> int:
-        """Outputs a policy needs: one per categorical value, location and scale per axis."""
+        """Number of outputs of a policy: one per categorical value, location and scale per axis."""
         return self.num_categorical + 2 * self.axes
 
     def split(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Cut `(..., action_dim)` into the one-hots `(..., num_categorical)` and the axes `(..., axes)`."""
+        """Split `(..., action_dim)` into the one-hots `(..., num_categorical)` and the axes `(..., axes)`."""
         return action[..., : self.num_categorical], action[..., self.num_categorical :]
 
     def choices(self, action: Tensor) -> Tensor:
-        """Index chosen in every categorical head, `(..., action_dim)` to `(..., heads)` int64.
+        """Return the index chosen in every categorical head: `(..., action_dim)` to `(..., heads)` int64.
 
         Example:
             >>> ActionHeads((2, 3)).choices(torch.tensor([0.0, 1.0, 1.0, 0.0, 0.0])).tolist()
@@ -87,10 +88,8 @@ class ActionHeads:
             >>> ActionHeads((2, 3)).from_choices(torch.tensor([1, 0])).tolist()
             [0.0, 1.0, 1.0, 0.0, 0.0]
         """
-        parts = [
-            torch.nn.functional.one_hot(choices[..., head].long(), size).float()
-            for head, size in enumerate(self.categorical)
-        ]
+        heads = zip(choices.long().unbind(-1), self.categorical, strict=True)
+        parts = [torch.nn.functional.one_hot(choice, size).float() for choice, size in heads]
         return torch.cat([*parts, axes] if axes is not None else parts, -1)
 
     def spec(
@@ -99,7 +98,7 @@ class ActionHeads:
         device: torch.device | str | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> TensorSpec:
-        """Action spec `(*batch_shape, action_dim)`: `Bounded` for axes only, else `MixedActionSpec`."""
+        """Return the action spec `(*batch_shape, action_dim)`: `Bounded` for axes only, else `MixedActionSpec`."""
         shape = torch.Size((*batch_shape, self.action_dim))
         if not self.categorical:
             return Bounded(-1.0, 1.0, shape=shape, device=device, dtype=dtype)
@@ -107,13 +106,13 @@ class ActionHeads:
 
 
 class MixedActionSpec(TensorSpec):
-    """Spec of concatenated one-hots and axes: `rand` draws valid actions, `is_in` accepts only those.
+    """Spec of concatenated one-hots and axes.
 
-    TorchRL's `Bounded` would draw actions that are no one-hots, and its `MultiOneHot` has no axes.
+    TorchRL's `Bounded` would draw actions that are not one-hots, and its `MultiOneHot` has no axes.
 
     Args:
         heads: Components of the action.
-        shape: Shape whose last dimension is `heads.action_dim`; that dimension can be neither indexed nor moved.
+        shape: Shape whose last dimension is `heads.action_dim`. That dimension can be neither indexed nor moved.
         device: Device of the samples.
         dtype: Floating point type of the samples.
     """
@@ -144,7 +143,7 @@ class MixedActionSpec(TensorSpec):
         return MixedActionSpec(self.heads, shape, device=self.device, dtype=self.dtype)
 
     def rand(self, shape: Sequence[int] | None = None) -> Tensor:
-        """Draw every head and every axis uniformly, independently of each other."""
+        """Draw every head and every axis uniformly and independently."""
         full = torch.Size((*(() if shape is None else shape), *self.shape))
         action = torch.empty(full, device=self.device, dtype=self.dtype)
         one_hots, axes = self.heads.split(action)
@@ -153,7 +152,7 @@ class MixedActionSpec(TensorSpec):
         return action
 
     def is_in(self, val: Tensor) -> bool:
-        """Return whether every head is a one-hot and every axis in [-1, 1]."""
+        """Return whether every head is a one-hot and every axis is in [-1, 1]."""
         if val.shape[-len(self.shape) :] != self.shape or val.dtype != self.dtype:
             return False
         one_hots, axes = self.heads.split(val)
@@ -168,14 +167,11 @@ class MixedActionSpec(TensorSpec):
         return torch.cat((self.heads.layout.concatenate(chosen), axes.clamp(-1.0, 1.0)), -1)
 
     def cardinality(self) -> float:
-        """Number of distinct actions: infinite with axes."""
-        product = 1
-        for size in self.heads.categorical:
-            product *= size
-        return float("inf") if self.heads.axes else product
+        """Return the number of distinct actions, which is infinite with axes."""
+        return math.inf if self.heads.axes else math.prod(self.heads.categorical)
 
     def enumerate(self, use_mask: bool = False) -> Tensor:
-        """All actions of purely categorical heads, `(cardinality, action_dim)`."""
+        """Return all actions of purely categorical heads, `(cardinality, action_dim)`."""
         if self.heads.axes:
             raise NotImplementedError("an action with axes cannot be enumerated")
         choices = torch.cartesian_prod(*(torch.arange(size) for size in self.heads.categorical))
@@ -183,7 +179,7 @@ class MixedActionSpec(TensorSpec):
         return self.heads.from_choices(choices).to(device=self.device, dtype=self.dtype)
 
     def index(self, index: Any, tensor_to_index: Tensor) -> Tensor:
-        """Not defined for mixed actions."""
+        """Raise an error, because mixed actions cannot index tensors."""
         raise NotImplementedError(f"{type(self).__name__} cannot index tensors")
 
     def expand(self, *shape: Any) -> MixedActionSpec:
@@ -199,7 +195,7 @@ class MixedActionSpec(TensorSpec):
         return self._with_shape(lambda x: x.unsqueeze(dim))
 
     def unbind(self, dim: int = 0) -> tuple[MixedActionSpec, ...]:
-        """One spec per element of a leading dimension."""
+        """Return one spec per element of a leading dimension."""
         if not -self.ndim <= dim < self.ndim - 1 or dim == -1:
             raise ValueError(f"cannot unbind dimension {dim} of shape {tuple(self.shape)}")
         return tuple(self._with_shape(lambda x: x.select(dim, 0)) for _ in range(self.shape[dim]))
@@ -217,22 +213,16 @@ class MixedActionSpec(TensorSpec):
         """Change device or floating point type."""
         if dest is None:
             return self
-        if isinstance(dest, torch.dtype):
-            return MixedActionSpec(self.heads, self.shape, device=self.device, dtype=dest)
-        return MixedActionSpec(self.heads, self.shape, device=torch.device(dest), dtype=self.dtype)
+        change = {"dtype": dest} if isinstance(dest, torch.dtype) else {"device": torch.device(dest)}
+        return MixedActionSpec(self.heads, self.shape, **{"device": self.device, "dtype": self.dtype, **change})
 
     def clone(self) -> MixedActionSpec:
-        """Copy."""
+        """Return a copy."""
         return MixedActionSpec(self.heads, self.shape, device=self.device, dtype=self.dtype)
 
     def __eq__(self, other: object) -> bool:
-        return (
-            isinstance(other, MixedActionSpec)
-            and self.heads == other.heads
-            and self.shape == other.shape
-            and self.device == other.device
-            and self.dtype == other.dtype
-        )
+        names = ("heads", "shape", "device", "dtype")
+        return isinstance(other, MixedActionSpec) and all(getattr(self, n) == getattr(other, n) for n in names)
 
     def __hash__(self) -> int:
         return hash((self.heads, self.shape, self.dtype))

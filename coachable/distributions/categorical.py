@@ -1,7 +1,7 @@
 """Positive-part categorical heads with the regret-matching gradient, and samples from them (Appendix B).
 
-Pure torch. Several heads are handled at once: their values come concatenated, `(..., sum of sizes)`, and are computed
-on padded, `(..., heads, widest head)`, so that six gamepad heads cost as many kernels as one.
+The functions take the values of several heads, concatenated to `(..., sum of sizes)`. They compute with values padded
+to `(..., heads, widest head)`, so that six gamepad heads need as many kernels as one.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from torch import Tensor
 from coachable.distributions.tanh_gaussian import at_least_float32
 
 EPSILON = 1e-8
-"""Mass shared by the values of a head, so that none has probability zero (Appendix B)."""
+"""Mass divided among the values of a head, so that none has probability 0 (Appendix B)."""
 
-# Preferences beyond this all mean "the only choice"; keeps the sum of a head finite in float32.
+# Preferences are clamped to this, so that the sum of a head stays finite in float32.
 _LARGEST_PREFERENCE = 1e30
-# Exponential draws below one float32 rounding of a uniform draw are not representable; bounds y/pi by about 4e8.
+# Exponential draws are clamped to the rounding of a float32 uniform draw, which bounds y/pi by about 4e8.
 _SMALLEST_EXPONENTIAL = 2.0**-25
 
 
 class HeadLayout:
-    """How the values of several categorical heads lie in one concatenated tensor.
+    """Layout of the values of several categorical heads in one concatenated tensor.
 
     Args:
         sizes: Number of values of each head, each at least 2.
@@ -59,14 +59,11 @@ class HeadLayout:
     def __repr__(self) -> str:
         return f"HeadLayout({self.sizes})"
 
-    def __deepcopy__(self, memo: dict) -> HeadLayout:
-        return HeadLayout(self.sizes)
-
-    def __reduce__(self) -> tuple:
+    def __reduce__(self) -> tuple:  # copies and pickles leave out the cached constants
         return HeadLayout, (self.sizes,)
 
     def constants(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Index into the padded source, index back, and epsilon per padded entry (0 where there is no value)."""
+        """Return the indices for `pad` and `concatenate`, and epsilon per padded entry, 0 for padding."""
         key = (like.device, like.dtype)
         if key not in self._constants:
             into, back, epsilon, first = [], [], [], 0
@@ -84,19 +81,19 @@ class HeadLayout:
         return self._constants[key]
 
     def pad(self, values: Tensor) -> Tensor:
-        """Concatenated `(..., total)` to padded `(..., heads, width)`, zeros where a head is narrower."""
+        """Convert concatenated `(..., total)` to `(..., heads, width)`, with zeros for narrower heads."""
         if not self.uniform_width:
             values = F.pad(values, (0, 1)).index_select(-1, self.constants(values)[0])
         return values.unflatten(-1, (len(self), self.width))
 
     def concatenate(self, padded: Tensor) -> Tensor:
-        """Padded `(..., heads, width)` to concatenated `(..., total)`."""
+        """Convert padded `(..., heads, width)` to concatenated `(..., total)`."""
         values = padded.flatten(-2)
         return values if self.uniform_width else values.index_select(-1, self.constants(padded)[1])
 
 
 class _RegretMatching(torch.autograd.Function):
-    """`x -> pi` whose backward returns the regret-matching gradient g', which is not the derivative."""
+    """Function `x -> pi` whose backward pass returns the regret-matching gradient instead of the derivative."""
 
     @staticmethod
     def forward(ctx, x: Tensor, epsilon: Tensor) -> Tensor:
@@ -108,25 +105,27 @@ class _RegretMatching(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad_pi: Tensor):  # type: ignore[override]
         pi, negative = ctx.saved_tensors
-        # Regret of value i: how much cheaper it is than the head's average, since g is the gradient of a loss.
+        # Regret of value i: the head's average loss minus that of i, because `grad_pi` is the gradient of a loss.
         regret = (grad_pi * pi).sum(-1, keepdim=True) - grad_pi
         return (-regret).masked_fill_(negative & (regret < 0), 0.0), None
 
 
 def regret_matching_probabilities(x: Tensor, layout: HeadLayout) -> Tensor:
-    """Probabilities of positive-part heads, `pi_i = (max(0, x_i) + eps) / sum_j (max(0, x_j) + eps)` (Appendix B).
+    """Return the probabilities of positive-part heads (Appendix B).
 
-    The backward pass is one regression step of regret matching instead of the derivative: with `g` the gradient of the
-    loss with respect to the probabilities (our reading, see docs/deviations.md) and `rho_i = sum_j g_j pi_j - g_i`,
-    `x_i` receives `-rho_i`, or 0 if `x_i < 0` and `rho_i < 0`. So a value of probability zero that would have been
-    cheaper than average comes back.
+    They are `pi_i = (max(0, x_i) + eps) / sum_j (max(0, x_j) + eps)`.
+
+    The backward pass is one regression step of regret matching instead of the derivative. Let `g` be the gradient of
+    the loss with respect to the probabilities (our reading, see docs/deviations.md) and `rho_i = sum_j g_j pi_j - g_i`.
+    Then `x_i` receives `-rho_i`, or 0 if `x_i < 0` and `rho_i < 0`. Therefore the probability of a value rises again
+    from 0 if the value would reduce the loss.
 
     Args:
-        x: (..., layout.total) network outputs, heads concatenated.
-        layout: The heads.
+        x: Network outputs (..., layout.total), heads concatenated.
+        layout: Layout of the heads.
 
     Returns:
-        (..., layout.total) probabilities, float32 or wider; each head sums to 1.
+        Probabilities (..., layout.total), float32 or wider; the sum of each head is 1.
 
     Example:
         >>> regret_matching_probabilities(torch.tensor([2.0, 1.0, 1.0, -1.0]), HeadLayout((4,))).tolist()
@@ -138,23 +137,23 @@ def regret_matching_probabilities(x: Tensor, layout: HeadLayout) -> Tensor:
 
 
 def exponential_noise(like: Tensor) -> Tensor:
-    """Standard exponential draws E, bounded away from 0; `-log E` is the Gumbel noise of the paper."""
+    """Draw standard exponential numbers E, clamped away from 0; `-log E` is the Gumbel noise of the paper."""
     return torch.empty_like(like).exponential_().clamp_min_(_SMALLEST_EXPONENTIAL)
 
 
 def relaxed_one_hots(pi: Tensor, layout: HeadLayout, noise: Tensor | None = None) -> Tensor:
-    """Gumbel-softmax samples at temperature 1, differentiable in `pi`.
+    """Draw Gumbel-softmax samples at temperature 1, differentiable in `pi`.
 
-    `softmax(log pi + Z)` with Z = -log E is `(pi_i / E_i) / sum_j (pi_j / E_j)`: no logarithm of a small probability
-    and, in the gradient `dL/dpi_i = (y_i / pi_i)(g_i - sum_j g_j y_j)`, no division by one.
+    They are `softmax(log pi + Z)` with Z = -log E, computed as `(pi_i / E_i) / sum_j (pi_j / E_j)`. This form and its
+    gradient contain neither the logarithm of a small probability nor a division by one.
 
     Args:
-        pi: (..., layout.total) probabilities.
-        layout: The heads.
-        noise: (..., layout.total) standard exponential draws; drawn here if None.
+        pi: Probabilities (..., layout.total).
+        layout: Layout of the heads.
+        noise: Standard exponential numbers (..., layout.total); None draws them.
 
     Returns:
-        (..., layout.total) relaxed one-hots; each head sums to 1.
+        Relaxed one-hots (..., layout.total); the sum of each head is 1.
     """
     noise = exponential_noise(pi) if noise is None else noise
     weights = layout.pad(pi / noise)
@@ -162,15 +161,15 @@ def relaxed_one_hots(pi: Tensor, layout: HeadLayout, noise: Tensor | None = None
 
 
 def hard_one_hots(pi: Tensor, layout: HeadLayout, noise: Tensor | None = None) -> Tensor:
-    """Exact samples, `argmax(log pi + Z)` of each head as one-hots (Gumbel-max); no gradient.
+    """Draw exact samples without gradient: `argmax(log pi + Z)` of each head as one-hots (Gumbel-max).
 
     Args:
-        pi: (..., layout.total) probabilities.
-        layout: The heads.
-        noise: (..., layout.total) standard exponential draws; drawn here if None.
+        pi: Probabilities (..., layout.total).
+        layout: Layout of the heads.
+        noise: Standard exponential numbers (..., layout.total); None draws them.
 
     Returns:
-        (..., layout.total) one-hots of the type of `pi`.
+        One-hots (..., layout.total) of the dtype of `pi`.
 
     Example:
         >>> hard_one_hots(torch.tensor([0.0, 1.0, 1.0, 0.0, 0.0]), HeadLayout((2, 3))).tolist()
@@ -182,25 +181,25 @@ def hard_one_hots(pi: Tensor, layout: HeadLayout, noise: Tensor | None = None) -
 
 
 def most_likely_one_hots(weights: Tensor, layout: HeadLayout) -> Tensor:
-    """One-hots of the largest weight of each head, the first one at ties; weights are not negative."""
+    """Return one-hots of the first largest weight of each head, for weights of at least 0."""
     padded = layout.pad(weights.detach())
     one_hots = torch.zeros_like(padded).scatter_(-1, padded.argmax(-1, keepdim=True), 1.0)
     return layout.concatenate(one_hots)
 
 
 def log_probabilities(pi: Tensor) -> Tensor:
-    """Logarithm of probabilities that stays finite, with gradient `1/pi`, for any probability a head can have."""
+    """Return the logarithm of probabilities, which stays finite for all probabilities that a head can have."""
     return pi.clamp_min(torch.finfo(pi.dtype).tiny).log()
 
 
 def categorical_entropy(pi: Tensor) -> Tensor:
-    """Exact entropy summed over the heads, `-sum_i pi_i log pi_i`.
+    """Return the exact entropy summed over the heads, `-sum_i pi_i log pi_i`.
 
     Args:
-        pi: (..., total) probabilities of one or more heads, concatenated.
+        pi: Probabilities (..., total) of one or more heads, concatenated.
 
     Returns:
-        (...,) entropy [nat].
+        Entropies (...,) [nat].
 
     Example:
         >>> categorical_entropy(torch.tensor([0.5, 0.5, 0.25, 0.25, 0.25, 0.25])).item()  # log 2 + log 4

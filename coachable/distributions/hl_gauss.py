@@ -1,4 +1,4 @@
-"""HL-Gauss: a scalar target becomes the histogram of a Gaussian around it (Imani and White 2018, arXiv 2403.03950)."""
+"""HL-Gauss: scalar targets as histograms of a Gaussian around them (Imani and White 2018; arXiv 2403.03950)."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from torch import Tensor, nn
 
 from coachable.distributions.tanh_gaussian import at_least_float32
 
-# The bump of `initialise_value`: its width over that of the support (40 for the paper's), and the lowest logit.
+# Logits of `initialise_value`: width of their bump over that of the support, and the lowest logit.
 _INITIAL_WIDTH_RATIO = 1.0 / 40.0
 _INITIAL_FLOOR = -8.0
 
 
 class HLGauss:
-    """Bins whose outer edges are v_min and v_max, encoding of scalars into them and decoding of logits over them.
+    """Bins between v_min and v_max, with the encoding of scalars and the decoding of logits.
 
     Args:
         v_min: Smallest value represented.
@@ -62,7 +62,7 @@ class HLGauss:
         return HLGauss(self.v_min, self.v_max, self.num_atoms, self.sigma_ratio)
 
     def _edges_and_centres(self, like: Tensor) -> tuple[Tensor, Tensor]:
-        # Computed in float64 and rounded once; cached because a kernel launch per constant would add up.
+        # Computed in float64 and rounded once; cached to save kernel launches.
         key = (like.device, like.dtype)
         if key not in self._constants:
             index = torch.arange(self.num_atoms + 1, dtype=torch.float64, device=like.device)
@@ -72,76 +72,73 @@ class HLGauss:
         return self._constants[key]
 
     def edges(self, like: Tensor) -> Tensor:
-        """Bin edges `(num_atoms + 1,)` with the device and type of `like`."""
+        """Return the edges of the bins `(num_atoms + 1,)`, with the device and dtype of `like`."""
         return self._edges_and_centres(like)[0]
 
     def centres(self, like: Tensor) -> Tensor:
-        """Bin centres `(num_atoms,)` with the device and type of `like`."""
+        """Return the centres of the bins `(num_atoms,)`, with the device and dtype of `like`."""
         return self._edges_and_centres(like)[1]
 
     def encode(self, value: Tensor) -> Tensor:
-        """Probabilities of a Gaussian around each value, truncated to the support and renormalised.
+        """Return the probabilities of a Gaussian around each value, truncated to the support and renormalised.
 
-        Values outside [v_min, v_max] are moved to the border first: unclipped, float32 gives 0/0 a few standard
-        deviations outside.
+        Values outside [v_min, v_max] are clamped first, because float32 gives 0/0 a few standard deviations outside.
 
         Args:
-            value: (...,) targets.
+            value: Targets (...,).
 
         Returns:
-            (..., num_atoms) probabilities, float32 or wider.
+            Probabilities (..., num_atoms), float32 or wider.
         """
         value = at_least_float32(value).clamp(self.v_min, self.v_max)
-        # erf = 2 Phi - 1; the factor cancels in the ratio.
+        # erf = 2 Phi - 1, whose factor of 2 cancels in the ratio.
         cumulative = torch.erf((self.edges(value) - value.unsqueeze(-1)) / (math.sqrt(2.0) * self.sigma))
         return cumulative.diff(dim=-1).div_(cumulative[..., -1:] - cumulative[..., :1])
 
     def decode(self, logits: Tensor) -> Tensor:
-        """Mean of the distribution with the given logits.
+        """Return the mean of the distribution with the given logits.
 
         Args:
-            logits: (..., num_atoms).
+            logits: Logits (..., num_atoms).
 
         Returns:
-            (...,) values between the outer centres, float32 or wider.
+            Values (...,) between the outer centres, float32 or wider.
         """
         return self.mean(at_least_float32(logits).softmax(-1))
 
     def mean(self, probabilities: Tensor) -> Tensor:
-        """Mean of distributions over the bins, `(..., num_atoms)` to `(...,)`.
-
-        A product and a sum, not a matrix product: autocast would round the latter to bfloat16.
-        """
+        """Return the mean (...,) of distributions over the bins (..., num_atoms)."""
+        # Not a matrix product, which autocast would round to bfloat16.
         return (probabilities * self.centres(probabilities)).sum(-1)
 
     def cross_entropy(self, logits: Tensor, value: Tensor) -> Tensor:
-        """Cross-entropy of `softmax(logits)` against the encoding of a scalar; its gradient is `softmax - p`.
+        """Return the cross-entropy of `softmax(logits)` against the encoding of scalars.
 
         Args:
-            logits: (..., num_atoms), may have leading dimensions that `value` lacks.
-            value: (...,) targets; no gradient.
+            logits: Logits (..., num_atoms), which may have leading dimensions that `value` lacks.
+            value: Targets (...,), which get no gradient.
 
         Returns:
-            (...,) cross-entropies [nat], summed over bins.
+            Cross-entropies (...,) [nat], summed over bins.
         """
         return -(self.encode(value.detach()) * at_least_float32(logits).log_softmax(-1)).sum(-1)
 
     def clipped_fraction(self, value: Tensor) -> Tensor:
-        """Fraction of the values outside [v_min, v_max], a scalar."""
+        """Return the fraction of the values outside [v_min, v_max], a scalar."""
         return ((value < self.v_min) | (value > self.v_max)).to(at_least_float32(value).dtype).mean()
 
 
 def initialise_value(critic: nn.Module, bins: HLGauss, initial_value: float | None = 0.0) -> None:
-    """Make a fresh categorical critic predict `initial_value` for every input, in place.
+    """Make a new categorical critic predict `initial_value` for every input, in place.
 
-    With near-uniform logits it would predict the middle of the support, +200 for the paper's, and that optimism takes
-    tens of thousands of updates to decay through bootstrapping. The last linear layer is scaled by 0.01 and its bias
-    becomes a wide bump, `-((centre - initial_value) / b)^2 / 2`, at least -8, with b a fortieth of the support.
+    With its initial, almost uniform logits it would predict the middle of the support, +200 for the paper's.
+    Bootstrapping takes tens of thousands of updates to correct that. The last linear layer is scaled by 0.01, and its
+    bias becomes `-((centre - initial_value) / b)^2 / 2`, at least -8, where b is a fortieth of the support.
 
     Args:
         critic: Network whose last linear layer, in order of registration, has `bins.num_atoms` outputs.
         bins: The support.
-        initial_value: Wanted prediction; None leaves the network as it is.
+        initial_value: Prediction; None does not change the network.
 
     Raises:
         ValueError: If the value lies outside the support, or the last linear layer has another width.

@@ -28,14 +28,14 @@ from coachable.distributions.tanh_gaussian import (
 class MixedAction(Distribution):
     """Distribution of one action tensor: the one-hots of independent categorical heads, then tanh-Gaussian axes.
 
-    `sample` is what the environment executes, replay stores and targets use: hard one-hots. `relaxed_action` is
-    differentiable in every parameter and belongs in the policy loss alone. There is no `rsample` for categorical
-    heads, so that no TorchRL component can draw relaxed actions by accident.
+    `sample` draws hard one-hots, which the environment executes, the replay buffer stores and targets use.
+    `relaxed_action` is differentiable in every parameter; use it only in the policy loss. There is no `rsample` for
+    categorical heads, so that no TorchRL component can draw relaxed actions by accident.
 
     Args:
-        probs: (..., heads.num_categorical) probabilities; None without categorical heads.
-        loc: (..., heads.axes) location of the axes before the tanh; None without axes.
-        scale: (..., heads.axes) standard deviation before the tanh; None without axes.
+        probs: Probabilities (..., heads.num_categorical); None without categorical heads.
+        loc: Location of the axes before the tanh (..., heads.axes); None without axes.
+        scale: Standard deviation of the axes before the tanh (..., heads.axes); None without axes.
         heads: Components of the action.
         low: Lower bound of the axes, a number or (axes,).
         high: Upper bound of the axes.
@@ -73,7 +73,7 @@ class MixedAction(Distribution):
 
     @property
     def has_rsample(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Whether `sample` is differentiable: only without categorical heads."""
+        """Whether `rsample` is defined, which it is without categorical heads."""
         return not self.heads.categorical
 
     def _join(self, one_hots: Tensor | None, axes: Tensor | None) -> Tensor:
@@ -84,30 +84,30 @@ class MixedAction(Distribution):
         return torch.cat([part for part in (one_hots, axes) if part is not None], -1)
 
     def _log_volume(self, like: Tensor) -> Tensor | float:
-        """Logarithm of the factor by which the bounds of the axes stretch a volume."""
+        """Return the logarithm of the volume of the axes' bounds over that of [-1, 1]^axes."""
         if self._unit_box:
             return 0.0
         half = 0.5 * (torch.as_tensor(self._high) - torch.as_tensor(self._low)).to(like)
         return half.expand(self.heads.axes).log().sum()
 
     def relaxed_action(self) -> Tensor:
-        """Differentiable sample (..., action_dim): Gumbel-softmax one-hots at temperature 1, reparameterised axes."""
+        """Draw a differentiable action (..., action_dim), with Gumbel-softmax one-hots at temperature 1."""
         return self._draw(relaxed_one_hots)
 
     def hard_action(self) -> Tensor:
-        """Exact sample (..., action_dim) with hard one-hots, reparameterised in the axes only."""
+        """Draw an exact action (..., action_dim) with hard one-hots, reparameterised in the axes only."""
         return self._draw(hard_one_hots)
 
     def relaxed_sample(self) -> tuple[Tensor, Tensor]:
-        """`relaxed_action`, and the log-density (...,) of this one sample, both differentiable.
+        """Draw a `relaxed_action`, and return it and its log-density (...,), both differentiable.
 
-        The axes are scored exactly. Categorical heads contribute the relaxed `sum_i y_i log pi_i` (our choice: a
-        one-sample estimate has no other path through a categorical sample).
+        The density of the axes is exact. Categorical heads contribute the relaxed `sum_i y_i log pi_i` (our choice,
+        because a one-sample estimate has no other gradient through a categorical sample).
         """
         return self._draw_and_score(relaxed_one_hots)
 
     def hard_sample(self) -> tuple[Tensor, Tensor]:
-        """`hard_action` and its log-density (...,)."""
+        """Draw a `hard_action`, and return it and its log-density (...,)."""
         return self._draw_and_score(hard_one_hots)
 
     def _draw(self, one_hots_of: Callable[[Tensor, HeadLayout], Tensor]) -> Tensor:
@@ -129,21 +129,25 @@ class MixedAction(Distribution):
         return self._join(one_hots, axes), torch.as_tensor(log_prob)
 
     def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Hard sample (*sample_shape, ..., action_dim), no gradient."""
+        """Draw hard actions (*sample_shape, ..., action_dim) without gradient."""
         with torch.no_grad():
             return self._expanded(sample_shape).hard_action()
 
     def sample_and_log_prob(self, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
-        """Hard sample without gradient and its differentiable log-density."""
+        """Draw hard actions without gradient, and return them and their differentiable log-densities."""
         action = self.sample(sample_shape)
         return action, self.log_prob(action)
 
     def rsample(self, sample_shape: Sequence[int] = ()) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Reparameterised sample of axes; categorical heads have none."""
+        """Draw reparameterised axes; see `rsample_and_log_prob`."""
         return self.rsample_and_log_prob(sample_shape)[0]
 
     def rsample_and_log_prob(self, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
-        """Reparameterised sample of axes and its log-density, as TorchRL's losses ask for it."""
+        """Draw reparameterised axes, and return them and their log-density.
+
+        Raises:
+            NotImplementedError: If there are categorical heads.
+        """
         if self.heads.categorical:
             raise NotImplementedError(
                 "categorical heads have no reparameterised hard sample: use a loss that draws relaxed actions itself "
@@ -158,7 +162,7 @@ class MixedAction(Distribution):
         return MixedAction(*parts, heads=self.heads, low=self._low, high=self._high)
 
     def log_prob(self, value: Tensor) -> Tensor:
-        """Log-density (...,) of a given action with hard one-hots."""
+        """Return the log-density (...,) of a given action with hard one-hots."""
         one_hots, axes = self.heads.split(value)
         log_prob: Tensor | float = 0.0
         if self.probs is not None:
@@ -172,14 +176,14 @@ class MixedAction(Distribution):
         return torch.as_tensor(log_prob)
 
     def entropy_estimate(self, num_samples: int = 1000, shared_noise: bool = True) -> Tensor:
-        """Sum over the components: exact categorical entropies, sampled entropies of the axes (Appendix B).
+        """Return the sum of exact categorical entropies and sampled entropies of the axes (Appendix B).
 
         Args:
-            num_samples: Draws per axis.
+            num_samples: Number of draws per axis.
             shared_noise: Whether the states share their draws, see `tanh_gaussian_entropy`.
 
         Returns:
-            (...,) entropy [nat], differentiable.
+            Differentiable entropies (...,) [nat].
         """
         entropy: Tensor | float = 0.0
         if self.probs is not None:
@@ -191,11 +195,11 @@ class MixedAction(Distribution):
 
     @property
     def deterministic_sample(self) -> Tensor:
-        """Most likely value of every head, tanh of the location of every axis; what evaluation executes."""
+        """Deterministic action: the most likely value of every head and the tanh of every axis's location."""
         one_hots = None if self.probs is None else most_likely_one_hots(self.probs, self.heads.layout)
         return self._join(one_hots, None if self.loc is None else torch.tanh(self.loc))
 
     @property
     def mode(self) -> Tensor:
-        """The deterministic action."""
+        """Deterministic action, under the name that torch uses."""
         return self.deterministic_sample

@@ -1,7 +1,7 @@
 """Squashed Gaussians, ``a = tanh(u)`` with ``u = loc + scale * z``: samples, densities and sampled entropies.
 
-Pure torch. Everything is expressed through ``log cosh u = |u| - log 2 + log1p(exp(-2|u|))``, since
-``log(1 - tanh(u)^2) = -2 log cosh u``; the direct form is ``log 0`` in float32 from ``|u|`` of about 9.
+The density contains ``log(1 - tanh(u)^2)``, which is ``log 0`` in float32 from ``|u|`` of about 9. It is therefore
+computed as ``-2 log cosh u``, where ``log cosh u = |u| - log 2 + log1p(exp(-2|u|))``.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from torch import Tensor
 
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 _TWO_LOG2_E = 2.0 * math.log2(math.e)
-# Elements of one temporary of the sampled entropy: 1 MB in float32 on a CPU (cache), 64 MB on an accelerator.
+# Elements of one temporary tensor of the sampled entropy: 1 MB in float32 on a CPU (cache), 64 MB on an accelerator.
 _CHUNK_ELEMENTS_CPU = 1 << 18
 _CHUNK_ELEMENTS_DEVICE = 1 << 24
 
 
 def at_least_float32(x: Tensor) -> Tensor:
-    """Promote half and bfloat16 tensors to float32 and leave the others alone.
+    """Convert half and bfloat16 tensors to float32, and return other tensors unchanged.
 
     Example:
         >>> at_least_float32(torch.zeros(1, dtype=torch.bfloat16)).dtype
@@ -30,7 +30,7 @@ def at_least_float32(x: Tensor) -> Tensor:
 
 
 def log_cosh(u: Tensor) -> Tensor:
-    """Logarithm of cosh without overflow, any shape.
+    """Return the logarithm of cosh, without overflow.
 
     Example:
         >>> log_cosh(torch.tensor([0.0, 1000.0])).tolist()
@@ -41,17 +41,18 @@ def log_cosh(u: Tensor) -> Tensor:
 
 
 def sample_tanh_gaussian(loc: Tensor, scale: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Reparameterised sample and its log-density, scored at the value before the tanh.
+    """Draw reparameterised actions, and return them and their log-densities.
 
-    Scoring the rounded action instead gives an entropy of -4.8 where the truth is -7.07 (scale e^2).
+    The density is computed from the value before the tanh. From the rounded action, the entropy at a scale of e^2 would
+    be -4.8 instead of -7.07.
 
     Args:
-        loc: (..., A) location before the tanh.
-        scale: (..., A) positive standard deviation before the tanh.
-        noise: (..., A) standard normal draws; drawn here if None.
+        loc: Location before the tanh (..., A).
+        scale: Positive standard deviation before the tanh (..., A).
+        noise: Standard normal numbers (..., A); None draws them.
 
     Returns:
-        The action (..., A) in [-1, 1] and its log-density per axis (..., A).
+        Actions (..., A) in [-1, 1] and their log-densities per axis (..., A).
     """
     loc, scale = at_least_float32(loc), at_least_float32(scale)
     noise = torch.randn_like(loc) if noise is None else noise
@@ -61,15 +62,15 @@ def sample_tanh_gaussian(loc: Tensor, scale: Tensor, noise: Tensor | None = None
 
 
 def tanh_gaussian_log_prob(action: Tensor, loc: Tensor, scale: Tensor) -> Tensor:
-    """Log-density per axis of given actions; prefer `sample_tanh_gaussian` for actions drawn here.
+    """Return the log-density per axis of given actions; to draw actions, use `sample_tanh_gaussian`.
 
     Args:
-        action: (..., A) in [-1, 1]; values that float rounding put on the border are moved inside by one rounding.
-        loc: (..., A) location before the tanh.
-        scale: (..., A) standard deviation before the tanh.
+        action: Actions (..., A) in [-1, 1], clamped to one float rounding inside the bounds.
+        loc: Location before the tanh (..., A).
+        scale: Standard deviation before the tanh (..., A).
 
     Returns:
-        (..., A) log-densities.
+        Log-densities (..., A).
     """
     loc, scale, action = at_least_float32(loc), at_least_float32(scale), at_least_float32(action)
     border = 1.0 - torch.finfo(action.dtype).eps
@@ -78,31 +79,29 @@ def tanh_gaussian_log_prob(action: Tensor, loc: Tensor, scale: Tensor) -> Tensor
 
 
 def tanh_gaussian_entropy(
-    loc: Tensor,
-    scale: Tensor,
-    num_samples: int = 1000,
-    *,
-    shared_noise: bool = True,
-    noise: Tensor | None = None,
+    loc: Tensor, scale: Tensor, num_samples: int = 1000, *, shared_noise: bool = True, noise: Tensor | None = None
 ) -> Tensor:
-    """Mean negative log-density of ``num_samples`` reparameterised samples per axis.
+    """Return the mean negative log-density of ``num_samples`` reparameterised samples per axis.
 
-    The regulariser of RAC for one Gaussian axis (Appendix B; 1000 samples per component). The gradient is the exact
-    derivative of the estimate, ``-2 mean tanh(u)`` for the location and ``1/scale - 2 mean(z tanh(u))`` for the scale,
-    computed along with the value, so no per-sample tensor outlives the call and memory does not grow with the batch.
+    This is RAC's regulariser for one Gaussian axis (Appendix B; 1000 samples per component). The gradient is the exact
+    derivative of the estimate: ``-2 mean tanh(u)`` for the location and ``1/scale - 2 mean(z tanh(u))`` for the scale.
+    It is computed together with the value, so that no tensor of samples stays in memory.
 
-    The draws are independent between axes and samples. By default all states of a batch share them (our choice): each
-    state's estimate has the same distribution, errors are correlated between states, and the cost falls to a third.
+    The draws are independent between axes and samples. By default all states of a batch share them (our choice). The
+    distribution of each state's estimate is the same, errors are correlated between states, and the cost is a third.
 
     Args:
-        loc: (..., A) location before the tanh.
-        scale: (..., A) positive standard deviation before the tanh.
-        num_samples: draws per axis, at least 1.
-        shared_noise: whether the states of the batch share their draws.
-        noise: standard normal draws to use instead, (num_samples, A) if shared, else (num_samples, ..., A).
+        loc: Location before the tanh (..., A).
+        scale: Positive standard deviation before the tanh (..., A).
+        num_samples: Number of draws per axis, at least 1.
+        shared_noise: Whether the states of the batch share their draws.
+        noise: Standard normal numbers, (num_samples, A) if shared, else (num_samples, ..., A); None draws them.
 
     Returns:
-        (..., A) entropy estimates [nat].
+        Entropy estimates (..., A) [nat].
+
+    Raises:
+        ValueError: If `num_samples` is below 1, or `noise` has another shape.
 
     Example:
         >>> h = tanh_gaussian_entropy(torch.zeros(3), torch.ones(3))
@@ -122,14 +121,14 @@ def tanh_gaussian_entropy(
 
 
 class _SampledEntropy(torch.autograd.Function):
-    """Value and both derivatives of the sampled entropy in one pass over the samples."""
+    """Sampled entropy, computed with both derivatives in one pass over the samples."""
 
     @staticmethod
     def forward(
         ctx, loc: Tensor, scale: Tensor, num_samples: int, shared: bool, noise: Tensor | None, needs_gradient: bool
     ) -> Tensor:
         shape, axes = loc.shape, loc.shape[-1]
-        # Samples last and axes first: (A, R, n), so that every reduction and product runs over contiguous memory.
+        # Axes first and samples last, (A, R, n), so that every reduction and product runs over contiguous memory.
         mu, sigma = loc.detach().reshape(-1, axes).T, scale.detach().reshape(-1, axes).T
         rows = mu.shape[1]
         if noise is not None:
@@ -159,9 +158,9 @@ class _SampledEntropy(torch.autograd.Function):
 def _entropy_of_rows(
     mu: Tensor, sigma: Tensor, num_samples: int, shared: bool, noise: Tensor | None, first: int, needs_gradient: bool
 ) -> tuple[Tensor, ...]:
-    """Entropy (A, R) and, if needed, its derivatives for one block of rows, in few passes over (A, R, n).
+    """Return the entropy (A, R) of a block of rows, and its derivatives if needed, in few passes over (A, R, n).
 
-    ``v = 2 log2(e) u``, so that ``exp(-2|u|) = exp2(-|v|)``: torch's exp2 is three times as fast as its exp on a CPU.
+    With ``v = 2 log2(e) u``, ``exp(-2|u|)`` is ``exp2(-|v|)``, which torch computes three times as fast on a CPU.
     """
     if noise is None:
         z = torch.randn(*mu.shape, num_samples, dtype=mu.dtype, device=mu.device)
@@ -180,7 +179,7 @@ def _entropy_of_rows(
     tanh = q.reciprocal_().mul_(2.0).sub_(1.0).mul_(v.sign_())
     by_loc = tanh.mean(-1).mul_(-2.0)
     if shared:
-        # A matrix-vector product for each axis; the batched form is an order of magnitude slower on a CPU.
+        # One matrix-vector product per axis, because the batched form is ten times slower on a CPU.
         z_tanh = torch.stack([torch.mv(t, row[0]) for t, row in zip(tanh, z, strict=True)])
     else:
         z_tanh = tanh.mul_(z).sum(-1)
@@ -188,7 +187,7 @@ def _entropy_of_rows(
 
 
 def _log_of_product(q: Tensor) -> Tensor:
-    """Sum of log q over the last axis for q in (1, 2]: fold by halves three times, then take an eighth of the logs."""
+    """Return the sum of log q over the last axis for q in (1, 2], by an eighth of the logarithms."""
     remainder = 0.0
     for _ in range(3):
         n = q.shape[-1]

@@ -1,4 +1,4 @@
-"""Losses as TorchRL modules: QR-SAC, RAC, Cat-RAC and categorical SAC. Plain SAC is TorchRL's own."""
+"""Losses as TorchRL modules: QR-SAC, RAC, Cat-RAC and categorical SAC. For plain SAC, use TorchRL's `SACLoss`."""
 
 from coachable.losses.cat_rac import CatRACLoss
 from coachable.losses.qr_sac import QRSACLoss

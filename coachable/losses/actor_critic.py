@@ -1,4 +1,4 @@
-"""The base class of QR-SAC, RAC, Cat-RAC and categorical SAC: an actor-critic loss with four methods left open."""
+"""Base class of QR-SAC, RAC, Cat-RAC and categorical SAC."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ Reduction = Literal["none", "mean", "sum"]
 
 
 class ActorCriticLoss(SACLoss):
-    """Soft actor-critic with a fixed entropy weight whose policy sample and critic a subclass defines.
+    """Soft actor-critic loss with a fixed entropy weight, whose policy sample and critic a subclass defines.
 
-    `actor_loss(td)` and `qvalue_loss(td)` return `(loss, metadata)` and can be stepped one after the other, in which
-    case the target uses the policy as it then is; `forward` gives both from the same parameters. All three accept any
-    batch shape, `[B]` or `[B, n + 1]`. Rewards with `steps_to_next_obs` are n-step returns, discounted accordingly.
+    `actor_loss(td)` and `qvalue_loss(td)` return `(loss, metadata)`. If you step them one after the other, the target
+    uses the updated policy. `forward` computes both from the same parameters. All three accept any batch shape, such as
+    `[B]` or `[B, n + 1]`. Rewards with `steps_to_next_obs` are n-step returns and are discounted accordingly.
     Everything after the networks is computed in float32 or wider, also under autocast.
 
     Subclasses define `_sample` (action and negative entropy), `_values` (critic output to scalars), `_next_value`
-    (target critics' output to what is bootstrapped from) and `_errors` (regression of the critics on the target).
+    (target critics' output to the successor's value) and `_errors` (regression of the critics on the target).
     Their names must not contain `loss`, because TorchRL wraps such methods.
 
     Args:
         actor_network: Policy, from `make_gaussian_actor` or `make_mixed_actor`.
-        qvalue_network: List of critics, one call of a critic factory each.
+        qvalue_network: List of critics, each built by its own call of a critic factory.
         num_qvalue_nets: Number of critics, checked against the list.
         alpha: Weight of the entropy, fixed.
-        action_spec: The environment's action spec; if given, checked against the actor.
+        action_spec: The environment's action spec, which is checked against the actor; None for no check.
         reduction: `"mean"`, `"sum"` or `"none"`, over the batch.
-        deactivate_vmap: Evaluate the critics one after the other.
-        use_prioritized_weights: Whether `priority_weight` weighs the losses; `"auto"`: if present.
+        deactivate_vmap: Whether to evaluate the critics one after the other.
+        use_prioritized_weights: Whether `priority_weight` weights the losses; `"auto"` means if it is present.
 
     Raises:
-        ValueError: If a number is out of range, an option unknown, or the action space one that the loss cannot serve.
+        ValueError: If a number is out of range, an option is unknown, or the loss does not support the actions.
     """
 
     SUPPORTED_VALUE_ESTIMATORS = (ValueEstimators.TD0,)
@@ -75,7 +75,7 @@ class ActorCriticLoss(SACLoss):
         if reduction not in ("none", "mean", "sum"):
             raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
         policy = PolicyReader(actor_network, name, continuous_only=self._continuous_only, action_spec=action_spec)
-        # TorchRL makes buffers of a list of one, and draws new weights for a critic on its own: these are put back.
+        # TorchRL makes buffers of a list of one, and draws new weights for a single critic, so they are restored below.
         single = cast(TensorDict, TensorDict.from_module(critics[0])).data.clone() if len(critics) == 1 else None
         super().__init__(
             actor_network,
@@ -84,7 +84,7 @@ class ActorCriticLoss(SACLoss):
             loss_function="l2",
             alpha_init=alpha,
             fixed_alpha=True,
-            target_entropy=0.0,  # unused; "auto" would need an action spec for the state dict
+            target_entropy=0.0,  # not used; "auto" would need an action spec
             reduction=reduction,
             deactivate_vmap=deactivate_vmap,
             use_prioritized_weights=use_prioritized_weights,
@@ -93,15 +93,15 @@ class ActorCriticLoss(SACLoss):
         if single is not None:
             for params in (self.qvalue_network_params, self.target_qvalue_network_params):
                 cast(TensorDictBase, params).data.copy_(single.unsqueeze(0))
-        # In float64, as gamma: float64 losses see the rounding, and a 0-dim number does not widen float32 tensors.
+        # In float64, like gamma, for the precision of float64 losses; it does not widen float32 tensors.
         self.log_alpha = torch.tensor(math.log(alpha), dtype=torch.float64, device=cast(Tensor, self.log_alpha).device)
-        self._policy = policy  # no submodule: the parameters are those of actor_network_params
+        self._policy = policy  # not a submodule, because its parameters are those of actor_network_params
         self.make_value_estimator()
 
-    # What a subclass defines.
+    # Methods that a subclass defines.
 
     def _sample(self, policy: MixedAction, *, relaxed: bool) -> tuple[Tensor, Tensor]:
-        """Return an action (..., A) and a negative entropy (...,), here the action's log-density as in SAC."""
+        """Return an action (..., A) and its negative entropy (...,), here its log-density as in SAC."""
         return policy.relaxed_sample() if relaxed else policy.hard_sample()
 
     def _values(self, output: Tensor) -> Tensor:
@@ -116,7 +116,7 @@ class ActorCriticLoss(SACLoss):
         """Return the losses (K, ...) of the critics against the target, and their absolute TD errors (K, ...)."""
         raise NotImplementedError
 
-    # What TorchRL calls.
+    # Methods that TorchRL calls.
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the policy loss `mean(alpha log pi - min_k Q_k)` of relaxed actions, without critic gradient.
@@ -134,10 +134,10 @@ class ActorCriticLoss(SACLoss):
             return self._reduced(loss, tensordict), {"log_prob": log_prob.detach()}
 
     def qvalue_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the critic loss, summed over the critics; the target uses the policy's present parameters.
+        """Return the critic loss, summed over the critics; the target uses the present policy.
 
         Returns:
-            The loss, and `td_error` (...,), the largest of the critics'.
+            The loss, and `td_error` (...,), the largest one of the critics.
         """
         target = self.compute_target(tensordict)
         output = self._critics_at(tensordict, None, self.qvalue_network_params)
@@ -152,9 +152,9 @@ class ActorCriticLoss(SACLoss):
 
     @torch.no_grad()
     def compute_target(self, tensordict: TensorDictBase) -> Tensor:
-        """Return the target, (...,) or (..., M), from hard actions of the present policy and the target critics.
+        """Return the target (...,) or (..., M), from hard actions of the present policy and the target critics.
 
-        The successor's entropy is inside the discount, so that terminals have none.
+        The discount includes the successor's entropy, so that a terminal step has none.
         """
         successor = tensordict.get("next")
         policy = self._policy_at(successor)
@@ -178,7 +178,7 @@ class ActorCriticLoss(SACLoss):
         """Return both losses, computed from the same parameters.
 
         Args:
-            tensordict: Batch; only the priority (`td_error`) is written into it.
+            tensordict: Batch, into which only the priority (`td_error`) is written.
 
         Returns:
             `loss_actor`, `loss_qvalue`, and, unless the reduction is "none", `alpha` and `entropy`.
@@ -193,7 +193,7 @@ class ActorCriticLoss(SACLoss):
 
     @property
     def out_keys(self) -> list[str]:
-        """Keys of what `forward` returns."""
+        """Keys of the result of `forward`."""
         scalars = [] if self.reduction == "none" else ["alpha", "entropy"]
         return ["loss_actor", "loss_qvalue", *scalars]
 
@@ -202,7 +202,7 @@ class ActorCriticLoss(SACLoss):
         self._out_keys = values
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> ActorCriticLoss:
-        """Set `gamma`. Only TD(0) is served; n-step returns come as rewards with `steps_to_next_obs`."""
+        """Set `gamma`. Only TD(0) is supported; pass n-step returns as rewards with `steps_to_next_obs`."""
         if value_type not in (None, ValueEstimators.TD0) or set(hyperparams) - {"gamma", "device"}:
             raise ValueError(
                 f"{type(self).__name__} computes its own TD(0) target and takes gamma alone, got value_type="
@@ -216,8 +216,6 @@ class ActorCriticLoss(SACLoss):
             self.value_estimator.gamma = exact.to(self._gamma.device)
         return self
 
-    # Pieces.
-
     def _extra_metrics(self, target: Tensor) -> dict[str, Tensor]:
         """Return further scalars of the critic update, for logging."""
         return {}
@@ -227,7 +225,7 @@ class ActorCriticLoss(SACLoss):
             return self._policy.read(tensordict)
 
     def _critics_at(self, tensordict: TensorDictBase, action: Tensor | None, params: TensorDictBase) -> Tensor:
-        """Return the raw output (K, ..., out) of all critics at the stored action or another one."""
+        """Return the output (K, ..., out) of all critics at `action`, or at the stored one if it is None."""
         inputs = tensordict.select(*self.qvalue_network.in_keys, strict=False)
         if action is not None:
             inputs.set(self.tensor_keys.action, action)
@@ -260,7 +258,7 @@ class ActorCriticLoss(SACLoss):
     def _reduced(self, loss: Tensor, tensordict: TensorDictBase) -> Tensor:
         weights = self._maybe_get_priority_weight(tensordict)
         if weights is not None and weights.shape != loss.shape:
-            # One weight per record also where the batch is [B, n + 1].
+            # One weight per record, also if the batch is [B, n + 1].
             weights = weights.squeeze(-1) if weights.ndim > loss.ndim else weights.unsqueeze(-1)
             weights = weights.expand_as(loss)
         return cast(Tensor, self._reduce_loss(loss, tensordict=tensordict, weights=weights))

@@ -13,13 +13,13 @@ from coachable.losses.rac import RACLoss
 
 
 class CatRACLoss(RACLoss):
-    """Loss of Cat-RAC: critics give logits over bins, `L_Q = sum_k mean CE(HLGauss(y), softmax(logits_k))`.
+    """Loss of Cat-RAC, with the critic loss `L_Q = sum_k mean CE(HLGauss(y), softmax(logits_k))` over bins.
 
-    Values are decoded means; the minimum over critics is taken of those. `td_error` is the absolute difference of the
-    target and the decoded mean. The metadata of `qvalue_loss` and the output of `forward` hold `clipped_fraction`, the
-    share of targets outside the support (paper, Appendix B; Farebrother et al. 2024).
+    The minimum over critics is that of the decoded means. `td_error` is the absolute difference of the target and the
+    decoded mean. The metadata of `qvalue_loss` and the output of `forward` contain `clipped_fraction`, the share of
+    targets outside the support (paper, Appendix B; Farebrother et al. 2024).
 
-    Build the critics with `make_hl_gauss_critic`, so that they start at a value of 0 instead of the middle of the
+    Build the critics with `make_hl_gauss_critic`, so that their initial value is 0 instead of the middle of the
     support.
 
     Args:

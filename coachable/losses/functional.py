@@ -1,4 +1,4 @@
-"""Numerics of the losses: bootstrap targets, pessimistic quantiles, quantile regression. Pure torch."""
+"""Numerics of the losses in pure torch: bootstrap targets, pessimistic quantiles, quantile regression."""
 
 from __future__ import annotations
 
@@ -15,15 +15,14 @@ def bootstrap_target(
 ) -> Tensor:
     """Return the TD target `R + gamma^k (1 - d) V'`.
 
-    The value of a terminal successor is selected out, not multiplied by zero: what an environment emits after the end
-    may be NaN, and NaN times zero is NaN.
+    The value of a terminal state is replaced by 0 instead of multiplied by 0, because it may be NaN.
 
     Args:
-        reward: (...,) reward summed over `steps` steps, discounted.
-        next_value: (...,) or (..., M) value, or quantiles of it, at the last state of the sum.
-        terminated: (...,) bool, whether that state is terminal. A truncated step is not.
+        reward: Discounted sum of the rewards of `steps` steps (...,).
+        next_value: Value (...,) or its quantiles (..., M) at the last state of the sum.
+        terminated: Whether that state is terminal (...,), bool. A truncated step is not terminal.
         gamma: Discount per step.
-        steps: (...,) number of steps summed; None for 1.
+        steps: Number of steps summed (...,); None for 1.
 
     Returns:
         The target, in the shape of `next_value`.
@@ -41,27 +40,27 @@ def bootstrap_target(
 
 
 def pessimistic_quantiles(quantiles: Tensor) -> Tensor:
-    """Return all quantiles of the critic with the lowest mean, of the first one at ties.
+    """Return all quantiles of the critic with the lowest mean, or of the first such critic.
 
     Args:
-        quantiles: (K, ..., M) quantiles of K critics.
+        quantiles: Quantiles of K critics (K, ..., M).
 
     Returns:
-        (..., M).
+        Quantiles (..., M).
 
     Example:
         >>> pessimistic_quantiles(torch.tensor([[0.0, 4.0], [1.0, 2.0]])).tolist()
         [1.0, 2.0]
     """
     best = quantiles[0]
-    for candidate in quantiles[1:]:  # not argmin: which index that returns at ties is undefined
+    for candidate in quantiles[1:]:  # not argmin, whose index is undefined if means are equal
         lower = candidate.mean(-1, keepdim=True) < best.mean(-1, keepdim=True)
         best = torch.where(lower, candidate, best)
     return best
 
 
 def quantile_midpoints(num_quantiles: int, like: Tensor) -> Tensor:
-    """Return the quantile fractions `(2i - 1) / (2M)`, i = 1..M, with the device and type of `like`."""
+    """Return the quantile fractions `(2i - 1) / (2M)`, i = 1..M, with the device and dtype of `like`."""
     index = torch.arange(num_quantiles, device=like.device, dtype=like.dtype)
     return (index + 0.5) / num_quantiles
 
@@ -69,17 +68,17 @@ def quantile_midpoints(num_quantiles: int, like: Tensor) -> Tensor:
 def quantile_huber_loss(prediction: Tensor, target: Tensor, *, kappa: float = 1.0) -> Tensor:
     """Return the quantile Huber loss of every prediction against every target (QR-DQN, IQN).
 
-    The mean over predictions and targets of `|tau_i - 1{u_ij < 0}| L_kappa(u_ij) / kappa` with
-    `u_ij = target_j - prediction_i` and the midpoints `tau_i = (2i - 1) / (2M)`. The sum over predictions, which other
-    libraries use, is M times larger; Adam does not see that, and gradient clipping does.
+    It is the mean over predictions and targets of `|tau_i - 1{u_ij < 0}| L_kappa(u_ij) / kappa` with
+    `u_ij = target_j - prediction_i` and the midpoints `tau_i = (2i - 1) / (2M)`. Other libraries sum over predictions,
+    which gives M times as much. This factor affects gradient clipping, but not Adam.
 
     Args:
-        prediction: (..., M) predicted quantiles; may have leading dimensions that `target` lacks.
-        target: (..., M') samples or quantiles of the target; no gradient.
-        kappa: Where the loss turns from quadratic to linear; 0 for the pinball loss `|tau - 1{u < 0}| |u|`.
+        prediction: Predicted quantiles (..., M), which may have leading dimensions that `target` lacks.
+        target: Samples or quantiles of the target (..., M'), which get no gradient.
+        kappa: Error at which the loss changes from quadratic to linear; 0 for the pinball loss `|tau - 1{u < 0}| |u|`.
 
     Returns:
-        (...,) losses.
+        Losses (...,).
 
     Raises:
         ValueError: If `kappa` is negative.
@@ -97,10 +96,10 @@ def quantile_huber_loss(prediction: Tensor, target: Tensor, *, kappa: float = 1.
 
 
 class _QuantileHuber(torch.autograd.Function):
-    """Loss and gradient in one pass over blocks that fit a cache.
+    """Quantile Huber loss, computed with its gradient in one pass over blocks that fit in a cache.
 
-    Left to autograd, half a dozen (..., M, M') tensors go through main memory and cost more than a critic does. With
-    the error's clipped value c and the Huber loss h, both weights are `1/2 + (tau - 1/2) sign(u)`, hence only row sums:
+    With autograd, six (..., M, M') tensors would go through main memory and take longer than a critic. Let c be the
+    clipped error and h the Huber loss. Both weights are `1/2 + (tau - 1/2) sign(u)`, so that row sums are enough:
     `loss_i = sum_j h/2 + (tau_i - 1/2) sign(u) h` and `-gradient_i = sum_j c/2 + (tau_i - 1/2) |c|`.
     """
 

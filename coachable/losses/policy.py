@@ -1,4 +1,4 @@
-"""`PolicyReader`: turns the output of any supported TorchRL actor into a `MixedAction`."""
+"""`PolicyReader`, which converts the output of a supported TorchRL actor to a `MixedAction`."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ from coachable.distributions.mixed_action import MixedAction
 
 
 class PolicyReader:
-    """Evaluates the deterministic part of an actor and wraps its parameters in a `MixedAction`.
+    """Reader of the distribution of an actor as a `MixedAction`.
 
-    The actor's own distribution is not built. Building a `TanhNormal` costs more than sampling one. It also samples and
-    scores in separate steps, which gives wrong densities where tanh saturates (see `sample_tanh_gaussian`).
+    It evaluates the deterministic part of the actor and does not build the actor's own distribution. A `TanhNormal`
+    takes longer to build than to sample. It also samples and scores in separate steps, which gives wrong densities
+    where tanh saturates (see `sample_tanh_gaussian`).
 
     Args:
         actor: A `ProbabilisticActor` with a `MixedAction` or a `TanhNormal`.
         loss_name: Name for error messages.
-        continuous_only: Whether categorical heads are refused.
-        action_spec: Spec of the environment's action, checked against the actor if given.
+        continuous_only: Whether to reject categorical heads.
+        action_spec: Spec of the environment's action, which is checked against the actor; None for no check.
 
     Raises:
-        ValueError: If the loss cannot serve the actor's distribution or the action spec.
+        ValueError: If the loss does not support the actor's distribution or the action spec.
     """
 
     def __init__(
@@ -49,7 +50,7 @@ class PolicyReader:
         if issubclass(kind, MixedAction):
             heads = options.get("heads")
         elif issubclass(kind, TanhNormal) and not options.get("tanh_loc", False):
-            heads = None  # axes only; their number shows at the first call
+            heads = None  # axes only, counted in the first call
         else:
             raise ValueError(
                 f"{loss_name} serves positive-part categorical heads and tanh-Gaussian axes (without tanh_loc), not "
@@ -68,11 +69,11 @@ class PolicyReader:
         }
         names = getattr(head, "dist_keys", head.in_keys)
         self._parameters = list(zip(names, head.in_keys, strict=True))
-        # Shares the actor's modules, so that parameters swapped into the actor are used here.
+        # Shares the actor's modules, so that parameters replaced in the actor are used here.
         self.body = TensorDictSequential(*cast(Any, actor.module)[:-1])
 
     def read(self, tensordict: TensorDictBase) -> MixedAction:
-        """Return the distribution at the states of `tensordict`, which stays unchanged."""
+        """Return the distribution at the states of `tensordict`, which is not changed."""
         outputs = self.body(tensordict.select(*self.body.in_keys, strict=False))
         parameters = {name: outputs.get(key) for name, key in self._parameters}
         if self._heads is None:
@@ -81,7 +82,7 @@ class PolicyReader:
 
 
 def _number_or_tensor(bound: Any) -> Any:
-    """Return a bound as a number if all its entries are equal (±1 needs no arithmetic), otherwise as a tensor."""
+    """Return a bound as a number if all its entries are equal, otherwise as a tensor."""
     tensor = torch.as_tensor(bound, dtype=torch.float32)
     first = tensor.flatten()[0].item()
     return first if bool((tensor == first).all()) else tensor

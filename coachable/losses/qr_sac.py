@@ -15,18 +15,18 @@ from coachable.ranges import COUNT, NOT_NEGATIVE
 
 
 class QRSACLoss(ActorCriticLoss):
-    """Loss of QR-SAC for continuous actions; n-step returns come as rewards with `steps_to_next_obs`.
+    """Loss of QR-SAC for continuous actions.
 
-    Target `y_j = R + gamma^k (1 - d)(Z_j - alpha log pi(a'|s'))` with the quantiles Z of the target critic of lower
-    mean; critic loss the quantile Huber loss of every prediction against every y_j, summed over critics; policy loss
-    `mean(alpha log pi - min_c mean_i Z_ci)` (paper, Appendix B; Wurman et al. 2022). `td_error` is the absolute
-    difference of the means of target and prediction.
+    The target is `y_j = R + gamma^k (1 - d)(Z_j - alpha log pi(a'|s'))` with the quantiles Z of the target critic of
+    lower mean. The critic loss is the quantile Huber loss of every prediction against every y_j, summed over critics.
+    The policy loss is `mean(alpha log pi - min_c mean_i Z_ci)` (paper, Appendix B; Wurman et al. 2022). `td_error` is
+    the absolute difference of the means of target and prediction.
 
     Args:
-        actor_network: tanh-Gaussian policy, from `make_gaussian_actor`, or `make_mixed_actor` with axes only.
+        actor_network: Tanh-Gaussian policy, from `make_gaussian_actor`, or `make_mixed_actor` with axes only.
         qvalue_network: List of critics with `num_quantiles` outputs.
-        num_quantiles: Quantiles per critic, M, at the levels `(2i - 1) / (2M)`.
-        kappa: Where the Huber loss turns linear; 0 for the pinball loss.
+        num_quantiles: Number of quantiles per critic, M, at the levels `(2i - 1) / (2M)`.
+        kappa: Error at which the Huber loss becomes linear; 0 for the pinball loss.
         **options: See `ActorCriticLoss`.
 
     Raises:

@@ -1,4 +1,4 @@
-"""RAC: the regularised actor-critic, soft actor-critic with one regulariser per action component (Appendix B)."""
+"""RAC, a soft actor-critic with one regulariser per action component (Appendix B)."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ class RACLoss(ActorCriticLoss):
     Args:
         actor_network: Policy, from `make_mixed_actor` or `make_gaussian_actor`.
         qvalue_network: List of critics.
-        entropy_samples: Draws per axis for its entropy, independent of the action's own draw.
-        shared_entropy_noise: Whether the states of a batch share these draws, which costs a third, see
+        entropy_samples: Number of draws per axis for its entropy, independent of the action.
+        shared_entropy_noise: Whether the states of a batch share these draws, which takes a third of the time, see
             `tanh_gaussian_entropy` (our choice).
         **options: See `ActorCriticLoss`.
 
     Raises:
-        ValueError: If `entropy_samples` is not positive, or as `ActorCriticLoss`.
+        ValueError: If `entropy_samples` is not positive, and in the cases of `ActorCriticLoss`.
     """
 
     def __init__(

@@ -6,18 +6,17 @@ from collections.abc import Sequence
 from typing import Any
 
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
-from torch import Tensor
 
-from coachable.distributions.mixed_action import MixedAction
+from coachable.losses.actor_critic import ActorCriticLoss
 from coachable.losses.cat_rac import CatRACLoss
 
 
 class CategoricalSACLoss(CatRACLoss):
-    """Categorical SAC, the paper's ablation: Cat-RAC's critic with SAC's one-sample entropy estimate.
+    """Loss of categorical SAC, with Cat-RAC's critic and SAC's one-sample entropy estimate (paper, ablation).
 
-    The negative entropy is the log-density of the one action drawn. In the target that is the hard sample's. In the
-    policy loss categorical heads, through whose samples no gradient passes, contribute `sum_i y_i log pi_i` with the
-    relaxed sample y (our choice). For RAC's estimators with fewer draws use `CatRACLoss(entropy_samples=...)`.
+    The negative entropy is the log-density of the action drawn. The target uses that of the hard sample. In the policy
+    loss categorical heads, whose hard samples have no gradient, contribute `sum_i y_i log pi_i` with the relaxed
+    sample y (our choice). For RAC's estimators with fewer draws, use `CatRACLoss(entropy_samples=...)`.
 
     Args:
         actor_network: Policy, from `make_mixed_actor` or `make_gaussian_actor`.
@@ -38,5 +37,4 @@ class CategoricalSACLoss(CatRACLoss):
                 )
         super().__init__(actor_network, qvalue_network, **options)
 
-    def _sample(self, policy: MixedAction, *, relaxed: bool) -> tuple[Tensor, Tensor]:
-        return policy.relaxed_sample() if relaxed else policy.hard_sample()
+    _sample = ActorCriticLoss._sample  # SAC's instead of RAC's

@@ -1,4 +1,4 @@
-"""Networks: padded residual trunks, style-conditioned actors and critics."""
+"""Networks: padded residual trunks, and style-conditioned actors and critics."""
 
 from coachable.distributions.action_heads import ActionHeads
 from coachable.networks.actors import make_gaussian_actor

@@ -18,7 +18,7 @@ from coachable.networks.residual import ResidualMLP
 
 
 class StyleEncoding(Protocol):
-    """What a network needs of a style space (a `StyleSpace` provides it)."""
+    """Part of a `StyleSpace` that a network uses."""
 
     @property
     def dim(self) -> int:
@@ -31,10 +31,9 @@ class StyleEncoding(Protocol):
 
 
 class TensorModule(TensorDictModule):
-    """A `TensorDictModule` whose network returns tensors, which are written as they are.
+    """`TensorDictModule` that writes the tensors of its network without conversion.
 
-    The base class first sees whether an output has to be converted, and looks for pandas on disk each time: a twentieth
-    of an update.
+    The base class checks each output for a conversion and looks for pandas on disk, which takes 5 % of an update.
     """
 
     def _write_to_tensordict(
@@ -51,11 +50,11 @@ class TensorModule(TensorDictModule):
 
 
 class StyleNetwork(nn.Module):
-    """A residual network of `cat(observation, encode(theta), further inputs)`.
+    """Residual network of `cat(observation, encode(theta), further inputs)`.
 
     Args:
-        space: Style space whose `encode` is applied to theta; `None` makes a network without style.
-        inputs: Width of the other inputs.
+        space: Style space that encodes theta; None for a network without style.
+        inputs: Total width of the other inputs.
         outputs: Width of the head.
         widths: Widths of the residual layers.
         **trunk: Further arguments of :class:`~coachable.networks.residual.ResidualMLP`.
@@ -69,7 +68,7 @@ class StyleNetwork(nn.Module):
         self.trunk = ResidualMLP(inputs + (0 if space is None else space.dim), outputs, widths, **trunk)
 
     def head(self, observation: Tensor, style: Tensor | None, *further: Tensor) -> Tensor:
-        """Return the output `(..., outputs)` of the head for raw (not encoded) `style`."""
+        """Return the output `(..., outputs)` of the head; `style` is not encoded."""
         if self.space is None:
             return self.trunk(observation, *further)
         if style is None:
@@ -78,15 +77,15 @@ class StyleNetwork(nn.Module):
 
 
 class GaussianPolicy(StyleNetwork):
-    """Mean and scale of a diagonal Gaussian over pre-tanh actions, given observation and style.
+    """Network of location and scale of a diagonal Gaussian over actions before the tanh.
 
-    The trunk sees `cat(observation, encode(theta))`. The scale is `exp(l + (h - l)/2 (tanh(raw) + 1))` with
-    `log_scale_range=(l, h)`; `(-2, 2)` gives the `exp(2 tanh(raw))` of the paper's RAC.
+    The trunk's input is `cat(observation, encode(theta))`. The scale is `exp(l + (h - l)/2 (tanh(raw) + 1))` with
+    `log_scale_range=(l, h)`; with `(-2, 2)` it is `exp(2 tanh(raw))`, as in the paper's RAC.
 
     Args:
         obs_dim: Width of the observation.
         action_dim: Number of action dimensions.
-        space: Style space whose `encode` is applied to theta; `None` makes a policy without style.
+        space: Style space that encodes theta; None for a policy without style.
         widths: Widths of the residual layers.
         log_scale_range: Bounds of the logarithm of the scale.
         **trunk: Further arguments of :class:`~coachable.networks.residual.ResidualMLP`.
@@ -109,7 +108,7 @@ class GaussianPolicy(StyleNetwork):
         self.log_scale_range = (float(low), float(high))
 
     def forward(self, observation: Tensor, style: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return location and scale, both `(..., action_dim)` float32, for raw (not encoded) `style`."""
+        """Return location and scale, both `(..., action_dim)` float32; `style` is not encoded."""
         loc, raw = self.head(observation, style).chunk(2, -1)
         low, high = self.log_scale_range
         return loc, torch.exp(torch.tanh(raw) * (0.5 * (high - low)) + 0.5 * (high + low))
@@ -129,13 +128,13 @@ def make_gaussian_actor(
     Args:
         obs_dim: Width of the observation.
         action_dim: Number of action dimensions.
-        space: Style space; theta is read from the key `style` and encoded inside. `None` for no style.
+        space: Style space that encodes theta, which is read from the key `style`; None for no style.
         widths: Widths of the residual layers.
         log_scale_range: Bounds of the logarithm of the scale, see :class:`GaussianPolicy`.
         **trunk: Further arguments of :class:`~coachable.networks.residual.ResidualMLP`.
 
     Returns:
-        A `ProbabilisticActor` reading `observation` and `style`, writing `loc`, `scale` and `action`.
+        A `ProbabilisticActor` that reads `observation` and `style` and writes `loc`, `scale` and `action`.
     """
     policy = GaussianPolicy(obs_dim, action_dim, space, widths, log_scale_range=log_scale_range, **trunk)
     in_keys: list[Any] = ["observation"] if space is None else ["observation", STYLE]

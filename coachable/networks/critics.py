@@ -13,12 +13,14 @@ from coachable.networks.actors import StyleEncoding, StyleNetwork, TensorModule
 
 
 class StyleCritic(StyleNetwork):
-    """Action value (or its quantiles, or logits over its bins) of `cat(observation, encode(theta), action)`.
+    """Network of an action value, its quantiles, or logits over its bins.
+
+    The trunk's input is `cat(observation, encode(theta), action)`.
 
     Args:
         obs_dim: Width of the observation.
         action_dim: Width of the action.
-        space: Style space whose `encode` is applied to theta; `None` makes a critic without style.
+        space: Style space that encodes theta; None for a critic without style.
         widths: Widths of the residual layers.
         num_outputs: Width of the head: 1 for a scalar value, else the number of quantiles or bins.
         **trunk: Further arguments of :class:`~coachable.networks.residual.ResidualMLP`.
@@ -37,12 +39,12 @@ class StyleCritic(StyleNetwork):
         super().__init__(space, obs_dim + action_dim, num_outputs, widths, **trunk)
 
     def forward(self, observation: Tensor, action: Tensor, style: Tensor | None = None) -> Tensor:
-        """Return `(..., num_outputs)` float32, for raw (not encoded) `style`."""
+        """Return `(..., num_outputs)` float32; `style` is not encoded."""
         return self.head(observation, style, action)
 
 
 class CriticModule(TensorModule, ValueOperator):
-    """A `ValueOperator` that writes its tensor as it is."""
+    """`ValueOperator` that writes its tensor without conversion."""
 
 
 def make_critic(
@@ -56,19 +58,19 @@ def make_critic(
 ) -> ValueOperator:
     """Build one critic.
 
-    Losses want several: pass them as a list, one call of this function each. A single module would be re-initialised
-    per copy by TorchRL, and lose its Glorot weights.
+    Build each critic of a loss by its own call, and pass them as a list. TorchRL would initialise copies of a single
+    module again, without the Glorot weights.
 
     Args:
         obs_dim: Width of the observation.
         action_dim: Width of the action.
-        space: Style space; theta is read from the key `style` and encoded inside. `None` for no style.
+        space: Style space that encodes theta, which is read from the key `style`; None for no style.
         widths: Widths of the residual layers.
         num_outputs: 1 for a scalar value, else the number of quantiles or logits.
         **trunk: Further arguments of :class:`~coachable.networks.residual.ResidualMLP`.
 
     Returns:
-        A `ValueOperator` reading `observation`, `action`, `style` and writing `state_action_value`.
+        A `ValueOperator` that reads `observation`, `action` and `style` and writes `state_action_value`.
     """
     critic = StyleCritic(obs_dim, action_dim, space, widths, num_outputs=num_outputs, **trunk)
     in_keys = ["observation", "action"] if space is None else ["observation", "action", STYLE]

@@ -29,17 +29,18 @@ def make_hl_gauss_critic(
     Args:
         obs_dim: Width of the observation.
         action_dim: Width of the action (for mixed actions `ActionHeads.action_dim`).
-        space: Style space; theta is read from the key `style`. None for no style.
+        space: Style space that encodes theta, which is read from the key `style`; None for no style.
         widths: Widths of the residual layers.
-        v_min: Smallest value represented; as in the loss, like the next two.
+        v_min: Smallest value represented; it, `v_max` and `num_atoms` must equal those of the loss.
         v_max: Largest value represented.
         num_atoms: Number of bins.
-        initial_value: What the critic predicts before training, see `initialise_value`; None for the plain
-            initialisation, which predicts the middle of the support.
+        initial_value: Prediction before training, see `initialise_value`; None for the usual initialisation, which
+            predicts the middle of the support.
         **options: Further arguments of `make_critic`.
 
     Returns:
-        A `ValueOperator` reading `observation`, `action`, `style` and writing `state_action_value` (..., num_atoms).
+        A `ValueOperator` that reads `observation`, `action` and `style` and writes `state_action_value`
+        (..., num_atoms).
 
     Raises:
         ValueError: If the support is empty, or `initial_value` lies outside it.

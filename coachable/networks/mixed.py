@@ -1,4 +1,4 @@
-"""Policies over mixed discrete-continuous actions, one action tensor each (Appendices B and C)."""
+"""Policies over mixed discrete-continuous actions in one tensor (Appendices B and C)."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from coachable.networks.actors import StyleEncoding, StyleNetwork, TensorModule
 
 
 class MixedPolicy(StyleNetwork):
-    """Probabilities of the categorical heads, location and scale of the axes, given observation and style.
+    """Network of the probabilities of the categorical heads, and of location and scale of the axes.
 
-    The trunk sees `cat(observation, encode(theta))`. Heads run in float32, also under autocast. The scale of the axes
-    is `exp(2 tanh(raw))` (paper), their location is unbounded and its tanh is the deterministic action.
+    The trunk's input is `cat(observation, encode(theta))`. Heads run in float32, also under autocast. The scale of the
+    axes is `exp(2 tanh(raw))` (paper). Their location is unbounded, and its tanh is the deterministic action.
 
     Args:
         obs_dim: Width of the observation.
         heads: Components of the action.
-        space: Style space whose `encode` is applied to theta; None for a policy without style.
+        space: Style space that encodes theta; None for a policy without style.
         widths: Widths of the residual layers.
         **trunk: Further arguments of `ResidualMLP`.
     """
@@ -44,7 +44,7 @@ class MixedPolicy(StyleNetwork):
         self.heads = heads
 
     def forward(self, observation: Tensor, style: Tensor | None = None) -> tuple[Tensor, ...]:
-        """Return `probs` if there are categorical heads, then `loc` and `scale` if there are axes, float32."""
+        """Return `probs` if there are categorical heads, then `loc` and `scale` if there are axes, in float32."""
         raw = at_least_float32(self.head(observation, style))
         preferences, loc, raw_scale = raw.split((self.heads.num_categorical, self.heads.axes, self.heads.axes), -1)
         outputs: tuple[Tensor, ...] = ()
@@ -66,17 +66,16 @@ def make_mixed_actor(
 
     Args:
         obs_dim: Width of the observation.
-        heads: Components of the action, or the arguments of `ActionHeads`, as a configuration file has them; also
-            works with only axes or only categorical heads.
-        space: Style space; theta is read from the key `style` and encoded inside. None for no style.
+        heads: Components of the action, or the arguments of `ActionHeads` as a mapping, for configuration files.
+        space: Style space that encodes theta, which is read from the key `style`; None for no style.
         widths: Widths of the residual layers.
         **trunk: Further arguments of `ResidualMLP`.
 
     Returns:
-        A `ProbabilisticActor` reading `observation` and `style`, writing `probs`, `loc`, `scale` (those that exist)
-        and `action`, with hard one-hots. Unless told otherwise (`set_exploration_type`) it samples its actions where
-        it has categorical heads, as in training: at their modes it would never do what is right now and then, such as
-        dodging. With axes alone it takes the deterministic action.
+        A `ProbabilisticActor` that reads `observation` and `style`. It writes `action` with hard one-hots, `probs` with
+        categorical heads, and `loc` and `scale` with axes. By default (see `set_exploration_type`) an actor with
+        categorical heads samples its actions, because their modes would never include rare actions such as dodging.
+        An actor with axes alone takes the deterministic action.
 
     Example:
         >>> actor = make_mixed_actor(3, ActionHeads((4, 2), axes=1), None, widths=(8,))

@@ -1,4 +1,4 @@
-"""Policies as plain functions of two tensors, for export and explanation."""
+"""Policies as plain functions of tensors, for export and explanation."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from coachable.networks.mixed import MixedPolicy
 
 __all__ = ["ActionOutputs", "DeterministicAction", "policy_network"]
 
-_SCALE = 2.0**20  # cancels out; without it the exporter takes EPSILON for 0, and a head without preferences for 0 / 0
+_SCALE = 2.0**20  # cancels; without it the exporter rounds EPSILON to 0, and a head without preferences is 0 / 0
 
 
 def policy_network(actor: TensorDictModuleBase) -> GaussianPolicy | MixedPolicy:
-    """The network inside an actor.
+    """Return the network inside an actor.
 
     Raises:
-        ValueError: If the actor holds no `GaussianPolicy` or `MixedPolicy` that reads a style.
+        ValueError: If the actor does not contain exactly one `GaussianPolicy` or `MixedPolicy` that reads a style.
     """
     found = [module for module in actor.modules() if isinstance(module, GaussianPolicy | MixedPolicy)]
     styled = [module for module in found if module.space is not None]
@@ -43,9 +43,10 @@ class _PlainPolicy(nn.Module):
         self.observation_dim = self.policy.trunk.in_features - self.style_dim
 
     def _parts(self, raw: Tensor) -> tuple[Tensor | None, tuple[Tensor, ...]]:
-        """Axes after the tanh, and probabilities per head, from the trunk's output.
+        """Return the axes after the tanh and the probabilities per head, from the trunk's output.
 
-        By elementary operations, because neither exporters nor derivatives get past the regret gradient's function.
+        This uses only elementary operations, because the regret gradient's function supports neither export nor
+        derivatives.
         """
         if isinstance(self.policy, GaussianPolicy):
             return torch.tanh(raw.chunk(2, -1)[0]), ()
@@ -62,9 +63,9 @@ class _PlainPolicy(nn.Module):
 
 
 class DeterministicAction(_PlainPolicy):
-    """`(observation, style)` to the deterministic action, style raw and encoded inside.
+    """Deterministic action of a policy as a function `(observation, style)`, where `style` is not encoded.
 
-    Categorical heads also give their probabilities: policies of mixed actions act by sampling them.
+    The probabilities of categorical heads are returned as well, because policies of mixed actions sample from them.
 
     Args:
         actor: From `make_gaussian_actor` or `make_mixed_actor`; its weights are shared.
@@ -92,15 +93,15 @@ class DeterministicAction(_PlainPolicy):
             self.choice_sizes = heads.categorical
 
     def forward(self, observation: Tensor, style: Tensor) -> tuple[Tensor, ...]:
-        """Outputs in the order of `output_names`.
+        """Return the outputs in the order of `output_names`.
 
         Args:
-            observation: `(..., observation_dim)`.
-            style: `(..., style_dim)`, raw.
+            observation: Observations `(..., observation_dim)`.
+            style: Styles `(..., style_dim)`, not encoded.
 
         Returns:
-            `action` `(..., A)` in [-1, 1]; or `axes` `(..., axes)` in [-1, 1] and `choices` `(..., heads)` int64, the
-            index of each head's most likely value, and `probabilities` `(..., sum(choice_sizes))`, head after head.
+            `action` `(..., A)` in [-1, 1]. For mixed actions, `axes` `(..., axes)` in [-1, 1], `choices` `(..., heads)`
+            int64, the index of each head's most likely value, and `probabilities` `(..., sum(choice_sizes))`.
         """
         axes, probabilities = self._parts(self.policy.trunk(observation, self.space.encode(style)))
         outputs = () if axes is None else (axes,)
@@ -110,16 +111,16 @@ class DeterministicAction(_PlainPolicy):
 
 
 class ActionOutputs(_PlainPolicy):
-    """Differentiable account of the action, as a function of what the network sees, `cat(observation, encode(theta))`.
+    """Differentiable outputs of a policy as a function of its trunk's input, `cat(observation, encode(theta))`.
 
-    The axes after the tanh, and the probabilities of the categorical values with their true derivative (training uses
-    the regret gradient instead, which is none).
+    The outputs are the probabilities of the categorical values and the axes after the tanh. The probabilities have
+    their true derivative, which training replaces by the regret gradient.
 
     Args:
         actor: From `make_gaussian_actor` or `make_mixed_actor`; its weights are shared.
     """
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """`(B, observation_dim + style_dim)` to `(B, outputs)`."""
+        """Map `(B, observation_dim + style_dim)` to `(B, outputs)`."""
         axes, probabilities = self._parts(self.policy.trunk(inputs))
         return torch.cat([*probabilities, *(() if axes is None else (axes,))], -1)

@@ -1,11 +1,11 @@
 """Padded residual network of the paper's policies and critics.
 
-Every layer is `block(x) = ReLU(LayerNorm(W x + b)) + fit(x)`, where `fit` has no parameters: it pads the input with
-zeros, or cuts it, to the width of the layer. Heads are linear. Source: the paper, network appendix (arXiv 2607.00642).
+Every layer is `block(x) = ReLU(LayerNorm(W x + b)) + fit(x)`. `fit` has no parameters. It pads the input with zeros, or
+cuts it, to the width of the layer. Heads are linear. Source: the paper, network appendix (arXiv 2607.00642).
 
-Dropout, which the racing policies of Wurman et al. 2022 have, is on only while a gradient is asked for. A policy that
-acts, is evaluated or gives the action of a target does so without gradients, and therefore without dropout, also where
-a collector holds a copy of it that nobody has put into evaluation mode.
+Dropout, as in the racing policies of Wurman et al. 2022, is applied only while gradients are enabled. A policy that
+collects, is evaluated or computes the actions of a target therefore has no dropout, even if it is not in evaluation
+mode.
 """
 
 from __future__ import annotations
@@ -26,13 +26,12 @@ def fit_features(x: Tensor, width: int, side: Side = "end") -> Tensor:
     """Pad or cut the last dimension of `x` to `width` (the identity path of a residual layer).
 
     Args:
-        x: Features, `(..., n)`.
-        width: Wanted size of the last dimension.
-        side: Where zeros go when `x` is narrower: `"end"` gives `[x, 0]`, `"beginning"` gives `[0, x]`. Where `x` is
-            wider, features are dropped from there, as padding by a negative amount would.
+        x: Features `(..., n)`.
+        width: New size of the last dimension.
+        side: Side that is padded or cut: if `x` is narrower, `"end"` gives `[x, 0]` and `"beginning"` gives `[0, x]`.
 
     Returns:
-        `(..., width)`; `x` itself where nothing changes, a view where it is cut.
+        Features `(..., width)`: `x` itself if it has that width, and a view if it is cut.
 
     Example:
         >>> fit_features(torch.tensor([1.0, 2.0]), 3, side="beginning").tolist()
@@ -49,24 +48,18 @@ def fit_features(x: Tensor, width: int, side: Side = "end") -> Tensor:
 
 
 class ResidualBlock(nn.Module):
-    """One layer, `ReLU(LayerNorm(W x + b)) + fit(x)`.
+    """Layer `ReLU(LayerNorm(W x + b)) + fit(x)`.
 
     Args:
         in_features: Width of the input.
         out_features: Width of the output.
         side: Padding side of the identity path, see :func:`fit_features`.
-        layer_norm: Without it the layer is `ReLU(W x + b) + fit(x)`.
-        dropout: Probability with which a unit is dropped after the ReLU, in training mode and where gradients are on.
+        layer_norm: Whether to apply the layer norm.
+        dropout: Probability with which a unit is dropped after the ReLU, in training mode with gradients enabled.
     """
 
     def __init__(
-        self,
-        in_features: int,
-        out_features: int,
-        *,
-        side: Side = "end",
-        layer_norm: bool = True,
-        dropout: float = 0.0,
+        self, in_features: int, out_features: int, *, side: Side = "end", layer_norm: bool = True, dropout: float = 0.0
     ) -> None:
         super().__init__()
         self.linear = nn.Linear(in_features, out_features)
@@ -76,7 +69,7 @@ class ResidualBlock(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Glorot-uniform weight, zero bias, identity layer norm (the paper's initialisation)."""
+        """Initialise as in the paper: Glorot-uniform weight, zero bias, identity layer norm."""
         nn.init.xavier_uniform_(self.linear.weight)
         nn.init.zeros_(self.linear.bias)
         if self.norm is not None:
@@ -93,23 +86,23 @@ class ResidualBlock(nn.Module):
         return hidden + fit_features(x, hidden.shape[-1], self.side)
 
     def extra_repr(self) -> str:
-        """Padding of the identity path."""
+        """Return the padding of the identity path, for `repr`."""
         return f"side={self.side!r}"
 
 
 class ResidualMLP(nn.Module):
     """Stack of residual layers with a linear head.
 
-    Layers pad their input at the end and at the beginning in turns, which makes no difference between equal widths.
+    Layers pad their input alternately at the end and at the beginning. Layers of equal width do not pad.
 
     Args:
         in_features: Width of the input.
-        out_features: Width of the head; `None` leaves the head out.
+        out_features: Width of the head; None for no head.
         widths: Widths of the layers. The paper uses three of 512 (humanoid), 4096, 2048, 1024, 512 (combat).
-        layer_norm: Layer norm before the activation of every layer.
-        head_gain: Factor on the head's initial weights. With the paper's Glorot weights (1) and inputs of unit size the
-            outputs have a standard deviation of about 2, where tanh is nearly flat: a policy may want less.
-        dropout: Probability with which a layer's unit is dropped while learning; see the module.
+        layer_norm: Whether every layer has a layer norm.
+        head_gain: Factor on the head's initial weights. With 1 (paper) and inputs of unit size, the outputs have a
+            standard deviation of about 2, where tanh is almost flat, so that policies may need less.
+        dropout: Probability with which a layer's unit is dropped while learning, see the module.
 
     Raises:
         ValueError: If a width is not positive, or `dropout` is not in [0, 1).
@@ -150,8 +143,8 @@ class ResidualMLP(nn.Module):
     def forward(self, *inputs: Tensor) -> Tensor:
         """Map inputs `(..., d_i)`, concatenated to `in_features`, to `(..., out_features)`.
 
-        The head runs in float32 also under autocast: values and log-probabilities need more than bfloat16's 8 bits.
-        Without a head this returns the last layer's features.
+        The head runs in float32, also under autocast, because values and log-probabilities need more precision than
+        bfloat16. Without a head, this returns the last layer's features.
         """
         x = inputs[0] if len(inputs) == 1 else torch.cat(inputs, -1)
         hidden = self.blocks(x)
@@ -162,20 +155,20 @@ class ResidualMLP(nn.Module):
 
 
 def with_new_inputs(weights: Mapping[str, Tensor], seen: int, new: int) -> dict[str, Tensor]:
-    """State of a :class:`ResidualMLP` with `new` inputs more, which do what the others did while the new ones are 0.
+    """Return the state of a :class:`ResidualMLP` with more inputs and, while these are 0, the same outputs.
 
-    Weights of the new inputs are 0. That alone is not enough where the first layer is wider than its input: the
-    identity path then carries inputs behind the new ones elsewhere, so that the units of all layers change places with
-    them. What it carries of the new inputs goes on top of units that carried nothing.
+    The weights of the new inputs are 0. If the first layer is wider than its input, the identity path maps the inputs
+    after the new ones to other units. The units of all layers are reordered accordingly, and the new inputs are mapped
+    to units to which no input was mapped before.
 
     Args:
-        weights: `blocks.0.linear.weight` and so on, with any leading dimensions (a stack of critics), of a network
-            whose first layer pads at the end.
-        seen: Inputs before the new ones.
-        new: How many there are.
+        weights: State of a network whose first layer pads at the end, `blocks.0.linear.weight` and so on. It may have
+            leading dimensions, for a stack of critics.
+        seen: Number of inputs before the new ones.
+        new: Number of new inputs.
 
     Raises:
-        ValueError: If layers differ in width, or the first ends among the inputs: there is no such state then.
+        ValueError: If there is no such state, because layers differ in width or the first one ends among the inputs.
     """
     first = weights["blocks.0.linear.weight"]
     width, inputs = first.shape[-2:]
@@ -196,9 +189,9 @@ def with_new_inputs(weights: Mapping[str, Tensor], seen: int, new: int) -> dict[
     order = torch.cat(moved).to(first.device)
     for name, value in wide.items():
         linear = name.endswith("linear.weight")
-        if name.startswith("blocks."):  # what gives units
+        if name.startswith("blocks."):  # its outputs are units
             value = value.index_select(-2 if linear else -1, order)
-        if name == "head.weight" or (linear and not name.startswith("blocks.0.")):  # what takes them
+        if name == "head.weight" or (linear and not name.startswith("blocks.0.")):  # its inputs are units
             value = value.index_select(-1, order)
         wide[name] = value
     return wide

@@ -1,4 +1,4 @@
-"""The replay buffer with event tables and multi-tables (paper, Appendix B, Stratified Sampling)."""
+"""Replay buffer with event tables and multi-tables (paper, Appendix B, Stratified Sampling)."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -22,36 +22,36 @@ __all__ = ["EventTableBuffer"]
 
 
 class EventTableBuffer(TensorDictReplayBuffer):
-    """Replay in several first-in-first-out tables, of which every batch holds an exact share.
+    """Replay buffer of several first-in-first-out tables, each of which fills an exact share of every batch.
 
-    Every step goes to one routed table: the table "default", or with `route` the one of its scenario (multi-tables).
-    When an event fires, it and the steps before it, at most `event_horizon` in all and none from before the episode's
-    start, are copied to the event's table as well, unless they are there already (event tables). Copies keep their
-    labels and stay when the default table has long dropped the originals.
+    Every step is stored in one routed table: the table "default", or with `route` the table of its scenario
+    (multi-tables). When an event fires, its step and the steps before it are also copied to the event's table (event
+    tables). These are at most `event_horizon` steps of the same episode, without those that the table already contains.
+    Copies keep their labels, and they stay after the default table has dropped the originals.
 
-    Batches `(steps,)` are read as time-major (all environments at one time, then at the next), batches `(num_envs,
-    time)` as TorchRL's collectors yield them. Trajectory numbers, `("collector", "traj_ids")`, override both. Episodes
-    may span any number of `extend` calls, and batches of several workers may be interleaved if they carry trajectory
-    numbers. All of it runs in the process that calls `extend`.
+    Batches `(steps,)` are read as time-major: all environments at one time, then at the next. Batches `(num_envs,
+    time)` are read as TorchRL's collectors yield them. Trajectory numbers, `("collector", "traj_ids")`, override both.
+    Episodes may span any number of `extend` calls, and batches of several workers may be interleaved if they contain
+    trajectory numbers. Everything runs in the process that calls `extend`.
 
-    Samples carry `index` and `table`, the number of the table in `names`.
+    Samples contain `index` and `table`, the number of the table in `names`.
 
     Args:
-        table_capacities: Records per table, by name: routed tables and event tables.
-        events: Which event tables there are and when their events fire (`coachable.replay.routing`).
-        event_horizon: H_max, steps stored per event, the event step included. Needed with `events`.
-        route: Which routed tables there are and where each step goes; without it there is one, "default".
+        table_capacities: Number of records of each table, by name: routed tables and event tables.
+        events: Event predicate, which defines the event tables (`coachable.replay.routing`).
+        event_horizon: H_max, number of steps stored per event, including its own. Needed with `events`.
+        route: Route, which defines the routed tables; None for one table, "default".
         table_proportions: Share of each table in a batch. By default event tables share one half equally, routed tables
             the other (our choice).
-        num_envs: Environments in a batch `(steps,)` that carries no trajectory numbers.
-        n_steps: Steps summed into one transition, before routing; see `coachable.replay.n_step.NStep`.
+        num_envs: Number of environments in a batch `(steps,)` without trajectory numbers.
+        n_steps: Number of steps summed into one transition, before routing; see `coachable.replay.n_step.NStep`.
         gamma: Discount of that sum.
-        discounted_keys: What is summed besides rewards.
+        discounted_keys: Keys of further entries to sum besides rewards.
         prioritized: Whether to draw within each table in proportion to priorities; importance weights are relative to
             the table.
         priority_alpha: Exponent of the priorities.
         priority_beta: Exponent of the importance weights (`rb.sampler.beta` may be changed later).
-        storage: Makes the storage for a number of records, such as `partial(LazyTensorStorage, device="cuda")` or
+        storage: Returns the storage for a number of records, such as `partial(LazyTensorStorage, device="cuda")` or
             `LazyMemmapStorage`.
         **kwargs: `batch_size`, `transform`, `generator`, `priority_key`, `pin_memory`, `collate_fn` of
             `TensorDictReplayBuffer`.
@@ -131,15 +131,15 @@ class EventTableBuffer(TensorDictReplayBuffer):
         event_share: float = 0.5,
         **kwargs: Any,
     ) -> "EventTableBuffer":
-        """A default table and one table per event, all of one size.
+        """Build a buffer with a default table and one table per event, all event tables of one size.
 
         Args:
             events: Event predicate.
-            capacity: Records of the default table.
-            event_capacity: Records of each event table.
+            capacity: Number of records of the default table.
+            event_capacity: Number of records of each event table.
             event_horizon: H_max.
-            event_share: Share of a batch that the event tables have together, equally.
-            **kwargs: As for the class.
+            event_share: Share of all event tables together in a batch, divided equally.
+            **kwargs: Further arguments of the class.
 
         Raises:
             ValueError: If the share is not between 0 and 1.
@@ -152,12 +152,12 @@ class EventTableBuffer(TensorDictReplayBuffer):
 
     @classmethod
     def for_scenarios(cls, scenarios: Sequence[str], *, capacity: int, **kwargs: Any) -> "EventTableBuffer":
-        """Make one table per scenario, all of one size and with one share of each batch (multi-tables).
+        """Build a buffer with one table per scenario, all of one size and one share of each batch (multi-tables).
 
         Args:
             scenarios: Names of the scenarios, in the order of the numbers under `scenario` in the data.
-            capacity: Records of all tables together.
-            **kwargs: As for the class.
+            capacity: Number of records of all tables together.
+            **kwargs: Further arguments of the class.
         """
         return cls(dict.fromkeys(scenarios, capacity // len(scenarios)), route=KeyRoute(scenarios), **kwargs)
 
@@ -167,11 +167,11 @@ class EventTableBuffer(TensorDictReplayBuffer):
         return self.regions.names
 
     def __len__(self) -> int:
-        """Records in all tables, copies included; `write_count` counts every step once."""
+        """Return the number of records in all tables, including copies; `write_count` counts every step once."""
         return int(self.regions.sizes.sum())
 
     def __getitem__(self, index: Any) -> Any:
-        """Records by slot, as in `index` of a sample; a slice runs over live records only, table after table."""
+        """Return records by slot, as in `index` of a sample; a slice selects from the live records, table by table."""
         if isinstance(index, slice):
             index = np.concatenate([self.regions.slots(i) for i in range(len(self.regions))])[index]
         return super().__getitem__(index)
@@ -189,23 +189,23 @@ class EventTableBuffer(TensorDictReplayBuffer):
             return self._storage.get(slots.to(self._storage.device))  # type: ignore[arg-type]
 
     def statistics(self) -> dict[str, dict[str, int | float]]:
-        """Per table: size, capacity, fill, records written and evicted, events admitted, copies lost to eviction."""
+        """Return numbers per table, see `TableWriter.statistics`."""
         return self._writer.statistics()
 
     def stats(self) -> dict[str, int | float | bool]:
-        """TorchRL's snapshot, with `tables/NAME/...` of `statistics`."""
+        """Return TorchRL's statistics, and those of `statistics` as `tables/NAME/...`."""
         tables = {f"tables/{name}/{key}": v for name, row in self.statistics().items() for key, v in row.items()}
         return {**super().stats(), **tables}
 
     def extend(self, tensordicts: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
-        """Add steps; the input is left as it is.
+        """Add steps; the input is not changed.
 
         Args:
-            tensordicts: `(steps,)`, time-major, or `(num_envs, time)`, as collectors yield them.
-            update_priority: Not used: new records get the largest priority seen so far.
+            tensordicts: Transitions `(steps,)`, time-major, or `(num_envs, time)`, as collectors yield them.
+            update_priority: Not used, because new records get the largest priority so far.
 
         Returns:
-            Slots written to: those of the steps, then those of copies in event tables.
+            Slots `(slots,)` of the steps, then of their copies in event tables.
 
         Raises:
             ValueError: If shapes do not fit the tables (see the class).
@@ -223,13 +223,13 @@ class EventTableBuffer(TensorDictReplayBuffer):
         return self.extend(data.unsqueeze(0))
 
     def finish(self) -> Tensor:
-        """End every open episode where its data ends, for instance because the environments are going to be reset.
+        """End every open episode at its last step, for instance because the environments are going to be reset.
 
-        Held back n-step sums are written, bootstrapping from the last state seen, and no later window reaches back over
-        this point. Call it after loading a checkpoint, too, unless the environments were restored with it.
+        Unfinished n-step sums are written and bootstrap from the last state. Later windows do not include earlier
+        steps. Also call this after loading a checkpoint, unless the environments were restored with it.
 
         Returns:
-            Slots written to.
+            Slots `(slots,)` of the written records.
         """
         with self._replay_lock, self._write_lock:
             index = self._writer.finish()
@@ -237,7 +237,7 @@ class EventTableBuffer(TensorDictReplayBuffer):
         return index
 
     def update_tensordict_priority(self, data: TensorDictBase) -> None:
-        """Set priorities from `priority_key` of a sample; of several labels of one record the largest counts."""
+        """Set priorities from `priority_key` of a sample; if a record has several labels, the largest counts."""
         if self._sampler.prioritized:
             self.update_priority(data.get("index"), data.get(self.priority_key))
 
@@ -247,10 +247,10 @@ class EventTableBuffer(TensorDictReplayBuffer):
             self._sampler.update_priority(index, priority)
 
     def mark_update(self, index: int | Tensor) -> None:
-        """Do nothing: records are written by `extend` alone, which sets their priorities."""
+        """Do nothing, because only `extend` writes records, and it sets their priorities."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the whole state as tensors and plain containers."""
+        """Return the whole state in tensors and plain containers."""
         rng = None if self._rng is None else {"state": self._rng.get_state().clone(), "device": str(self._rng.device)}
         with self._replay_lock:
             return {
@@ -263,7 +263,7 @@ class EventTableBuffer(TensorDictReplayBuffer):
             }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restore `state_dict`; the tables must be the same.
+        """Restore what `state_dict` returned; the tables must be the same.
 
         Raises:
             ValueError: If tables, horizon or prioritisation differ.

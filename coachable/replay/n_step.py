@@ -1,4 +1,4 @@
-"""n-step transitions from a stream of one-step transitions."""
+"""Assembly of n-step transitions from streams of one-step transitions."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,23 +18,22 @@ REWARDS = (("next", "reward"), ("next", TASK_REWARD), ("next", STYLE_REWARD))
 
 
 class NStep:
-    """Sums rewards over up to `n_steps` steps and lets `next` point at the last state seen.
+    """Assembler of n-step transitions, which sum rewards over up to `n_steps` steps.
 
     The transition at t gets `R_t = sum_{l<k} gamma^l r_{t+l}`, the `next` entries of step t+k-1, `steps_to_next_obs =
     k` (TorchRL's key, which its value estimators read) and `discount = gamma^k`, both `(..., 1)`. k is `n_steps`, or
-    less where the episode ends first, terminated or truncated: the discount is gamma to the steps summed, and whoever
-    computes the target bootstraps unless `("next", "terminated")`.
+    less if the episode ends first, terminated or truncated. A loss bootstraps unless `("next", "terminated")`.
 
-    Steps whose sum is still open are held back until the steps after them arrive, so that several calls per episode
-    give the same transitions as one. `flush` ends all of them where the data ends.
+    Steps whose sum is incomplete are held back until the following steps arrive, so that several calls per episode give
+    the same transitions as one. `flush` completes all sums at the end of the data.
 
     Args:
-        n_steps: Steps to sum, N.
+        n_steps: Number of steps to sum, N.
         gamma: Discount per step.
-        discounted_keys: What is summed besides the rewards. `("next", "style_features")` belongs here if, and only if,
-            the style reward is linear in the features; otherwise the features are dropped from n-step transitions,
-            because relabelling from the last step's features would be wrong.
-        patience: A stream of which nothing arrived for that many steps has ended.
+        discounted_keys: Keys of further entries to sum besides the rewards. Include `("next", "style_features")` only
+            if the style reward is linear in the features. Without it, n-step transitions have no features, because
+            relabelling from the last step's features would be wrong.
+        patience: Number of steps after which a stream has ended if nothing of it arrived.
 
     Raises:
         ValueError: If `n_steps` is not positive or `gamma` lies outside [0, 1].
@@ -45,23 +44,22 @@ class NStep:
         SHARE.check("gamma", gamma)
         self.n_steps = n_steps
         self.gamma = gamma
-        self.summed = tuple(
-            dict.fromkeys((*REWARDS, *(tuple(k) if not isinstance(k, str) else k for k in discounted_keys)))
-        )
+        further = (key if isinstance(key, str) else tuple(key) for key in discounted_keys)
+        self.summed = tuple(dict.fromkeys((*REWARDS, *further)))
         self.patience = patience
         self._data: TensorDictBase | None = None
         self._steps: Steps | None = None
 
     def __len__(self) -> int:
-        """Number of steps held back."""
+        """Return the number of steps held back."""
         return 0 if self._steps is None else len(self._steps)
 
     def push(self, data: TensorDictBase, steps: Steps) -> tuple[TensorDictBase, Steps]:
-        """Add steps and return the transitions that became complete, in the order in which they did.
+        """Add steps and return the transitions that they complete, in the order of completion.
 
         Args:
-            data: `(steps,)` one-step transitions.
-            steps: their bookkeeping, which the returned transitions inherit from the step they start at.
+            data: One-step transitions `(steps,)`.
+            steps: Their bookkeeping. A returned transition has that of its first step.
         """
         if self._data is not None and self._steps is not None:
             data = torch.cat([self._data, data])  # type: ignore[assignment]
@@ -69,7 +67,7 @@ class NStep:
         return self._emit(data, steps, finish=False)
 
     def flush(self) -> tuple[TensorDictBase, Steps] | None:
-        """Return what is held back, every sum ending where the data ends; None if there is nothing."""
+        """Return the steps that are held back, with their sums ended at the last step, or None without such steps."""
         if self._data is None or self._steps is None:
             return None
         return self._emit(self._data, self._steps, finish=True)
@@ -111,9 +109,7 @@ class NStep:
         if ("next", STYLE_FEATURES) not in self.summed:
             nxt = nxt.exclude(STYLE_FEATURES)
         if following.get(EVENTS, None) is not None:
-            nxt.set(
-                EVENTS, following.get(EVENTS)[first_row]
-            )  # the events of the step that the table membership is about
+            nxt.set(EVENTS, following.get(EVENTS)[first_row])  # those by which the transition was assigned to tables
         out.set("next", nxt)
         for key in self.summed:
             value: Any = data.get(key, None)
@@ -125,14 +121,12 @@ class NStep:
                 _add(total, value[at], self.gamma**lag, count > lag)
             out.set(key, total)
         out.set("steps_to_next_obs", count.unsqueeze(-1))
-        out.set(
-            "discount",
-            torch.as_tensor(self.gamma, dtype=torch.float64).pow(count.cpu()).float().to(device).unsqueeze(-1),
-        )
+        discount = torch.as_tensor(self.gamma, dtype=torch.float64).pow(count.cpu()).float()
+        out.set("discount", discount.to(device).unsqueeze(-1))
         return out
 
     def clear(self) -> None:
-        """Forget the held back steps."""
+        """Drop the steps that are held back."""
         self._data = self._steps = None
 
     def state_dict(self) -> dict[str, Any]:
@@ -142,7 +136,7 @@ class NStep:
         return {"data": self._data.to_dict(), "steps": self._steps.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any], device: torch.device | None = None) -> None:
-        """Restore what was held back."""
+        """Restore what `state_dict` returned."""
         self.clear()
         if state:
             self._steps = Steps.from_state_dict(state["steps"])

@@ -1,4 +1,4 @@
-"""The records of a replay buffer on disk: one `.npy` file per entry with its checksum, written and read in chunks."""
+"""Records of a replay buffer on disk: one `.npy` file with a checksum per entry, written and read in chunks."""
 
 import json
 import os
@@ -14,19 +14,19 @@ from coachable.files import CheckpointError, refusing, write_text
 
 __all__ = ["read_records", "record_bytes", "write_records"]
 
-_VERSION = 2  # 1, without a version, had no checksums
+_VERSION = 2  # files of version 1 have neither a version nor checksums
 _INDEX = "index.json"
-_CHUNK = 65_536  # records per copy: bounds the extra memory
+_CHUNK = 65_536  # records per copy, which limits the extra memory
 
 
 def write_records(storage: Any, folder: Path, unused: np.ndarray | None = None) -> None:
     """Write the filled part of a `TensorStorage`.
 
     Args:
-        storage: Of a replay buffer.
-        folder: Exists.
-        unused: `(len(storage),)` bool, slots that were never written. They hold whatever was in memory before; zeros
-            take its place in the files, so that equal buffers have equal files.
+        storage: Storage of a replay buffer.
+        folder: An existing folder.
+        unused: Whether each slot was never written, `(len(storage),)` bool. Such slots are zeros in the files, because
+            their content is undefined and equal buffers must have equal files.
 
     Raises:
         OSError: If writing fails.
@@ -45,7 +45,7 @@ def write_records(storage: Any, folder: Path, unused: np.ndarray | None = None) 
             for start in range(0, filled, _CHUNK):
                 chunk, stray = _numpy(value[start : start + _CHUNK]), unused[start : start + _CHUNK]
                 if stray.any():
-                    chunk = chunk.copy()  # it may share the storage's memory
+                    chunk = chunk.copy()  # the chunk may share the storage's memory
                     chunk[stray] = 0
                 crc = zlib.crc32(chunk.data, crc)
                 chunk.tofile(stream)
@@ -59,15 +59,15 @@ def read_records(storage: Any, folder: Path) -> int:
     """Fill a storage from `write_records`'s files.
 
     Args:
-        storage: Of a buffer made like the saved one. Where reading fails, it may hold a part of the records.
-        folder: Written by `write_records`.
+        storage: Storage of a buffer made like the saved one. If reading fails, it may contain a part of the records.
+        folder: Folder written by `write_records`.
 
     Returns:
-        How many records were read.
+        Number of records read.
 
     Raises:
-        CheckpointError: If files are missing, damaged or link elsewhere, or the capacities differ (a ring buffer's
-            order depends on it).
+        CheckpointError: If files are missing, damaged or named outside the folder, or the capacities differ, on which
+            the order of a ring buffer depends.
     """
     if not (folder / _INDEX).is_file():
         raise CheckpointError(f"no such file: {folder / _INDEX}, which lists the records of the replay buffer")
@@ -104,7 +104,7 @@ def read_records(storage: Any, folder: Path) -> int:
 
 
 def record_bytes(storage: Any) -> int:
-    """Return the bytes that the records of a storage take on disk."""
+    """Return the size of a storage's records on disk [bytes]."""
     if not len(storage):
         return 0
     first = storage.get(slice(0, 1))
@@ -128,7 +128,7 @@ def _array(folder: Path, entry: dict[str, Any], filled: int, version: int) -> np
 
 
 def _file(key: list[str]) -> str:
-    """Name of an entry's file, which never leads out of its folder."""
+    """Return the name of an entry's file, which is never outside its folder."""
     name = ".".join(key) + ".npy"
     if Path(name).name != name:
         raise CheckpointError(f"{name!r} is no name of a file of records: expected one without folders")

@@ -1,4 +1,4 @@
-"""One storage cut into contiguous regions, one per table, each with its own FIFO cursor."""
+"""Contiguous regions of one storage, one per table, each with its own FIFO cursor."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,13 +9,13 @@ __all__ = ["Regions"]
 
 
 class Regions:
-    """Where the records of each table live in one storage.
+    """Positions of the records of each table in one storage.
 
-    Regions are laid out in reverse order of the tables: the first table, usually by far the largest, comes last, so
-    that the used prefix of the storage stays short while it fills (checkpoints write that prefix).
+    Regions have the reverse order of the tables. The first table is usually by far the largest. Because it comes last,
+    the used prefix of the storage, which checkpoints write, stays short while the buffer fills.
 
     Args:
-        capacities: Records per table, by name.
+        capacities: Number of records of each table, by name.
 
     Raises:
         ValueError: If there is no table, or a capacity is not a positive integer.
@@ -40,31 +40,31 @@ class Regions:
         self.offsets = ends - self.capacities
         self.total = int(self.capacities.sum())
         self.written = np.zeros(len(self.names), dtype=np.int64)
-        self.version = 0  # changes whenever a size does, so that samplers may cache what follows from the sizes
+        self.version = 0  # increases with every change of a size, so that samplers can cache what depends on sizes
 
     def __len__(self) -> int:
         return len(self.names)
 
     @property
     def sizes(self) -> np.ndarray:
-        """Live records per table, `(tables,)`."""
+        """Number of live records of each table, `(tables,)`."""
         return np.minimum(self.written, self.capacities)
 
     @property
     def used_prefix(self) -> int:
-        """Number of leading slots of the storage outside which nothing was ever written."""
+        """Number of slots up to and including the last one that was ever written."""
         sizes = self.sizes
         return int((self.offsets + sizes)[sizes > 0].max(initial=0))
 
     def allocate(self, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Take the next slots, first in first out.
+        """Return the next slots, first in first out.
 
         Args:
-            table: `(records,)` table of each record, in the order in which they are appended.
+            table: Table of each record, `(records,)`, in the order in which they are appended.
 
         Returns:
-            Slots `(records,)`, -1 for a record that a later one of the same call replaces because the table is too
-            small for all of them; and serial numbers `(records,)`, counting what was ever appended to that table.
+            Slots `(records,)`, or -1 for a record that a later one of the same call replaces because the table is too
+            small for all of them. Serial numbers `(records,)`, which count all records ever appended to the table.
         """
         counts = np.bincount(table, minlength=len(self))
         order = np.argsort(table, kind="stable")
@@ -79,7 +79,7 @@ class Regions:
         return slot, serial
 
     def table_of(self, slot: np.ndarray) -> np.ndarray:
-        """Return the table that each slot belongs to, `(slots,)`."""
+        """Return the table of each slot, `(slots,)`."""
         ascending = np.argsort(self.offsets)
         return ascending[np.searchsorted(self.offsets[ascending], slot, side="right") - 1]
 
@@ -89,26 +89,26 @@ class Regions:
         return self.offsets[table] + np.arange(written - size, written) % self.capacities[table]
 
     def unused(self) -> np.ndarray:
-        """Return which slots of the used prefix were never written, `(used_prefix,)` bool."""
+        """Return whether each slot of the used prefix was never written, `(used_prefix,)` bool."""
         unused = np.ones(self.used_prefix, dtype=bool)
         for table in range(len(self)):
             unused[self.slots(table)] = False
         return unused
 
     def clear(self) -> None:
-        """Forget every record."""
+        """Drop every record."""
         self.written[:] = 0
         self.version += 1
 
     def state_dict(self) -> dict[str, Any]:
-        """Return names, capacities and write counts, from which cursors and fill counts follow."""
+        """Return the names, capacities and write counts of the tables."""
         return {"names": list(self.names), "capacities": self.capacities.tolist(), "written": self.written.tolist()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore the cursors.
 
         Raises:
-            ValueError: If the tables are others than the saved ones.
+            ValueError: If the tables differ from the saved ones.
         """
         saved = dict(zip(state["names"], state["capacities"], strict=True))
         present = dict(zip(self.names, self.capacities.tolist(), strict=True))

@@ -1,4 +1,4 @@
-"""A replay buffer on disk: its records, and the state of its writer, sampler and transforms."""
+"""Files of a replay buffer: its records, and the state of its writer, sampler and transforms."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -18,11 +18,11 @@ def write_replay(replay: ReplayBuffer, folder: Path) -> None:
     """Write the filled part of a buffer over a `LazyTensorStorage`, with the state of its writer, sampler, transforms.
 
     Args:
-        replay: the buffer; of an `EventTableBuffer`, slots that were never written are zeros in the files.
-        folder: created if missing.
+        replay: The buffer. Slots of an `EventTableBuffer` that were never written are zeros in the files.
+        folder: The folder to write to, created if missing.
 
     Raises:
-        OSError: if writing fails.
+        OSError: If writing fails.
     """
     folder.mkdir(parents=True, exist_ok=True)
     regions = getattr(replay, "regions", None)
@@ -31,38 +31,34 @@ def write_replay(replay: ReplayBuffer, folder: Path) -> None:
 
 
 def read_replay(replay: ReplayBuffer, folder: Path) -> int:
-    """Fill a buffer from `write_replay`'s files, executing nothing from them.
+    """Fill a buffer from `write_replay`'s files, without executing anything from them.
 
     Args:
-        replay: a buffer made like the saved one; a ring buffer has to be empty.
-        folder: written by `write_replay`.
+        replay: A buffer made like the saved one; a ring buffer must be empty.
+        folder: Folder written by `write_replay`.
 
     Returns:
-        How many records it now holds.
+        Number of records in the buffer.
 
     Raises:
-        CheckpointError: if files are missing or damaged, or the capacities differ (a ring buffer's order depends on
-            it).
+        CheckpointError: If files are missing or damaged, or the capacities differ.
     """
     storage: Any = replay.storage  # typed too narrowly in TorchRL: it takes slices and tensors
-    state = load_state(folder / "state.pt")  # of a buffer without records, too: it may hold steps back
+    state = load_state(folder / "state.pt")  # needed without records, too, because steps may be held back
     filled = read_records(storage, folder)
     with refusing(folder / "state.pt", "the state of a replay buffer"):
-        # The records are in place already: the storage gets its own state.
+        # The storage already contains the records, so it gets its own state.
         replay.load_state_dict({**state, "_storage": storage.state_dict()})
     return filled
 
 
 def replay_bytes(env: EnvBase, keys: Iterable[NestedKey], capacity: int) -> int:
-    """Size of a full buffer.
+    """Return the size of a full buffer [bytes].
 
     Args:
-        env: batched env whose transitions are stored.
-        keys: what is stored of them.
-        capacity: records.
-
-    Returns:
-        Bytes.
+        env: Batched environment whose transitions are stored.
+        keys: Keys of the stored entries.
+        capacity: Number of records.
     """
     record = env.fake_tensordict().select(*keys, strict=False)
     values = record.values(include_nested=True, leaves_only=True)

@@ -1,8 +1,8 @@
-"""Events and routes: which events fired at a step, and which table a step belongs to.
+"""Events and routes: which events fired at a step, and in which table a step is stored.
 
 An event predicate is any object with `names`, one per event table, and `__call__(steps)`, which maps a flat tensordict
-of transitions to booleans `(steps, len(names))`. A route has `names` too and returns the table of each step, integers
-`(steps,)`. The classes below cover the domains of this library; a domain of your own may bring its own.
+of transitions to booleans `(steps, len(names))`. A route also has `names` and returns the table of each step, integers
+`(steps,)`. The domains of this library use the classes below; your own domain may define others.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +19,7 @@ __all__ = ["EventPredicate", "KeyEvents", "KeyRoute", "PredicateEvents", "Route"
 
 @runtime_checkable
 class EventPredicate(Protocol):
-    """Says which events happened at each step."""
+    """Event predicate, which tells the events of each step."""
 
     names: tuple[str, ...]
 
@@ -30,7 +30,7 @@ class EventPredicate(Protocol):
 
 @runtime_checkable
 class Route(Protocol):
-    """Sends every step to exactly one table."""
+    """Route, which assigns every step to exactly one table."""
 
     names: tuple[str, ...]
 
@@ -40,12 +40,12 @@ class Route(Protocol):
 
 
 class StyleEvents:
-    """Admit event i if it fired and the trajectory's weight w_i is not 0 (paper, Appendix B, Stratified Sampling).
+    """Event predicate that admits event i if it fired and the style's weight w_i is not 0 (paper, Appendix B).
 
     Args:
-        names: Names of the styles, in the order of the event columns; the tables are named after them.
+        names: Names of the styles and their tables, in the order of the event columns.
         columns: Entry of theta that holds each weight.
-        extra: Names of event columns after these, admitted whatever the style (such as a kill table).
+        extra: Names of further event columns, which are admitted in every style, such as kills.
 
     Raises:
         ValueError: If lengths differ or a name repeats.
@@ -69,18 +69,18 @@ class StyleEvents:
 
     @classmethod
     def of(cls, space: "object", extra: Sequence[str] = ()) -> "StyleEvents":
-        """Return events for each `Weight` of a `StyleSpace`, in the space's order.
+        """Return the event predicate for the weights of a `StyleSpace`, in the space's order.
 
         Args:
             space: A `coachable.styles.StyleSpace`.
-            extra: As above.
+            extra: See the class.
         """
         slices = space.slices  # type: ignore[attr-defined]
         weights = [p.name for p in space.parameters if p.kind == "weight"]  # type: ignore[attr-defined]
         return cls(weights, [slices[name].start for name in weights], extra)
 
     def __call__(self, steps: TensorDictBase) -> Tensor:
-        """Booleans `(steps, len(names))`."""
+        """Return booleans `(steps, len(names))`."""
         fired = steps.get(("next", EVENTS))
         if fired.shape[-1] != len(self.names):
             raise ValueError(
@@ -94,25 +94,25 @@ class StyleEvents:
 
 
 class KeyEvents:
-    """Events exactly as the environment reports them, whatever the style.
+    """Event predicate that admits all events that the environment reports, in every style.
 
     Args:
-        names: One per column of `("next", "events")`.
+        names: Table of each column of `("next", "events")`.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
         self.names = _distinct(names)
 
     def __call__(self, steps: TensorDictBase) -> Tensor:
-        """Booleans `(steps, len(names))`."""
+        """Return booleans `(steps, len(names))`."""
         return steps.get(("next", EVENTS))
 
 
 class PredicateEvents:
-    """One function per event table.
+    """Event predicate that consists of one function per event table.
 
     Args:
-        predicates: By table name, each mapping transitions `(steps,)` to booleans `(steps,)`.
+        predicates: Functions by table name, each of which maps transitions `(steps,)` to booleans `(steps,)`.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -126,7 +126,7 @@ class PredicateEvents:
         self.predicates = dict(predicates)
 
     def __call__(self, steps: TensorDictBase) -> Tensor:
-        """Booleans `(steps, len(names))`."""
+        """Return booleans `(steps, len(names))`."""
         columns = {name: predicate(steps) for name, predicate in self.predicates.items()}
         for name, column in columns.items():
             if column.shape != steps.shape:
@@ -141,20 +141,20 @@ class KeyRoute:
     """Route by the number of the scenario, integers `(steps,)` or `(steps, 1)` under the key `scenario`.
 
     Args:
-        names: Table of each number.
+        names: Table of each scenario number.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
         self.names = _distinct(names)
 
     def __call__(self, steps: TensorDictBase) -> Tensor:
-        """Table numbers `(steps,)`."""
+        """Return table numbers `(steps,)`."""
         number = steps.get(SCENARIO)
         return number.squeeze(-1) if number.shape == (*steps.shape, 1) else number
 
 
 def checked_events(predicate: EventPredicate, steps: TensorDictBase) -> Tensor:
-    """Evaluate a predicate.
+    """Evaluate a predicate and check the result.
 
     Raises:
         ValueError: If the result is not boolean `(steps, len(names))`.
@@ -171,18 +171,14 @@ def checked_events(predicate: EventPredicate, steps: TensorDictBase) -> Tensor:
 
 
 def checked_route(route: Route, steps: TensorDictBase) -> Tensor:
-    """Evaluate a route.
+    """Evaluate a route and check the result.
 
     Raises:
         ValueError: If the result is not integer `(steps,)` or names no table.
     """
     table = route(steps)
-    if (
-        not isinstance(table, Tensor)
-        or table.is_floating_point()
-        or table.dtype == torch.bool
-        or table.shape != steps.shape
-    ):
+    whole = isinstance(table, Tensor) and not table.is_floating_point() and table.dtype != torch.bool
+    if not whole or table.shape != steps.shape:
         got = f"{table.dtype} {tuple(table.shape)}" if isinstance(table, Tensor) else type(table).__name__
         raise ValueError(f"the route {type(route).__name__} returned {got}: expected integers {tuple(steps.shape)}")
     low, high = (int(bound) for bound in table.aminmax()) if table.numel() else (0, 0)

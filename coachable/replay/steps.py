@@ -1,4 +1,4 @@
-"""Bookkeeping of steps beside their data: which stream each belongs to, and where episodes begin and end."""
+"""Bookkeeping of steps: the stream of each step, and where episodes begin and end."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -16,17 +16,17 @@ _MASK = ("collector", "mask")
 
 @dataclass
 class Steps:
-    """Bookkeeping of consecutive steps of many streams, on the CPU: rows of one stream are in the order of time.
+    """Bookkeeping of consecutive steps of many streams, on the CPU; rows of one stream are in the order of time.
 
-    A stream is one trajectory where the collector numbers them, otherwise one environment.
+    A stream is a trajectory if the collector numbers trajectories, otherwise an environment.
     """
 
     stream: np.ndarray  # (steps,) int64
-    begins: np.ndarray  # (steps,) bool, first step of an episode as far as the data says so (`is_init`)
+    begins: np.ndarray  # (steps,) bool, first step of an episode according to `is_init`
     ends: np.ndarray  # (steps,) bool, last step of an episode, terminated or truncated
     fired: np.ndarray  # (steps, event tables) bool
-    route: np.ndarray  # (steps,) int64, table that the step itself goes to
-    arrival: np.ndarray  # (steps,) int64, how many steps had been received before
+    route: np.ndarray  # (steps,) int64, routed table of the step
+    arrival: np.ndarray  # (steps,) int64, number of steps received before
 
     def __len__(self) -> int:
         return len(self.stream)
@@ -36,13 +36,13 @@ class Steps:
 
     @staticmethod
     def unrelated(n: int) -> "Steps":
-        """Return the bookkeeping of steps whose order does not matter."""
+        """Return the bookkeeping of `n` steps whose order does not matter."""
         yes_no, number = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
         return Steps(number, yes_no, yes_no, np.zeros((n, 0), dtype=bool), number, number)
 
     @staticmethod
     def cat(parts: "Sequence[Steps]") -> "Steps":
-        """Concatenate."""
+        """Concatenate bookkeeping in the order of time."""
         return Steps(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Steps)})
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -51,11 +51,11 @@ class Steps:
 
     @staticmethod
     def from_state_dict(state: dict[str, Tensor]) -> "Steps":
-        """Inverse of `state_dict`."""
+        """Return the bookkeeping from what `state_dict` returned."""
         return Steps(**{f.name: state[f.name].cpu().numpy().copy() for f in fields(Steps)})
 
     def in_episodes(self) -> "Episodes":
-        """Sort the steps by stream and cut them into episodes."""
+        """Sort the steps by stream and divide them into episodes."""
         order = np.argsort(self.stream, kind="stable")
         stream, ends = self.stream[order], self.ends[order]
         first_of_stream = np.ones(len(order), dtype=bool)
@@ -76,28 +76,28 @@ class Steps:
 
 @dataclass
 class Episodes:
-    """Steps sorted by stream, cut into (pieces of) episodes."""
+    """Steps sorted by stream and divided into episodes or parts of them, called pieces."""
 
     order: np.ndarray  # (steps,) row of each sorted step
     stream: np.ndarray  # (steps,)
     ends: np.ndarray  # (steps,)
     first_of_stream: np.ndarray  # (steps,) bool
-    number: np.ndarray  # (steps,) which piece a step is in
+    number: np.ndarray  # (steps,) piece of each step
     start: np.ndarray  # (pieces,) sorted position of the first step
     last: np.ndarray  # (pieces,) sorted position of the last step
 
 
 def flatten_time_major(data: TensorDictBase) -> tuple[TensorDictBase, int | None]:
-    """Flatten a batch so that steps of one environment stay in the order of time.
+    """Flatten a batch such that the steps of each environment are in the order of time.
 
     Args:
-        data: `(steps,)`, already time-major, or `(num_envs, time)` as TorchRL's collectors and rollouts yield it.
+        data: Transitions `(steps,)`, already time-major, or `(num_envs, time)` as TorchRL's collectors yield them.
 
     Returns:
-        `(steps,)` and the number of environments, if the shape tells.
+        The transitions `(steps,)`, and the number of environments or None if the batch had one dimension.
 
     Raises:
-        ValueError: For another number of batch dimensions.
+        ValueError: If the batch has neither one nor two dimensions.
     """
     if data.ndim not in (1, 2):
         raise ValueError(
@@ -106,7 +106,7 @@ def flatten_time_major(data: TensorDictBase) -> tuple[TensorDictBase, int | None
         )
     num_envs = None
     if isinstance(data, LazyStackedTensorDict):
-        data = data.contiguous()  # a rollout is a lazy stack, a hundred times slower to flatten
+        data = data.contiguous()  # a lazy stack, such as a rollout, is a hundred times slower to flatten
     if data.ndim == 2:
         num_envs = data.shape[0]
         data = data.transpose(0, 1).reshape(-1)
@@ -117,20 +117,23 @@ def flatten_time_major(data: TensorDictBase) -> tuple[TensorDictBase, int | None
 
 
 def read_steps(data: TensorDictBase, num_envs: int | None, arrived: int) -> Steps:
-    """Read streams and episode ends; events and routes are left empty.
+    """Return the streams and episode ends of steps, without events and routes.
 
     Args:
-        data: `(steps,)`.
-        num_envs: Environments in the batch; needed if the data carries no trajectory numbers.
-        arrived: Steps received before.
+        data: Transitions `(steps,)`.
+        num_envs: Number of environments in the batch; needed if the data has no trajectory numbers.
+        arrived: Number of steps received before.
 
     Returns:
         One row per step.
 
     Raises:
-        ValueError: If streams cannot be told apart.
+        ValueError: If the stream of a step is unknown, or the data has no `("next", "done")`.
     """
     n = len(data)
+    done = data.get(("next", "done"), None)
+    if done is None:
+        raise ValueError("the data has no ('next', 'done'): expected transitions as TorchRL's collectors yield them")
     trajectory = data.get(TRAJECTORY, None)
     if trajectory is not None:
         stream = trajectory.reshape(n, -1)[:, 0].to("cpu", torch.int64).numpy()
@@ -146,16 +149,9 @@ def read_steps(data: TensorDictBase, num_envs: int | None, arrived: int) -> Step
     steps = Steps.unrelated(n)
     steps.stream = stream
     steps.begins = _flag(data.get("is_init", None), n)
-    steps.ends = _flag(_done(data), n)
+    steps.ends = _flag(done, n)
     steps.arrival = arrived + np.arange(n)
     return steps
-
-
-def _done(data: TensorDictBase) -> Tensor:
-    done = data.get(("next", "done"), None)
-    if done is None:
-        raise ValueError("the data has no ('next', 'done'): expected transitions as TorchRL's collectors yield them")
-    return done
 
 
 def _flag(value: Tensor | None, n: int) -> np.ndarray:

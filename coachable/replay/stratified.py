@@ -1,4 +1,4 @@
-"""Batches with an exact number of records from every table, uniform or prioritised within the table."""
+"""Sampling of batches with an exact number of records per table, uniform or prioritised within a table."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,18 +18,18 @@ __all__ = ["StratifiedSampler", "allot"]
 
 
 def allot(batch_size: int, proportions: np.ndarray, available: np.ndarray) -> np.ndarray:
-    """Share a batch among the available tables: renormalised proportions, largest remainder, at least 1 record each.
+    """Divide a batch among the available tables by largest remainders of the renormalised proportions.
 
-    Tables whose quota is below 1 get exactly 1, and the rest of the batch is shared by the others. Ties of remainders
-    go to the table that comes first.
+    A table whose quota is below 1 gets exactly 1 record, and the other tables share the rest of the batch. Among equal
+    remainders the first table's counts as the largest.
 
     Args:
-        batch_size: Records in the batch, B.
-        proportions: `(tables,)` shares.
-        available: `(tables,)` bool.
+        batch_size: Number of records in the batch, B.
+        proportions: Share of each table, `(tables,)`.
+        available: Whether each table has records, `(tables,)` bool.
 
     Returns:
-        `(tables,)` int64 that sums to `batch_size`; 0 where a table is not available or has no share.
+        Number of records per table, `(tables,)` int64, with sum `batch_size`; 0 for tables without records or share.
 
     Raises:
         ValueError: If no table is available, or more than `batch_size` are.
@@ -53,7 +53,7 @@ def allot(batch_size: int, proportions: np.ndarray, available: np.ndarray) -> np
         )
     left = batch_size
     while True:
-        # Only float rounding is removed here: 0.3 * 10 is 3, not 2.9999999999999996.
+        # Remove float rounding: 0.3 * 10 is 3, not 2.9999999999999996.
         quota = np.round(proportions * sharing / proportions[sharing].sum() * left, 9)
         small = sharing & (quota < 1)
         if not small.any():
@@ -74,24 +74,23 @@ def allot(batch_size: int, proportions: np.ndarray, available: np.ndarray) -> np
 
 @dataclass
 class _Plan:
-    """Counts and tables of all batches of one size; valid until a table grows."""
+    """Tables of all batches of one size, valid until a table grows."""
 
-    counts: np.ndarray
     table: Tensor  # (B,) int64
     offset: Tensor  # (B,) int64, first slot of the record's table
     size: Tensor  # (B,) float64, live records of it
 
 
 class StratifiedSampler(Sampler):
-    """Draws the same share of every batch from each table (paper, Stratified Sampling; SSET, Kompella 2023).
+    """Sampler that draws the same share of every batch from each table (paper, Stratified Sampling; Kompella 2023).
 
     Args:
         regions: The tables.
-        proportions: `(tables,)` shares that sum to 1.
+        proportions: Shares of the tables, `(tables,)`, which sum to 1.
         prioritized: Whether to draw within a table in proportion to priorities instead of uniformly.
         alpha: Exponent of the priorities.
         beta: Exponent of the importance weights; may be changed while training.
-        eps: Added to priorities, so that none is 0.
+        eps: Number added to priorities, so that none is 0.
     """
 
     def __init__(
@@ -115,10 +114,10 @@ class StratifiedSampler(Sampler):
         self._pending_leaves: Tensor | None = None
 
     def counts(self, batch_size: int) -> dict[str, int]:
-        """Return how many records of each table a batch holds at present.
+        """Return the present number of records of each table in a batch.
 
         Raises:
-            ValueError: If the buffer cannot fill such a batch.
+            ValueError: If no table has records, or more tables have some than a batch holds.
         """
         return dict(zip(self.regions.names, self._allot(batch_size).tolist(), strict=True))
 
@@ -126,13 +125,14 @@ class StratifiedSampler(Sampler):
         """Draw slots, grouped by table.
 
         Returns:
-            Slots `(batch_size,)` and `{"table": (batch_size,)}`, with `priority_weight` if prioritised: `(n
-            P(i))^-beta`, n records and P(i) the probability within the table, divided by the largest of the batch.
+            Slots `(batch_size,)`, and `{"table": (batch_size,)}`, with `priority_weight` if prioritised. The weight is
+            `(n P(i))^-beta` over the largest one of the batch. n is the number of records of the table, P(i) the
+            probability within it.
         """
         device = getattr(storage, "device", None)
         device = device if isinstance(device, torch.device) else torch.device("cpu")
         plan = self._plan(batch_size, device)
-        # float64: a float32 draw reaches at most 2^24 different records.
+        # float64, because a float32 draw reaches at most 2^24 different records.
         uniform = torch.rand(batch_size, dtype=torch.float64, device=device, generator=self._rng)
         info = {TABLE: plan.table.clone()}
         if not self.prioritized:
@@ -153,22 +153,21 @@ class StratifiedSampler(Sampler):
         return True
 
     def extend(self, index: Tensor) -> None:
-        """Give new records the largest priority seen so far."""
+        """Give new records the largest priority so far."""
         if self.prioritized and len(index):
             tree = self._tree_on(index.device)
             tree.update(index, self._largest_priority(index.device).expand(len(index)))
 
     def add(self, index: int | Tensor) -> None:
-        """Like `extend`, for one record."""
+        """Give a new record the largest priority so far."""
         self.extend(torch.as_tensor(index).reshape(-1))
 
     def update_priority(self, index: Any, priority: Any, *, storage: Storage | None = None) -> None:
-        """Set priorities to `(|priority| + eps)^alpha`; of a slot given more than once the largest counts.
+        """Set priorities to `(|priority| + eps)^alpha`; if a slot is given more than once, the largest counts.
 
         Args:
             index: Slots of any shape.
-            priority: TD errors or the like, of that shape, possibly with further dimensions, over which the largest
-                counts.
+            priority: TD errors of the same shape, possibly with further dimensions, over which the largest counts.
             storage: Not used.
 
         Raises:
@@ -190,14 +189,10 @@ class StratifiedSampler(Sampler):
     def _plan(self, batch_size: int, device: torch.device) -> _Plan:
         version, plan = self._plans.get((batch_size, device), (-1, None))
         if plan is None or version != self.regions.version:
-            counts = self._allot(batch_size)
-            if plan is not None and np.array_equal(plan.counts, counts):
-                table = plan.table
-            else:
-                table = torch.from_numpy(np.repeat(np.arange(len(counts)), counts)).to(device)
-            columns = np.stack([self.regions.offsets, self.regions.sizes])[:, np.repeat(np.arange(len(counts)), counts)]
-            both = torch.from_numpy(columns).to(device)
-            plan = _Plan(counts, table, both[0], both[1].double())
+            regions = self.regions
+            table = np.repeat(np.arange(len(regions)), self._allot(batch_size))
+            columns = torch.from_numpy(np.stack([table, regions.offsets[table], regions.sizes[table]])).to(device)
+            plan = _Plan(columns[0], columns[1], columns[2].double())
             self._plans[batch_size, device] = self.regions.version, plan
         return plan
 
@@ -219,14 +214,14 @@ class StratifiedSampler(Sampler):
         self._tree = self._largest = self._pending_leaves = None
 
     def state_dict(self) -> dict[str, Any]:
-        """Priorities, if prioritised."""
+        """Return the priorities, or an empty dictionary if the sampler is not prioritised."""
         if not self.prioritized:
             return {}
         tree = self._tree if self._tree is not None else self._tree_on(torch.device("cpu"))
         return {"priorities": tree.leaves(), "largest": self._largest_priority(tree.device).clone(), "beta": self.beta}
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restore priorities.
+        """Restore what `state_dict` returned.
 
         Raises:
             ValueError: If only one of the two samplers is prioritised.
@@ -243,11 +238,11 @@ class StratifiedSampler(Sampler):
             self.beta = state_dict["beta"]
 
     def dumps(self, path: Any) -> None:
-        """Not used: `EventTableBuffer.dumps` saves the state dict."""
+        """Raise an error, because `EventTableBuffer.dumps` saves the state dict."""
         raise NotImplementedError("save the buffer (EventTableBuffer.dumps), not its sampler")
 
     def loads(self, path: Any) -> None:
-        """Not used: `EventTableBuffer.loads` restores the state dict."""
+        """Raise an error, because `EventTableBuffer.loads` restores the state dict."""
         raise NotImplementedError("load the buffer (EventTableBuffer.loads), not its sampler")
 
     def __repr__(self) -> str:

@@ -1,7 +1,7 @@
 """Sum trees in pure torch, for proportional priorities (arXiv 1511.05952) on CPU and GPU.
 
-TorchRL's `PrioritizedSampler` needs a compiled extension that torch 2.13 cannot load. A wide tree costs few kernels:
-with 64 children per node, three levels serve 262 144 slots.
+TorchRL's `PrioritizedSampler` needs a compiled extension that torch 2.13 cannot load. A wide tree needs few kernels:
+with 64 children per node, three levels are enough for 262,144 slots.
 """
 
 from collections.abc import Sequence
@@ -16,15 +16,15 @@ __all__ = ["SumTree"]
 class SumTree:
     """Priorities of the slots of several contiguous regions, and draws from a region in proportion to them.
 
-    Every region has a tree of its own inside the same tensors, so draws never leak into a neighbour and the rounding of
-    one region's sums does not depend on another's. All sums are float64 and are recomputed from the children they
-    belong to, so they neither drift nor count an index twice that is given twice.
+    Every region has its own tree inside the same tensors, so that a draw never returns a slot of another region and the
+    rounding of one region's sums does not depend on others. All sums are float64 and are recomputed from their
+    children. They therefore do not drift, and a slot that is given twice counts once.
 
     Args:
-        capacities: Slots of each region.
+        capacities: Number of slots of each region.
         offsets: First slot of each region.
-        fanout: Children per node.
-        device: Where the tree lives.
+        fanout: Number of children per node.
+        device: Device of the tree.
 
     Examples:
         >>> tree = SumTree([3], [0])
@@ -70,8 +70,8 @@ class SumTree:
         """Set priorities.
 
         Args:
-            slot: Slots of any shape, possibly repeated: the largest of the given priorities then counts.
-            priority: Non-negative, of the same shape.
+            slot: Slots of any shape; if one is repeated, the largest of its priorities counts.
+            priority: Non-negative priorities of the same shape.
         """
         slot = slot.reshape(-1).to(self.device)
         priority = priority.detach().reshape(-1).to(self.device, torch.float64)
@@ -85,7 +85,7 @@ class SumTree:
             self.levels[level + 1].view(-1)[entry] = self.levels[level][row].sum(-1)
 
     def get(self, slot: Tensor) -> Tensor:
-        """Priorities of slots, float64 of the same shape."""
+        """Return the priorities of slots, float64 of the same shape."""
         _, entry = self._locate(slot.to(self.device))
         return self.levels[0].view(-1)[entry]
 
@@ -93,11 +93,11 @@ class SumTree:
         """Draw slots in proportion to their priority; a slot of priority 0 is never drawn.
 
         Args:
-            region: `(draws,)` region of each draw, none of which may be all zero.
-            uniform: `(draws,)` float64 in [0, 1).
+            region: Region of each draw, `(draws,)`; each must have a priority above 0.
+            uniform: Uniform numbers `(draws,)`, float64 in [0, 1).
 
         Returns:
-            `(draws,)` slots.
+            Slots `(draws,)`.
         """
         row = region
         entry = region
@@ -110,7 +110,7 @@ class SumTree:
             child = torch.searchsorted(upper, target, right=True)
             share = children.gather(-1, child)
             below = upper.gather(-1, child) - share
-            # What is left of the number, stretched to [0, 1), decides among the grandchildren.
+            # The rest of the number, scaled to [0, 1), selects among the children of the child.
             uniform = ((target - below) / share).clamp(0.0, 1.0 - 2.0**-53).squeeze(-1)
             entry = (row - self._first_row[level][region]) * self.fanout + child.squeeze(-1)
             if level:
@@ -123,7 +123,7 @@ class SumTree:
             level.zero_()
 
     def leaves(self) -> Tensor:
-        """All priorities by slot, float64 `(slots,)`: what a checkpoint has to keep."""
+        """Return all priorities by slot, float64 `(slots,)`."""
         return self.get(torch.arange(int(self.capacities.sum()), device=self.device))
 
     def load_leaves(self, leaves: Tensor) -> None:

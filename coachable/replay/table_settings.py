@@ -1,4 +1,4 @@
-"""Checks of what an `EventTableBuffer` is made from; every mistake is reported before anything is allocated."""
+"""Checks of the arguments of an `EventTableBuffer`, before any memory is allocated."""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,7 +12,7 @@ __all__ = ["checked_horizon", "checked_proportions", "make_regions"]
 
 
 def make_regions(capacities: Mapping[str, int], route: Route | None, events: EventPredicate | None) -> Regions:
-    """Put the tables in order: routed tables, then event tables.
+    """Return the regions of the tables: routed tables, then event tables.
 
     Raises:
         ValueError: If names are missing, unknown or given twice, or a capacity is not positive.
@@ -35,10 +35,10 @@ def make_regions(capacities: Mapping[str, int], route: Route | None, events: Eve
 def checked_horizon(
     regions: Regions, routed: int, events: EventPredicate | None, horizon: int | None, num_envs: int | None
 ) -> int:
-    """Check H_max against the tables.
+    """Check H_max against the tables, and return it, or 1 without event tables.
 
     Raises:
-        ValueError: If it is missing, not positive, or larger than a table.
+        ValueError: If it is missing, not positive, or larger than a table, or there are no event tables.
     """
     Range("[1, inf)", whole=True, optional=True).check("num_envs", num_envs)
     if events is None:
@@ -69,12 +69,12 @@ def checked_proportions(names: Sequence[str], routed: int, given: Mapping[str, f
     """Return the shares of the tables in a batch.
 
     Args:
-        names: Tables, the routed ones first.
-        routed: How many are routed.
+        names: Names of the tables, the routed ones first.
+        routed: Number of routed tables.
         given: Shares by name; by default 0.5 for the routed tables and 0.5 for the event tables, each split equally.
 
     Returns:
-        `(tables,)` shares.
+        Shares `(tables,)`.
 
     Raises:
         ValueError: If names differ, a share is negative, or they do not sum to 1.

@@ -1,4 +1,4 @@
-"""Writes steps to their tables: n-step assembly, routing, and copies of the windows before events."""
+"""Writer of steps to their tables, with n-step assembly, routing, and copies of the windows before events."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -20,15 +20,15 @@ __all__ = ["TableWriter"]
 
 
 class TableWriter(Writer):
-    """Writer of an `EventTableBuffer`; it owns the cursors of the tables and what is known about open episodes.
+    """Writer of an `EventTableBuffer`, which contains the cursors of the tables and the state of open episodes.
 
     Args:
-        regions: The tables, those that steps are routed to first, then the event tables.
-        route: Table of each step; None if there is only one.
+        regions: The tables: routed tables, then event tables.
+        route: Route of the steps; None if there is one routed table.
         events: Event predicate; None without event tables.
         horizon: H_max.
         n_step: n-step assembly; None for one-step transitions.
-        num_envs: Environments in a batch, None if the data tells.
+        num_envs: Number of environments in a batch; None if batches are `(num_envs, time)` or have trajectory numbers.
     """
 
     _storage: LazyTensorStorage  # set when the buffer registers it
@@ -49,7 +49,7 @@ class TableWriter(Writer):
         self.n_step = n_step
         self.num_envs = num_envs
         self.base_tables = len(route.names) if route is not None else 1
-        # Whoever was silent for longer than the routed tables remember has nothing left there to look back at.
+        # After so many steps without a step of a stream, the routed tables no longer contain any step of it.
         kept = int(regions.capacities[: self.base_tables].sum())
         self.history = WindowHistory(len(events.names), horizon, patience=kept) if events is not None else None
         if n_step is not None:
@@ -59,8 +59,13 @@ class TableWriter(Writer):
         self._lost = np.zeros(len(regions), dtype=np.int64)
 
     @property
+    def _device(self) -> torch.device | None:
+        device = getattr(self._storage, "device", None)  # "auto" before the first record
+        return device if isinstance(device, torch.device) else None
+
+    @property
     def _write_count(self) -> int:
-        """Steps written, each counted once however many tables hold it. Collectors read this."""
+        """Number of steps written, without copies; collectors read it."""
         return int(self.regions.written[: self.base_tables].sum())
 
     def add(self, data: TensorDictBase) -> Tensor:
@@ -71,16 +76,15 @@ class TableWriter(Writer):
         """Write a batch of steps.
 
         Args:
-            data: `(steps,)`, time-major, or `(num_envs, time)`.
+            data: Transitions `(steps,)`, time-major, or `(num_envs, time)`.
 
         Returns:
-            Slots written to, those of the steps themselves before those of their copies in event tables.
+            Slots `(slots,)` of the steps, then of their copies in event tables.
         """
         rows, found_envs = flatten_time_major(data)
         rows = rows.exclude("index", TABLE)
-        device = getattr(self._storage, "device", None)
-        if isinstance(device, torch.device) and rows.device != device:
-            rows = rows.to(device)
+        if self._device is not None and rows.device != self._device:
+            rows = rows.to(self._device)
         if not len(rows):
             return torch.zeros(0, dtype=torch.long)
         if self.history is None and self.n_step is None:
@@ -88,7 +92,7 @@ class TableWriter(Writer):
         else:
             steps = read_steps(rows, found_envs if found_envs is not None else self.num_envs, self._arrived)
         self._arrived += len(rows)
-        # Events and routes are those of the step itself, hence evaluated before n-step assembly replaces its future.
+        # Evaluated before n-step assembly, because events and routes are those of the step itself.
         if self.events is not None:
             steps.fired = checked_events(self.events, rows).cpu().numpy()
         if self.route is not None:
@@ -98,11 +102,7 @@ class TableWriter(Writer):
         return self._write(rows, steps)
 
     def finish(self) -> Tensor:
-        """End every open episode where its data ends; held back steps are written, no window reaches back over it.
-
-        Returns:
-            Slots written to.
-        """
+        """End every open episode at its last step; see `EventTableBuffer.finish`."""
         rest = self.n_step.flush() if self.n_step is not None else None
         slots = self._write(*rest) if rest is not None else torch.zeros(0, dtype=torch.long)
         if self.history is not None:
@@ -123,10 +123,10 @@ class TableWriter(Writer):
     def _copies(
         self, copies: Copies, rows: TensorDictBase, before: np.ndarray
     ) -> list[tuple[np.ndarray, TensorDictBase]]:
-        """Records to append to event tables, read before the batch overwrites anything."""
+        """Return the records to append to event tables, read before the batch overwrites any."""
         table = copies.table + self.base_tables
         home = self.regions.table_of(np.maximum(copies.slot, 0))
-        # A step that its own table has dropped meanwhile can no longer be copied.
+        # A step that its routed table no longer contains cannot be copied.
         lost = (copies.row < 0) & (copies.serial + self.regions.capacities[home] < before[home])
         self._lost += np.bincount(table[lost], minlength=len(self.regions))
         target = np.full(len(table), -1)
@@ -136,33 +136,29 @@ class TableWriter(Writer):
         if here.any():
             parts.append((target[here], rows[self._index(copies.row[here])]))
         if there.any():
-            parts.append((target[there], self._stored(copies.slot[there])))
+            parts.append((target[there], self._storage.get(self._index(copies.slot[there]))))  # type: ignore[arg-type]
         return parts
 
     def _put(self, slot: np.ndarray, rows: TensorDictBase) -> Tensor:
-        kept = slot >= 0  # the others have already been replaced within this batch
+        kept = slot >= 0  # later records of this batch replace the others
         if not kept.all():
             rows, slot = rows[self._index(np.flatnonzero(kept))], slot[kept]
         index = self._index(slot)
-        # A run of slots is written several times faster as a slice.
+        # Writing consecutive slots as a slice is several times faster.
         run = slot[-1] - slot[0] + 1 == len(slot) and bool((np.diff(slot) == 1).all())
         storage = self._storage
         storage.set(slice(int(slot[0]), int(slot[-1]) + 1) if run else index, rows, set_cursor=False)  # type: ignore[arg-type]
-        # TorchRL takes the first `_len` slots for the filled ones; `_last_cursor` only keeps its checkpointer quiet.
+        # TorchRL treats the first `_len` slots as filled, and its checkpointer needs a `_last_cursor`.
         storage._len = self.regions.used_prefix
         if storage._last_cursor is None:
             storage._set_last_cursor(0)
         return index
 
-    def _stored(self, slot: np.ndarray) -> TensorDictBase:
-        return self._storage.get(self._index(slot))  # type: ignore[arg-type]
-
     def _index(self, rows: np.ndarray) -> Tensor:
-        device = getattr(self._storage, "device", None)
-        return torch.from_numpy(rows).to(device if isinstance(device, torch.device) else "cpu")
+        return torch.from_numpy(rows).to(self._device or "cpu")
 
     def statistics(self) -> dict[str, dict[str, int | float]]:
-        """Per table: `size`, `capacity`, `fill`, records `written` and `evicted`, `events` admitted, copies `lost`."""
+        """Return for each table `size`, `capacity`, `fill`, `written`, `evicted`, `events`, and `lost` copies."""
         sizes = self.regions.sizes
         return {
             name: {
@@ -202,7 +198,7 @@ class TableWriter(Writer):
         """Restore what `state_dict` returned.
 
         Raises:
-            ValueError: If the tables or the horizon are others than the saved ones.
+            ValueError: If the tables or the horizon differ from the saved ones.
         """
         self.regions.load_state_dict(state_dict["regions"])
         self._arrived = state_dict["arrived"]
@@ -211,13 +207,12 @@ class TableWriter(Writer):
         if self.history is not None:
             self.history.load_state_dict(state_dict["history"])
         if self.n_step is not None:
-            device = getattr(self._storage, "device", None)
-            self.n_step.load_state_dict(state_dict["n_step"], device if isinstance(device, torch.device) else None)
+            self.n_step.load_state_dict(state_dict["n_step"], self._device)
 
     def dumps(self, path: Any) -> None:
-        """Not used: `EventTableBuffer.dumps` saves the state dict."""
+        """Raise an error, because `EventTableBuffer.dumps` saves the state dict."""
         raise NotImplementedError("save the buffer (EventTableBuffer.dumps), not its writer")
 
     def loads(self, path: Any) -> None:
-        """Not used: `EventTableBuffer.loads` restores the state dict."""
+        """Raise an error, because `EventTableBuffer.loads` restores the state dict."""
         raise NotImplementedError("load the buffer (EventTableBuffer.loads), not its writer")

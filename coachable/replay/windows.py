@@ -1,4 +1,4 @@
-"""Which steps an event sends to its table: windows that never reach back over the start of an episode."""
+"""Windows of steps that are copied to the table of an event, within the event's episode."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -19,23 +19,23 @@ class Copies:
 
     table: np.ndarray  # (copies,) event number
     row: np.ndarray  # (copies,) row of the present batch, or -1
-    slot: np.ndarray  # (copies,) slot of the storage where row is -1, otherwise -1
-    serial: np.ndarray  # (copies,) serial number of that slot's record, to see whether it is still there
+    slot: np.ndarray  # (copies,) slot of the storage if row is -1, otherwise -1
+    serial: np.ndarray  # (copies,) serial number of the record, which shows whether the slot still contains it
 
 
 class WindowHistory:
-    """Finds, for every event, the at most `horizon` steps up to it that its table does not hold yet.
+    """Finder of the at most `horizon` steps up to an event that the event's table does not contain yet.
 
-    The window is the event step and the `horizon - 1` steps before it (tau = H_max - 1 in SSET, Kompella 2023), cut at
-    the episode's start and at the previous event of the same table, whose window covered the rest. Between batches it
-    remembers, for every stream with an open episode, where the last `horizon - 1` steps are stored and when each event
-    last fired.
+    The window is the event step and the `horizon - 1` steps before it (tau = H_max - 1 in SSET, Kompella 2023). It
+    begins no earlier than the episode, and after the previous event of the same table, whose window contains the steps
+    before. Between batches the history keeps, for every open episode, the slots of the last `horizon - 1` steps and the
+    last step at which each event fired.
 
     Args:
         events: Number of event tables.
         horizon: H_max.
-        patience: A stream of which nothing arrived for that many steps is forgotten, since its steps have left the
-            storage.
+        patience: Number of steps without a step of a stream after which the stream is dropped, because its steps are no
+            longer in the storage.
     """
 
     def __init__(self, events: int, horizon: int, patience: int = 2**62) -> None:
@@ -45,31 +45,30 @@ class WindowHistory:
         self.clear()
 
     def clear(self) -> None:
-        """Forget every open episode."""
+        """Drop every open episode."""
         self._allocate(1)
 
     def __len__(self) -> int:
-        """Number of open episodes."""
+        """Return the number of open episodes."""
         return int((self.key >= 0).sum())
 
     def update(self, steps: Steps, slot: np.ndarray, serial: np.ndarray) -> Copies:
-        """Take in a batch.
+        """Add a batch.
 
         Args:
             steps: The batch.
-            slot: `(steps,)` where each step is going to be stored.
-            serial: `(steps,)` serial number of each record.
+            slot: Slot in which each step is going to be stored, `(steps,)`.
+            serial: Serial number of each record, `(steps,)`.
 
         Returns:
-            What to append to the event tables: tables in order, within each by the time of the event, oldest step
-            first.
+            Steps to append to the event tables, in the order of the tables, of the events' times, and of the steps.
         """
         cut = steps.in_episodes()
         first = np.flatnonzero(cut.first_of_stream)
         known = self._find(cut.stream[first])
         continues = (known >= 0) & ~steps.begins[cut.order[first]]
 
-        # Continued episodes: where they are kept, and how long they were before this batch.
+        # Rows of continued episodes, and their lengths before this batch.
         kept = np.full(len(cut.start), -1)
         kept[cut.number[first[continues]]] = known[continues]
         before = np.where(kept >= 0, self.length[kept], 0)
@@ -82,7 +81,7 @@ class WindowHistory:
         return copies
 
     def _windows(self, cut: Episodes, table: Array, at: Array, position: Array, kept: Array, before: Array) -> Copies:
-        """Return the steps that each event sends to its table; it fired at the sorted position `at`."""
+        """Return the steps to copy for each event, which fired at the sorted position `at`."""
         place = kept[cut.number[at]]
         previous = np.where(place >= 0, self.last_event[place, table], -1)
         again = (table[1:] == table[:-1]) & (cut.number[at[1:]] == cut.number[at[:-1]])
@@ -120,11 +119,11 @@ class WindowHistory:
         serial: Array,
         steps: Steps,
     ) -> None:
-        """Take note of the episodes that are open after the batch."""
+        """Store the episodes that are open after the batch."""
         streams = len(first)
         stream_of = np.cumsum(cut.first_of_stream) - 1
         last = np.append(first[1:] - 1, len(position) - 1)
-        episode = cut.number[last]  # the one that may go on
+        episode = cut.number[last]  # the one that may continue
         is_open = ~cut.ends[last]
 
         closing = (known >= 0) & ~is_open
@@ -132,7 +131,7 @@ class WindowHistory:
             self.key[known[closing]] = -1
             self._sorted = None
         place = np.where(is_open, known, -1)
-        self.arrival[place[place >= 0]] = steps.arrival.max()  # before `_open`, which looks for forgotten rows
+        self.arrival[place[place >= 0]] = steps.arrival.max()  # before `_open`, which frees rows of dropped streams
         fresh = is_open & (known < 0)
         if fresh.any():
             place[fresh] = self._open(cut.stream[first[fresh]], int(steps.arrival.max()))
@@ -194,7 +193,7 @@ class WindowHistory:
         return {name: torch.from_numpy(getattr(self, name).copy()) for name in names}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore open episodes.
+        """Restore what `state_dict` returned.
 
         Raises:
             ValueError: If the horizon or the number of event tables differs.

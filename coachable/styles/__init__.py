@@ -1,4 +1,4 @@
-"""Styles: what can be coached, how it is sampled and encoded, and what it is rewarded with. No environments here."""
+"""Styles: their parameters, sampling, encoding and rewards, independent of environments."""
 
 from coachable.styles.parameters import Choice, Parameter, Setpoint, Weight
 from coachable.styles.reward import StyleReward

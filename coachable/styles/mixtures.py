@@ -1,4 +1,4 @@
-"""Distributions of training styles for any space of weights: combat's, its ablations, and one for sliders."""
+"""Distributions of training styles for any space of weights: combat's, its ablations, and one for requests."""
 
 from collections.abc import Sequence
 from typing import Literal, get_args
@@ -14,19 +14,19 @@ Single = Literal["continuous_one_hot", "one_hot", "independent"]
 
 
 def own(space: StyleSpace) -> Sampler:
-    """Return the sampler that the space was declared with."""
+    """Return the space's own sampler."""
     return space.sampler
 
 
 def style_mixture(
     space: StyleSpace, single: Single = "continuous_one_hot", *, neutral: float = 0.03, independent: float = 0.10
 ) -> Sampler:
-    """Return the mixture of no style, all weights at once, and one weight alone (paper, Appendix C, Style Parameters).
+    """Return a mixture of no style, all weights at once, and one weight alone (paper, Appendix C, Style Parameters).
 
     Args:
-        space: Its parameters, all of them weights. Only `single="independent"` serves set-points and choices as well;
-            these have no neutral value, so that everything is drawn independently then.
-        single: How one weight is drawn: "continuous_one_hot" over its range, "one_hot" at its upper bound; or
+        space: Style space of weights. With set-points or choices, which have no neutral value, `single` must be
+            "independent", and everything is drawn independently.
+        single: Distribution of one weight alone: "continuous_one_hot" over its range, "one_hot" at its upper bound, or
             "independent", which draws all weights independently instead (the ablations of Appendix D).
         neutral: Probability that every weight is 0.
         independent: Probability that every weight is drawn, independently.
@@ -35,7 +35,7 @@ def style_mixture(
         A sampler of the space's dimension.
 
     Raises:
-        ValueError: If `single` is unknown, or a parameter is no weight.
+        ValueError: If `single` is unknown, or a parameter is not a weight.
     """
     if single not in get_args(Single):
         raise ValueError(f"single is {single!r}: expected one of {', '.join(get_args(Single))}")
@@ -50,13 +50,13 @@ def style_mixture(
 
 
 def with_requests(space: StyleSpace, *, positive: float = 0.25, full: float = 0.15, neutral: float = 0.1) -> Sampler:
-    """Mix the space's own sampler with requests that people make and that it hardly ever draws.
+    """Return the space's own sampler mixed with styles that people request but that it rarely draws.
 
-    Where each weight is positive on its own one time in four, all four are so once in 256 episodes, and a network that
-    has to extrapolate to such a request fails it.
+    If each of four weights is positive in a quarter of the episodes, all four are positive in one of 256 episodes. A
+    network that has to extrapolate to such a request fails.
 
     Args:
-        space: Its parameters, all of them weights.
+        space: Style space of weights.
         positive: Probability that every weight is drawn uniformly from 0 to its upper bound.
         full: Probability that every weight is at its upper bound.
         neutral: Probability that every weight is 0.
@@ -65,7 +65,7 @@ def with_requests(space: StyleSpace, *, positive: float = 0.25, full: float = 0.
         A sampler of the space's dimension.
 
     Raises:
-        ValueError: If a parameter is no weight, or the probabilities exceed 1 together.
+        ValueError: If a parameter is not a weight, or the sum of the probabilities exceeds 1.
     """
     _require((Weight,), space, "sampler with_requests asks for weights of 0, which {} cannot be (not a weight)")
     high, zero = space.high.tolist(), [0.0] * space.dim
@@ -76,16 +76,17 @@ def with_requests(space: StyleSpace, *, positive: float = 0.25, full: float = 0.
 def with_extremes(
     space: StyleSpace, *, share: float = 0.5, shared: bool = True, only: Sequence[str] | None = None
 ) -> Sampler:
-    """Mix the space's own sampler with styles whose every parameter is at one of its bounds.
+    """Return the space's own sampler mixed with styles in which every parameter is at one of its bounds.
 
-    What tells two styles apart is largest between bounds, so that networks hear of it sooner.
+    Styles differ most between bounds, so that networks learn the differences sooner.
 
     Args:
-        space: Its parameters, weights or set-points.
+        space: Style space of weights and set-points.
         share: Probability that every parameter is at its lower or its upper bound, each equally likely.
-        only: Parameters that are at a bound in that share; the others are at their default there. By default all.
-        shared: Whether rows that share a style in the space's own sampler (`Shared`), such as the cars of a race, go on
-            to share it. Otherwise each row has its own: agents then meet others of another style than theirs.
+        only: Names of the parameters that are at a bound in that share; the others are then at their default. By
+            default all.
+        shared: Whether rows that share a style in the space's own sampler (`Shared`), such as the cars of a race, still
+            share it. Otherwise each row has its own style, so that agents meet others of other styles.
 
     Returns:
         A sampler of the space's dimension.
@@ -129,7 +130,7 @@ def _others(space: StyleSpace, kinds: tuple[type, ...]) -> list[str]:
 
 
 def _require(kinds: tuple[type, ...], space: StyleSpace, why: str) -> None:
-    """Refuse parameters of other kinds; "{}" in `why` stands for them."""
+    """Raise a `ValueError` if there are parameters of other kinds, whose names replace "{}" in `why`."""
     if others := _others(space, kinds):
         named = f"{', '.join(others)} of the style space {space.name!r}"
         raise ValueError(f"{why.format(named)}: expected sampler=default or sampler=independent")

@@ -1,7 +1,7 @@
-"""The three kinds of style parameter: `Weight`, `Setpoint` and `Choice`.
+"""Style parameters of three kinds: `Weight`, `Setpoint` and `Choice`.
 
-A parameter is a plain, frozen declaration. `StyleSpace` turns a list of them into tensors; sliders, export metadata and
-reports read the same declarations.
+A parameter is a plain, frozen declaration. `StyleSpace` converts a list of them into tensors. Sliders, export metadata
+and reports read the same declarations.
 """
 
 import math
@@ -31,7 +31,7 @@ def _check_inside(what: str, value: float, low: float, high: float) -> None:
 
 
 class _Numeric:
-    """What `Weight` and `Setpoint` share: one number with a range."""
+    """Base of `Weight` and `Setpoint`: one number with a range."""
 
     name: str
     low: float
@@ -53,13 +53,13 @@ class _Numeric:
 
     @property
     def evaluation_range(self) -> tuple[float, float]:
-        """Range that reports sweep: `evaluation` where given, otherwise the whole range."""
+        """Range over which reports vary the parameter: `evaluation` if given, otherwise the whole range."""
         return (self.low, self.high) if self.evaluation is None else self.evaluation
 
 
 @dataclass(frozen=True)
 class Weight(_Numeric):
-    """Scales one or more reward terms: positive encourages, negative discourages, 0 is neutral and the default.
+    """Factor on reward terms: positive values encourage, negative ones discourage, and 0 is neutral and the default.
 
     Args:
         name: Identifier, unique in the space.
@@ -67,10 +67,10 @@ class Weight(_Numeric):
         high: Highest value ever sampled, at least 0.
         unit: Unit for sliders and reports, empty if none.
         help: One line that tells a coach what the parameter does.
-        evaluation: Range that reports sweep, inside `[low, high]`; the whole range if None.
+        evaluation: Range over which reports vary it, inside `[low, high]`; the whole range if None.
 
     Raises:
-        ValueError: If the name is no identifier, the range is empty or infinite, or lacks 0.
+        ValueError: If the name is not an identifier, or the range is empty, infinite or without 0.
 
     Examples:
         >>> Weight("melee", -0.375, 7.5, help="Prefer the spear").default
@@ -99,7 +99,7 @@ class Weight(_Numeric):
 
 @dataclass(frozen=True)
 class Setpoint(_Numeric):
-    """A target or threshold inside a reward term, such as a step length.
+    """Target or threshold inside a reward term, such as a step length.
 
     Args:
         name: Identifier, unique in the space.
@@ -107,13 +107,13 @@ class Setpoint(_Numeric):
         high: Highest value ever sampled.
         unit: Unit for sliders and reports.
         help: One line that tells a coach what the parameter does.
-        default: Value when the coach names none; the middle of the range if None.
-        encoding: What the networks see. "max": `theta / max(|low|, |high|)`, the paper's f; "range": the range mapped
-            to `[-1, 1]`, for set-points far from 0 (our choice).
-        evaluation: Range that reports sweep, inside `[low, high]`; the whole range if None.
+        default: Value if the coach gives none; None for the middle of the range.
+        encoding: "max": networks see `theta / max(|low|, |high|)`, the paper's f. "range": they see the range mapped to
+            `[-1, 1]`, for set-points far from 0 (our choice).
+        evaluation: Range over which reports vary it, inside `[low, high]`; the whole range if None.
 
     Raises:
-        ValueError: If the name is no identifier, the range is empty or infinite, the default lies outside, or the
+        ValueError: If the name is not an identifier, the range is empty or infinite, the default lies outside, or the
             encoding is unknown.
 
     Examples:
@@ -151,10 +151,10 @@ class Choice:
         name: Identifier, unique in the space.
         options: At least two distinct names, in the order of the one-hot entries.
         help: One line that tells a coach what the parameter does.
-        default: Option when the coach names none; the first if None.
+        default: Option if the coach gives none; None for the first.
 
     Raises:
-        ValueError: If the name is no identifier, options repeat or are fewer than two, or the default is none of them.
+        ValueError: If the name is not an identifier, options repeat or are too few, or the default is not an option.
 
     Examples:
         >>> Choice("pose", ("front", "t_pose", "up")).width

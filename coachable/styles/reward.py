@@ -1,4 +1,4 @@
-"""`StyleReward`, the only code that turns features and a style into the style part of the reward."""
+"""`StyleReward`, which computes the style part of the reward from features and a style."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,13 +14,13 @@ __all__ = ["StyleReward"]
 class StyleReward(nn.Module):
     """Sum of scaled style terms, `sum_k scale_k * term_k(features, theta)` (paper: `sum_i w_i g_i(s, a, s'; xi_i)`).
 
-    It runs as environment transform while collecting and inside the relabelling while learning, with the same bits.
+    The same code runs in the environment transform and in relabelling, so that both give the same bits.
 
     Args:
-        space: What theta means. Every parameter must be read by a term.
-        terms: Terms by name; each carries `.parameters`, the names it reads (wrap plain functions and modules in
-            `Term`).
-        scales: Fixed factor per term; 1 where not given.
+        space: Style space. Every parameter must be read by a term.
+        terms: Terms by name. Each has the attribute `parameters`, the names that it reads; wrap plain functions and
+            modules in `Term`.
+        scales: Fixed factors by name of the term; 1 for the other terms.
 
     Raises:
         ValueError: If a term declares no parameters or unknown ones, a parameter is read by no term, or a scale
@@ -49,26 +49,26 @@ class StyleReward(nn.Module):
 
     @property
     def terms(self) -> dict[str, StyleTerm]:
-        """The terms by name, in the order in which they are added."""
+        """Terms by name, in the order in which they are added."""
         return {name: term for name, term, _ in self._terms}
 
     @property
     def is_linear(self) -> bool:
-        """Whether the reward is known to be linear in the features, so that those of several steps may be summed."""
+        """Whether the reward is known to be linear in the features, so that features of several steps may be summed."""
         return all(isinstance(term, WeightedFeature | WeightedSum) for _, term, _ in self._terms)
 
     def forward(self, features: Features, theta: Tensor) -> Tensor:
         """Return the style part of the reward.
 
         Args:
-            features: `(..., F)`, or a tensordict of batch shape `(...)`.
-            theta: `(..., dim)`, raw. Its batch shape is that of the result; features may broadcast against it.
+            features: Features `(..., F)`, or a tensordict of batch shape `(...)`, which may broadcast against theta.
+            theta: Style `(..., dim)`, not encoded.
 
         Returns:
             `(..., 1)`, in theta's dtype (float32).
 
         Raises:
-            ValueError: If a term returns another shape than one number per style.
+            ValueError: If a term does not return one number per style.
         """
         style = self.space.view(theta)
         total: Tensor | None = None
@@ -81,7 +81,7 @@ class StyleReward(nn.Module):
         return total.to(theta.dtype).unsqueeze(-1)
 
     def terms_of(self, features: Features, theta: Tensor) -> dict[str, Tensor]:
-        """Return each term before its scale, `(...,)`, for logging and reports."""
+        """Return each term `(...,)` before it is scaled, by name."""
         style = self.space.view(theta)
         return {name: self._checked(name, term(features, style), theta) for name, term, _ in self._terms}
 

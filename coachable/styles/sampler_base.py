@@ -1,4 +1,4 @@
-"""`Sampler`: the base of all distributions over theta, with its registry for serialisation."""
+"""`Sampler`, the base class of all distributions over theta, with a registry for serialisation."""
 
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
@@ -14,7 +14,7 @@ _REGISTRY: dict[str, type["Sampler"]] = {}
 
 @lru_cache(maxsize=256)
 def constant(values: tuple[float, ...], device: torch.device) -> Tensor:
-    """Return a float32 constant `(n,)` on a device. It is shared: do not write to it."""
+    """Return a float32 constant `(n,)` on a device. It is shared, so do not write to it."""
     with torch.inference_mode(False):
         return torch.tensor(values, dtype=torch.float32, device=device)
 
@@ -29,20 +29,22 @@ def numbers(values: float | Sequence[float] | Tensor) -> tuple[float, ...]:
 class Sampler:
     """Distribution over a block of `dim` style numbers.
 
-    A new sampler is a frozen dataclass that subclasses this and defines `dim`, `_draw` and, for the range check of
-    `StyleSpace`, `support`. Its fields must be numbers, strings, samplers or tuples of these: serialisation follows
-    from them. Draws may depend on each other along the last batch dimension only (`Shared`).
+    To define a sampler, subclass this as a frozen dataclass with `_draw` and `support`, or with `_draw` and `dim` if
+    the support is not known. Its fields are serialised and must be numbers, strings, samplers or tuples of these. Draws
+    may depend on each other along the last batch dimension only (`Shared`).
     """
 
     @property
     def dim(self) -> int:
         """Number of entries of theta that this sampler draws."""
-        raise NotImplementedError(f"{type(self).__name__} must define dim")
+        if (support := self.support()) is None:
+            raise NotImplementedError(f"{type(self).__name__} must define dim or support")
+        return len(support[0])
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         known = _REGISTRY.get(cls.__name__, cls)
-        # Redefining a class (notebooks, reloads) is fine; another class of that name would hijack stored descriptions.
+        # A class may be redefined in a notebook, but another class of its name would be used for stored descriptions.
         if (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
             raise TypeError(
                 f"a sampler named {cls.__name__} exists already, in {known.__module__}: choose another name."
@@ -50,20 +52,17 @@ class Sampler:
         _REGISTRY[cls.__name__] = cls
 
     def sample(
-        self,
-        shape: Sequence[int] = (),
-        generator: Generator | None = None,
-        device: torch.device | str | None = None,
+        self, shape: Sequence[int] = (), generator: Generator | None = None, device: torch.device | str | None = None
     ) -> Tensor:
         """Draw styles.
 
         Args:
             shape: Batch shape.
-            generator: Source of randomness; torch's global generator if None.
-            device: Device of the result; the generator's device if None, or the CPU without one.
+            generator: Generator to draw from; None for torch's global one.
+            device: Device of the result; None for that of the generator, or without one the CPU.
 
         Returns:
-            `(*shape, dim)` float32.
+            Styles `(*shape, dim)`, float32.
         """
         target = torch.device(device) if device is not None else generator.device if generator is not None else _CPU
         source = generator.device if generator is not None else target
@@ -71,12 +70,9 @@ class Sampler:
         return drawn if source == target else drawn.to(target)
 
     def sample_independent(
-        self,
-        shape: Sequence[int] = (),
-        generator: Generator | None = None,
-        device: torch.device | str | None = None,
+        self, shape: Sequence[int] = (), generator: Generator | None = None, device: torch.device | str | None = None
     ) -> Tensor:
-        """Draw styles none of which depends on another, unlike the rows of a batch of `Shared`; see `sample`."""
+        """Draw styles that are all independent, unlike the rows of a batch of `Shared`; see `sample`."""
         return self.sample((*shape, 1), generator, device).squeeze(-2)
 
     def _draw(self, shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
@@ -87,14 +83,14 @@ class Sampler:
         return None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a description that JSON can hold; `Sampler.from_dict` reads it back."""
+        """Return a description that JSON can represent, for `Sampler.from_dict`."""
         if not is_dataclass(self):
             raise TypeError(f"sampler {type(self).__name__} cannot be described: make it a frozen dataclass.")
         return {"type": type(self).__name__, **{f.name: _plain(getattr(self, f.name)) for f in fields(self)}}
 
     @staticmethod
     def from_dict(description: dict[str, Any]) -> "Sampler":
-        """Rebuild a sampler from `to_dict`.
+        """Build a sampler from the description that `to_dict` returned.
 
         Raises:
             ValueError: If the type is unknown, for instance because the module that defines it was not imported.
@@ -104,7 +100,7 @@ class Sampler:
         if kind not in _REGISTRY:
             raise ValueError(
                 f"unknown sampler type {kind!r}: expected one of {sorted(_REGISTRY)}. "
-                "A sampler of your own is known once its module has been imported."
+                "Import the module that defines a sampler of your own."
             )
         return _REGISTRY[kind](**{name: _revived(value) for name, value in arguments.items()})
 

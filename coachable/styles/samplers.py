@@ -1,10 +1,11 @@
 """Composable distributions over theta (paper, Appendix A, Parameter Sampling).
 
-Every sampler draws float32 of any batch shape from an optional `torch.Generator`. Draws happen on the generator's
-device (on `device` without one) and the result is moved to `device`. How many random numbers a call consumes depends on
-its batch shape only, never on what was drawn, so runs with one seed stay aligned.
+Every sampler draws float32 of any batch shape from an optional `torch.Generator`. It draws on the generator's device,
+or without one on `device`, and moves the result to `device`. The number of random numbers that a call uses depends only
+on the batch shape, not on the values drawn, so that runs with equal seeds stay aligned.
 """
 
+import operator
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -27,19 +28,13 @@ __all__ = [
 ]
 
 
-def _check_bounds(who: str, low: tuple[float, ...], high: tuple[float, ...]) -> None:
-    _check_finite(who, low + high)
-    if len(low) != len(high) or not low or not all(a <= b for a, b in zip(low, high, strict=True)):
-        raise ValueError(f"{who} has low {low} and high {high}: expected equal lengths and low <= high throughout.")
-
-
-def _check_finite(who: str, values: tuple[float, ...]) -> None:
+def _check_finite(sampler: Sampler, values: tuple[float, ...]) -> None:
     for value in values:
-        FINITE.check(f"a value of {who}", value)
+        FINITE.check(f"a value of {type(sampler).__name__}", value)
 
 
 def _bounds_of(samplers: Iterable[Sampler]) -> tuple[list[tuple[float, ...]], list[tuple[float, ...]]] | None:
-    """Return the lower and the upper bounds of several samplers, or None if those of one are not known."""
+    """Return the lower and the upper bounds of several samplers, or None if those of a sampler are not known."""
     supports = [sampler.support() for sampler in samplers]
     known = [bounds for bounds in supports if bounds is not None]
     return None if len(known) < len(supports) else ([low for low, _ in known], [high for _, high in known])
@@ -50,14 +45,14 @@ def _rand(shape: tuple[int, ...], generator: Generator | None, device: torch.dev
 
 
 def _one_hot(n: int, shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
-    """Boolean one-hot of a uniformly drawn index, `(*shape, n)`."""
+    """Draw an index uniformly and return it as a boolean one-hot `(*shape, n)`."""
     index = torch.randint(n, (*shape, 1), generator=generator, device=device)
     return index == torch.arange(n, device=device)
 
 
 @dataclass(frozen=True)
 class PointMass(Sampler):
-    """Always the same style.
+    """Distribution that always gives the same style.
 
     Args:
         values: One number per entry, or a single number for one entry.
@@ -72,28 +67,23 @@ class PointMass(Sampler):
 
     def __init__(self, values: float | Sequence[float]) -> None:
         object.__setattr__(self, "values", numbers(values))
-        _check_finite(type(self).__name__, self.values)
-
-    @property
-    def dim(self) -> int:
-        """Number of entries."""
-        return len(self.values)
+        _check_finite(self, self.values)
 
     def _draw(self, shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
-        return constant(self.values, device).expand(*shape, self.dim).clone()
+        return constant(self.values, device).expand(*shape, len(self.values)).clone()
 
     def support(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Return the point as lower and as upper bound."""
+        """Return the values as lower and as upper bounds."""
         return self.values, self.values
 
 
 @dataclass(frozen=True)
 class Uniform(Sampler):
-    """Independent entries, each uniform over its own range.
+    """Distribution of independent entries, each uniform over its own range.
 
     Args:
         low: Lower bounds, one per entry, or a single number.
-        high: Upper bounds, as many.
+        high: Upper bounds, in the same form.
 
     Raises:
         ValueError: If lengths differ or a lower bound exceeds its upper bound.
@@ -105,30 +95,29 @@ class Uniform(Sampler):
     def __init__(self, low: float | Sequence[float], high: float | Sequence[float]) -> None:
         object.__setattr__(self, "low", numbers(low))
         object.__setattr__(self, "high", numbers(high))
-        _check_bounds(type(self).__name__, self.low, self.high)
-
-    @property
-    def dim(self) -> int:
-        """Number of entries."""
-        return len(self.low)
+        _check_finite(self, self.low + self.high)
+        if len(self.low) != len(self.high) or not self.low or any(map(operator.gt, self.low, self.high)):
+            raise ValueError(
+                f"{type(self).__name__} has low {self.low} and high {self.high}: expected equal lengths and low <= high"
+            )
 
     def _draw(self, shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
-        # lerp rounds to values inside [low, high] only, which bounded specs insist on.
-        u = _rand((*shape, self.dim), generator, device)
+        # lerp, because its rounded results are inside [low, high], as bounded specs require.
+        u = _rand((*shape, len(self.low)), generator, device)
         return torch.lerp(constant(self.low, device), constant(self.high, device), u)
 
     def support(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """The bounds."""
+        """Return the bounds."""
         return self.low, self.high
 
 
 @dataclass(frozen=True)
 class Mixture(Sampler):
-    """Draws from one of several samplers, chosen with fixed probabilities, for each style separately.
+    """Distribution that draws each style from one of several samplers, chosen with fixed probabilities.
 
     Args:
-        components: Samplers of one dimension.
-        weights: Their probabilities, summing to 1.
+        components: Samplers of the same dimension.
+        weights: Their probabilities, with sum 1.
 
     Raises:
         ValueError: If dimensions differ, or the weights are negative or do not sum to 1.
@@ -173,7 +162,7 @@ class Mixture(Sampler):
         return drawn
 
     def support(self) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-        """Hull of the components with a positive weight."""
+        """Return the bounds of the union of the components with a positive weight."""
         bounds = _bounds_of(c for c, w in zip(self.components, self.weights, strict=True) if w > 0)
         if bounds is None:
             return None
@@ -183,10 +172,10 @@ class Mixture(Sampler):
 
 @dataclass(frozen=True)
 class Product(Sampler):
-    """Independent samplers side by side; dimensions add up.
+    """Distribution of consecutive blocks of theta that are drawn independently.
 
     Args:
-        components: Samplers of consecutive blocks of theta.
+        components: Samplers of the blocks.
 
     Examples:
         >>> humanoid = Product([UniformChoice(3), Uniform(0.30, 0.65)])
@@ -210,14 +199,14 @@ class Product(Sampler):
         return torch.cat([c._draw(shape, generator, device) for c in self.components], dim=-1)
 
     def support(self) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-        """Supports of the components, concatenated."""
+        """Return the bounds of the components, concatenated."""
         bounds = _bounds_of(self.components)
         return None if bounds is None else (sum(bounds[0], ()), sum(bounds[1], ()))
 
 
 @dataclass(frozen=True)
 class UniformChoice(Sampler):
-    """One-hot vector of a uniformly drawn option, for a `Choice`.
+    """Distribution of a one-hot vector with a uniformly drawn option, for a `Choice`.
 
     Args:
         n: Number of options.
@@ -228,69 +217,64 @@ class UniformChoice(Sampler):
     def __post_init__(self) -> None:
         COUNT.check("n of UniformChoice", self.n)
 
-    @property
-    def dim(self) -> int:
-        """Number of entries."""
-        return self.n
-
     def _draw(self, shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
         return _one_hot(self.n, shape, generator, device).to(torch.float32)
 
     def support(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Zero to one."""
+        """Return bounds of 0 and 1."""
         return (0.0,) * self.n, (1.0,) * self.n
 
 
 @dataclass(frozen=True, init=False)
 class ContinuousOneHot(Uniform):
-    """One uniformly drawn entry k is uniform over `[low_k, high_k]`, the rest are zero (paper, combat).
+    """Distribution in which one uniformly drawn entry k is uniform over `[low_k, high_k]` and the others are 0 (paper).
 
     Args:
         low: Lower bounds, one per entry.
-        high: Upper bounds, as many.
+        high: Upper bounds, one per entry.
 
     Raises:
         ValueError: If lengths differ or a lower bound exceeds its upper bound.
     """
 
     def _draw(self, shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
-        hot = _one_hot(self.dim, shape, generator, device)
-        # One number per style is enough: only the chosen entry uses it.
+        hot = _one_hot(len(self.low), shape, generator, device)
+        # One number per style is enough, because only the chosen entry uses it.
         u = _rand((*shape, 1), generator, device)
         values = torch.lerp(constant(self.low, device), constant(self.high, device), u)
         return torch.where(hot, values, 0.0)
 
     def support(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """The bounds, widened to contain zero."""
+        """Return the bounds, widened to contain 0."""
         return tuple(min(a, 0.0) for a in self.low), tuple(max(b, 0.0) for b in self.high)
 
 
 @dataclass(frozen=True, init=False)
 class OneHot(PointMass):
-    """One uniformly drawn entry k takes the value `values_k`, the rest are zero (ablation of `ContinuousOneHot`).
+    """Distribution in which one uniformly drawn entry k is `values_k` and the others are 0 (paper, ablation).
 
     Args:
-        values: Value of each entry when it is chosen.
+        values: Value of each entry if it is drawn.
     """
 
     def _draw(self, shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
-        return torch.where(_one_hot(self.dim, shape, generator, device), constant(self.values, device), 0.0)
+        return torch.where(_one_hot(len(self.values), shape, generator, device), constant(self.values, device), 0.0)
 
     def support(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Zero to the value."""
+        """Return the bounds of 0 and the value."""
         return tuple(min(v, 0.0) for v in self.values), tuple(max(v, 0.0) for v in self.values)
 
 
 @dataclass(frozen=True)
 class Shared(Sampler):
-    """One style for several rows of a batch, such as the cars of a race.
+    """Distribution in which several rows of a batch, such as the cars of a race, share a style.
 
-    In a batch `(copies * n,)` rows i, i + n, i + 2 n and so on share a style. Where every draw has to be independent,
-    as in relabelling, `sample_independent` shares nothing.
+    In a batch `(copies * n,)` rows i, i + n, i + 2 n and so on share a style. `sample_independent` draws styles that
+    are not shared, as relabelling needs.
 
     Args:
         sampler: Distribution of the shared style.
-        copies: Rows that share one.
+        copies: Number of rows that share a style.
 
     Raises:
         ValueError: If `copies` is below 1.
@@ -320,5 +304,5 @@ class Shared(Sampler):
         return drawn.repeat(*(1 for _ in shape[:-1]), self.copies, 1)[..., : shape[-1], :].clone()
 
     def support(self) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-        """Bounds of the shared style."""
+        """Return the bounds of the shared style."""
         return self.sampler.support()

@@ -1,6 +1,6 @@
-"""`StyleSpace`, the single declaration of what can be coached.
+"""`StyleSpace`, the declaration of what can be coached.
 
-Samplers, networks (encoding), sliders, export metadata, checkpoints and reports all read this object.
+Samplers, networks, sliders, export metadata, checkpoints and reports all read this object.
 """
 
 import json
@@ -26,24 +26,24 @@ _KINDS: dict[str, type] = {"weight": Weight, "setpoint": Setpoint, "choice": Cho
 
 
 class StyleSpace:
-    """An ordered set of style parameters, their training distribution and their encoding.
+    """Ordered set of style parameters with their training distribution and encoding.
 
     Theta is a float32 tensor `(..., dim)`, in the units of the parameters. The space maps names to parameters like a
-    dict: `space["pose"]`, `"pose" in space`, `for name in space`.
+    dictionary: `space["pose"]`, `"pose" in space`, `for name in space`.
 
     Attributes:
-        parameters: The declarations, in the order of theta's entries.
-        names: Their names.
+        parameters: Declarations, in the order of theta's entries.
+        names: Names of the parameters.
         dim: Number of entries of theta.
-        low: Lower bounds, `(dim,)` float32; shared, do not write to it.
-        high: Upper bounds, likewise.
-        slices: Entries of theta by parameter name.
-        columns: The same for indexing: an integer for a `Weight` or `Setpoint`, a slice for a `Choice`.
+        low: Lower bounds `(dim,)`, float32. Do not write to them.
+        high: Upper bounds `(dim,)`, float32. Do not write to them.
+        slices: Slices of theta by parameter name.
+        columns: Indices into theta by parameter name: an integer for a `Weight` or `Setpoint`, a slice for a `Choice`.
         sampler: Training distribution.
 
     Args:
         parameters: `Weight`, `Setpoint` and `Choice` declarations, in the order of theta's entries.
-        sampler: Training distribution over theta; by default every parameter is uniform over its range, independent.
+        sampler: Training distribution over theta; by default parameters are independent and uniform over their ranges.
         name: Name of the space, for reports and error messages.
 
     Raises:
@@ -74,15 +74,10 @@ class StyleSpace:
             scale += [(p.high - p.low) / 2 if affine else max(abs(p.low), abs(p.high))] * p.width
             default += [float(o == p.default) for o in p.options] if isinstance(p, Choice) else [p.default]
         self.dim = len(low)
-        self.low = torch.tensor(low, dtype=torch.float32, device="cpu")
-        self.high = torch.tensor(high, dtype=torch.float32, device="cpu")
-        self._default = torch.tensor(default, dtype=torch.float32, device="cpu")
-        self._encoding = {
-            torch.device("cpu"): (
-                torch.tensor(shift, dtype=torch.float32, device="cpu"),
-                torch.tensor(scale, dtype=torch.float32, device="cpu"),
-            )
-        }
+        vectors = (low, high, default, shift, scale)
+        tensors = (torch.tensor(vector, dtype=torch.float32, device="cpu") for vector in vectors)
+        self.low, self.high, self._default, *encoding = tensors
+        self._encoding: dict[torch.device, tuple[Tensor, Tensor]] = {torch.device("cpu"): (encoding[0], encoding[1])}
         self.columns: dict[str, int | slice] = {
             p.name: self.slices[p.name] if isinstance(p, Choice) else self.slices[p.name].start for p in self.parameters
         }
@@ -91,7 +86,7 @@ class StyleSpace:
         self._check_sampler()
 
     def __getitem__(self, name: str) -> Parameter:
-        """Parameter of that name."""
+        """Return the parameter of a name."""
         if name not in self.slices:
             raise KeyError(f"no style parameter named {name}: expected {', '.join(self.names)}")
         return self.parameters[self.names.index(name)]
@@ -114,30 +109,27 @@ class StyleSpace:
 
     @property
     def default(self) -> Tensor:
-        """The style when the coach asks for nothing, `(dim,)`."""
+        """Style `(dim,)` of the parameters' defaults."""
         return self._default.clone()
 
     def sample(
-        self,
-        shape: Sequence[int] = (),
-        generator: Generator | None = None,
-        device: torch.device | str | None = None,
+        self, shape: Sequence[int] = (), generator: Generator | None = None, device: torch.device | str | None = None
     ) -> Tensor:
-        """Draws training styles, `(*shape, dim)` float32; see `Sampler.sample`."""
+        """Draw training styles `(*shape, dim)`, float32; see `Sampler.sample`."""
         return self.sampler.sample(shape, generator, device)
 
     def with_sampler(self, sampler: Sampler) -> "StyleSpace":
-        """The same parameters with another training distribution."""
+        """Return a space of the same parameters with another training distribution."""
         return StyleSpace(self.parameters, sampler, self.name)
 
     def encode(self, theta: Tensor) -> Tensor:
-        """Scales theta for the networks: `theta / max(|low|, |high|)` (paper's f), affine for "range" set-points.
+        """Scale theta for the networks: `theta / max(|low|, |high|)` (paper's f), affine for "range" set-points.
 
         Args:
-            theta: `(..., dim)`, raw.
+            theta: Styles `(..., dim)`.
 
         Returns:
-            `(..., dim)`, within `[-1, 1]` for styles inside the range. One-hots stay as they are.
+            Encoded styles `(..., dim)`, in [-1, 1] for styles inside the range. One-hots do not change.
         """
         tensors = self._encoding.get(theta.device)
         shift, scale = self._encoding_on(theta.device) if tensors is None else tensors
@@ -146,22 +138,22 @@ class StyleSpace:
     def _encoding_on(self, device: torch.device) -> tuple[Tensor, Tensor]:
         with torch.inference_mode(False):
             shift, scale = (t.to(device) for t in self._encoding[torch.device("cpu")])
-        if not torch.compiler.is_compiling():  # a traced tensor must not outlive its trace
+        if not torch.compiler.is_compiling():  # a traced tensor must not be used after its trace
             self._encoding[device] = (shift, scale)
         return shift, scale
 
     def make(self, strict: bool = False, **values: float | str) -> Tensor:
-        """Builds one style from named values.
+        """Return one style from named values.
 
         Args:
-            strict: Raise instead of clamping with a warning when a number lies outside its range.
-            **values: A number per `Weight` or `Setpoint`, an option's name per `Choice`; others take their default.
+            strict: Whether to raise instead of clamping with a warning if a number lies outside its range.
+            **values: A number per `Weight` or `Setpoint`, an option's name per `Choice`; the others have their default.
 
         Returns:
-            Theta, `(dim,)` float32.
+            Theta `(dim,)`, float32.
 
         Raises:
-            ValueError: If a name or option is unknown, a value is NaN or no number, or `strict` and out of range.
+            ValueError: If a name or option is unknown, a value is NaN or not a number, or out of range with `strict`.
         """
         theta = self.default
         for name, value in values.items():
@@ -182,19 +174,19 @@ class StyleSpace:
         return self.clamp(theta, strict=strict)
 
     def clamp(self, theta: Tensor, strict: bool = False) -> Tensor:
-        """Brings theta into the trained range, with a `StyleRangeWarning` that names what was changed.
+        """Clamp theta to the trained range, with a `StyleRangeWarning` that names the changed parameters.
 
-        A `Choice` block that is no one-hot becomes the one-hot of its largest entry.
+        A `Choice` block that is not a one-hot becomes the one-hot of its largest entry.
 
         Args:
-            theta: `(..., dim)`.
-            strict: Raise instead of changing anything.
+            theta: Styles `(..., dim)`.
+            strict: Whether to raise instead of changing theta.
 
         Returns:
-            `(..., dim)` float32, a new tensor.
+            Styles `(..., dim)`, float32, in a new tensor.
 
         Raises:
-            ValueError: If the shape is wrong, a value is NaN, or `strict` and something would be changed.
+            ValueError: If the shape is wrong, a value is NaN, or theta is out of range with `strict`.
         """
         clauses = violations(self.parameters, self.low, self.high, theta)
         if not clauses:
@@ -212,17 +204,20 @@ class StyleSpace:
         return clamped
 
     def validate(self, theta: Tensor) -> None:
-        """Raises a ValueError that lists what is wrong with theta: shape, NaN, range or one-hot."""
-        clauses = violations(self.parameters, self.low, self.high, theta)
-        if clauses:
+        """Check the shape and the values of theta.
+
+        Raises:
+            ValueError: If the shape is wrong, a value is NaN or out of range, or a `Choice` block is not a one-hot.
+        """
+        if clauses := violations(self.parameters, self.low, self.high, theta):
             raise ValueError(f"style {'; '.join(clauses)}.")
 
     def view(self, theta: Tensor) -> StyleView:
-        """Return theta `(..., dim)` by name; each block is sliced only when it is read."""
+        """Return a mapping of names to columns of theta `(..., dim)`, sliced lazily."""
         return StyleView(self.columns, self.columns_of, theta)
 
     def columns_of(self, names: tuple[str, ...]) -> slice | list[int] | None:
-        """Columns of several parameters, in that order: a slice where they are adjacent, None if all of theta."""
+        """Return the columns of several parameters in that order: a slice if adjacent, or None for all of theta."""
         if names not in self._columns_of:
             indices = [i for name in names for i in range(self.slices[name].start, self.slices[name].stop)]
             adjacent = indices == list(range(indices[0], indices[0] + len(indices)))
@@ -231,7 +226,7 @@ class StyleSpace:
         return self._columns_of[names]
 
     def describe(self, theta: Tensor) -> dict[str, float | str]:
-        """Numbers and option names of one style `(dim,)`; `make(**describe(theta))` gives it back."""
+        """Return numbers and option names of one style `(dim,)` by name, from which `make` builds it again."""
         if tuple(theta.shape) != (self.dim,):
             raise ValueError(f"style has shape {tuple(theta.shape)}: expected ({self.dim},), one style.")
         values = theta.detach().to("cpu", torch.float32)
@@ -243,17 +238,17 @@ class StyleSpace:
         }
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready description, sampler included."""
+        """Return a description of the space and its sampler that JSON can represent."""
         return {
             "version": SCHEMA_VERSION,
             "name": self.name,
-            "parameters": [{"kind": p.kind, **{k: _plain(v) for k, v in asdict(p).items()}} for p in self.parameters],
+            "parameters": [{"kind": p.kind, **asdict(p, dict_factory=_plain)} for p in self.parameters],
             "sampler": self.sampler.to_dict(),
         }
 
     @classmethod
     def from_dict(cls, description: Mapping[str, Any]) -> "StyleSpace":
-        """Rebuilds a space from `to_dict`.
+        """Build a space from the description that `to_dict` returned.
 
         Raises:
             ValueError: If the schema version, a kind of parameter or a sampler is unknown.
@@ -272,16 +267,16 @@ class StyleSpace:
         return cls(parameters, Sampler.from_dict(description["sampler"]), description.get("name", ""))
 
     def to_json(self) -> str:
-        """The description of `to_dict` as a JSON string."""
+        """Return the description of `to_dict` as a JSON string."""
         return json.dumps(self.to_dict(), allow_nan=False)
 
     @classmethod
     def from_json(cls, text: str) -> "StyleSpace":
-        """Rebuilds a space from `to_json`."""
+        """Build a space from the string that `to_json` returned."""
         return cls.from_dict(json.loads(text))
 
     def difference(self, other: "StyleSpace") -> list[str]:
-        """List how `other` ("there") differs from this space ("here"), as sentences; the list is empty if equal."""
+        """List the differences between this space ("here") and `other` ("there") as sentences."""
         found = differences(self.parameters, other.parameters)
         if self.name != other.name:
             found.insert(0, f"The space is called {self.name!r} here, {other.name!r} there.")
@@ -290,7 +285,7 @@ class StyleSpace:
         return found
 
     def encodes_like(self, other: "StyleSpace") -> bool:
-        """Whether a network trained on `other` reads this space's styles unchanged: same entries, same encoding."""
+        """Return whether the entries of both spaces and their encoding are equal, so that networks can be reused."""
         ours, theirs = (
             [(p.name, p.kind, getattr(p, "options", None), p.encoding, p.low, p.high) for p in space.parameters]
             for space in (self, other)
@@ -303,7 +298,7 @@ class StyleSpace:
                 f"the sampler draws {self.sampler.dim} numbers, the parameters {list(self.names)} need {self.dim}: "
                 f"{self.sampler}."
             )
-        # Draws expose a wrong order of components, and ranges where the sampler does not state its support.
+        # Draws show a wrong order of components, and wrong ranges of samplers without `support`.
         trial = self.sampler.sample((64,), torch.Generator().manual_seed(0))
         for theta in [trial, *self._corners()]:
             try:
@@ -312,7 +307,7 @@ class StyleSpace:
                 raise ValueError(f"the sampler does not fit the parameters: it draws a {error}") from None
 
     def _corners(self) -> list[Tensor]:
-        """Lowest and highest draw of every number, choices at their default."""
+        """Return the styles of lowest and highest values of the sampler's support, with choices at their default."""
         support = self.sampler.support()
         if support is None:
             return []
@@ -328,5 +323,5 @@ def _uniform_over(parameters: Sequence[Parameter]) -> Sampler:
     return Product([UniformChoice(p.width) if isinstance(p, Choice) else Uniform(p.low, p.high) for p in parameters])
 
 
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
+def _plain(fields: list[tuple[str, Any]]) -> dict[str, Any]:
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in fields}

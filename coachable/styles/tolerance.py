@@ -1,4 +1,4 @@
-"""Soft indicator of an interval, the building block of set-point rewards."""
+"""Soft indicator of an interval, for the rewards of set-points."""
 
 import math
 from functools import lru_cache
@@ -18,22 +18,22 @@ def tolerance(
     sigmoid: str = "gaussian",
     value_at_margin: float = 0.1,
 ) -> Tensor:
-    """Return 1 where `lower <= x <= upper`, and less with the distance from the interval.
+    """Return 1 where `lower <= x <= upper`, and values that fall with the distance from the interval elsewhere.
 
-    Equal to `dm_control.utils.rewards.tolerance`, but differentiable, on any device, and with bounds that may be
-    tensors, so that a style can set them.
+    The result equals that of `dm_control.utils.rewards.tolerance`. This function is differentiable and runs on any
+    device, and its bounds may be tensors, so that a style can set them.
 
     Args:
-        x: `(...)` floating point.
+        x: Values `(...)`, floating point.
         lower: Lower bound, a number or a tensor that broadcasts with `x`; may be infinite.
-        upper: Upper bound, likewise. Tensor bounds are not checked for `lower <= upper`.
+        upper: Upper bound, in the same form. Tensors are not checked for `lower <= upper`.
         margin: Distance at which the value is `value_at_margin`, in the unit of `x`; 0 gives a hard indicator.
         sigmoid: Shape of the decline: "gaussian", "hyperbolic", "long_tail", "reciprocal", "cosine", "linear",
             "quadratic" or "tanh_squared".
         value_at_margin: In (0, 1); 0 is allowed for "cosine", "linear" and "quadratic". Unused if `margin` is 0.
 
     Returns:
-        `(...)` in [0, 1], broadcast shape of `x` and the bounds.
+        Values in [0, 1], in the broadcast shape of `x` and the bounds.
 
     Raises:
         ValueError: If `lower > upper`, `margin < 0`, or `sigmoid` or `value_at_margin` is not valid.
@@ -53,9 +53,9 @@ def tolerance(
 
 
 def _distance(x: Tensor, lower: float | Tensor, upper: float | Tensor) -> Tensor:
-    """Return the distance from the interval; it is 0 inside. No mask is used, so that gradients stay finite.
+    """Return the distance from the interval, without a mask, so that gradients stay finite.
 
-    The special cases give the same values in fewer operations, which counts in every environment step.
+    The special cases give the same values in fewer operations.
     """
     if lower is upper:
         return (x - upper).abs()
@@ -101,7 +101,7 @@ def _decline(z: Tensor, sigmoid: str) -> Tensor:
         case "gaussian":
             return torch.exp(z.square().mul(-0.5))
         case "hyperbolic":
-            # 1 / cosh(z), but cosh overflows, and PyTorch's gives other bits for other memory layouts (exp does not).
+            # 1 / cosh(z) by exp, because cosh overflows and gives other bits for other memory layouts.
             decay = torch.exp(-z)
             return 2 * decay / (1 + decay.square())
         case "long_tail":

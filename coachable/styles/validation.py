@@ -1,4 +1,4 @@
-"""What can be wrong with a style: shape, NaN, range, one-hot."""
+"""Checks of a style: shape, NaN, range and one-hots."""
 
 from collections.abc import Sequence
 
@@ -16,16 +16,16 @@ def violations(parameters: Sequence[Parameter], low: Tensor, high: Tensor, theta
     """List range and one-hot violations of theta, one clause per parameter; the list is empty for a valid style.
 
     Args:
-        parameters: In the order of theta's entries.
-        low: `(dim,)` lower bounds.
-        high: `(dim,)` upper bounds.
-        theta: `(..., dim)`.
+        parameters: Parameters in the order of theta's entries.
+        low: Lower bounds `(dim,)`.
+        high: Upper bounds `(dim,)`.
+        theta: Styles `(..., dim)`.
 
     Returns:
         Clauses such as "step_length = 0.9 m lies outside [0.3, 0.65] m".
 
     Raises:
-        ValueError: If the shape or type is wrong or a value is NaN, which no clamping repairs.
+        ValueError: If the shape or type is wrong or a value is NaN, which cannot be clamped.
     """
     dim = len(low)
     if theta.ndim < 1 or theta.shape[-1] != dim or not theta.is_floating_point():
@@ -50,7 +50,7 @@ def violations(parameters: Sequence[Parameter], low: Tensor, high: Tensor, theta
 
 
 def _is_one_hot(block: Tensor) -> Tensor:
-    """`(N, n)` to `(N,)` boolean."""
+    """Return whether each row of `(N, n)` is a one-hot, `(N,)` bool."""
     return ((block == 0) | (block == 1)).all(-1) & (block.sum(-1) == 1)
 
 

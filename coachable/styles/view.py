@@ -1,4 +1,4 @@
-"""`StyleView`: theta by name, as reward terms see it."""
+"""`StyleView`, a mapping of names to columns of theta, for reward terms."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import TypeAlias
@@ -9,24 +9,21 @@ Columns: TypeAlias = slice | list[int] | None
 
 
 class StyleView(Mapping[str, Tensor]):
-    """Named, lazily sliced columns of theta.
+    """Mapping of parameter names to columns of theta.
 
-    `view["step_length"]` is `(...,)` for a `Weight` or `Setpoint` and `(..., n_options)` for a `Choice`. Slicing only
-    what is read keeps a reward cheap in spaces of many parameters.
+    `view["step_length"]` is `(...,)` for a `Weight` or `Setpoint` and `(..., n_options)` for a `Choice`. Columns are
+    sliced lazily, so that a reward is fast in spaces of many parameters.
 
     Args:
         columns: Column of each parameter: an integer, or a slice for a `Choice`.
-        columns_of: Columns of several parameters at once, None for all of theta; see `StyleSpace.columns_of`.
-        theta: `(..., dim)`, raw.
+        columns_of: Returns the columns of several parameters, see `StyleSpace.columns_of`.
+        theta: Styles `(..., dim)`, not encoded.
     """
 
     __slots__ = ("_columns", "_columns_of", "theta")
 
     def __init__(
-        self,
-        columns: Mapping[str, int | slice],
-        columns_of: Callable[[tuple[str, ...]], Columns],
-        theta: Tensor,
+        self, columns: Mapping[str, int | slice], columns_of: Callable[[tuple[str, ...]], Columns], theta: Tensor
     ) -> None:
         self._columns, self._columns_of = columns, columns_of
         self.theta = theta
@@ -44,6 +41,6 @@ class StyleView(Mapping[str, Tensor]):
         return len(self._columns)
 
     def block(self, names: tuple[str, ...]) -> Tensor:
-        """Several parameters at once, in that order, `(..., sum of widths)`."""
+        """Return the columns of several parameters in that order, `(..., sum of widths)`."""
         columns = self._columns_of(names)
         return self.theta if columns is None else self.theta[..., columns]

@@ -1,4 +1,4 @@
-"""How a learner evaluates networks and steps parameters, in plain torch."""
+"""Backend of a learner in plain torch: evaluates networks and steps parameters."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ __all__ = ["Backend"]
 
 
 class Backend:
-    """Everything in an update that can be done in another way with the same result.
+    """Operations of an update that another implementation may replace without changing the result.
 
-    This one evaluates the networks layer by layer, under autocast at bfloat16, steps with `torch.optim.Adam`, and moves
-    the target networks with TorchRL's `SoftUpdate`. To replace it, pass a subclass to
+    This implementation evaluates the networks layer by layer, under autocast at bfloat16. It steps with
+    `torch.optim.Adam` and moves the target networks with TorchRL's `SoftUpdate`. To replace it, pass a subclass to
     :meth:`coachable.training.Learner.use_backend`, as `coachable.fast.accelerate` does.
 
     Args:
         loss_module: The loss.
         precision: Precision of the matrix products.
-        target_updater: What moves the target networks.
+        target_updater: Moves the target networks.
 
     Attributes:
         compiles: Whether `torch.compile` may be applied to the loss functions.
@@ -58,7 +58,7 @@ class Backend:
         return torch.optim.Adam(params, lr=lr, eps=eps, fused=self._device_type in ("cpu", "cuda"))
 
     def gradient_norm(self, name: str, params: list[nn.Parameter]) -> Tensor:
-        """Return the norm of the gradient of `params`, see :meth:`make_optimizer`, after the backward pass."""
+        """Return the norm of the gradients of `params` after the backward pass; see :meth:`make_optimizer`."""
         return torch.nn.utils.get_total_norm([p.grad for p in params if p.grad is not None])
 
     def move_targets(self) -> None:
@@ -66,4 +66,4 @@ class Backend:
         self.target_updater.step()
 
     def follow(self) -> None:
-        """Continue with the parameters that the loss has now, after they were replaced, cast or moved in memory."""
+        """Use the loss's present parameters, after they were replaced, cast or moved in memory."""

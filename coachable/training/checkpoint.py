@@ -1,10 +1,11 @@
-"""Checkpoints: written atomically, read without pickle, and refused with a reason where they do not fit.
+"""Checkpoints, which are written atomically, read without pickle, and rejected with a reason if they do not fit.
 
 A checkpoint is a folder with `state.pt` (tensors, numbers, strings, containers: `torch.load(weights_only=True)`), a
 readable `metadata.json` and, in the newest one, the replay buffer under `replay/`.
 """
 
 import contextlib
+import itertools
 import json
 import os
 import shutil
@@ -46,7 +47,7 @@ SCHEMA_VERSION = 1
 _LATEST = "LATEST"
 _STATE = "state.pt"
 _WEIGHTS = ("actor", "critics", "learner")  # parts of a state that must be finite
-_FORMER_OPTIONS = {  # what configurations of earlier versions name, and the only behaviour that is left
+_FORMER_OPTIONS = {  # options of earlier versions, each with the only value that is still supported
     "entropy_in_target": "inside",
     "event_admission": "nonzero",
     "hl_gauss_support": "edges",
@@ -59,15 +60,15 @@ _FORMER_OPTIONS = {  # what configurations of earlier versions name, and the onl
 
 
 class CheckpointStore:
-    """The checkpoints of one run.
+    """Checkpoints of one run.
 
     Args:
-        directory: folder of the checkpoints, created when first written to.
-        keep: how many to keep; older ones are removed after a new one is complete.
-        replay: whether the newest checkpoint holds the replay buffer (needed to resume exactly).
+        directory: Folder of the checkpoints, created when the first one is written.
+        keep: Number of checkpoints to keep; older ones are removed after a new one is complete.
+        replay: Whether the newest checkpoint contains the replay buffer, which an exact resumption needs.
 
     Raises:
-        ValueError: if `keep` is below 1.
+        ValueError: If `keep` is below 1.
     """
 
     def __init__(self, directory: Path | str, keep: int = 3, replay: bool = True) -> None:
@@ -78,28 +79,29 @@ class CheckpointStore:
         self.replay = replay
 
     def save(self, state: Mapping[str, Any], metadata: Mapping[str, Any], replay: Any | None = None) -> Path:
-        """Writes one checkpoint: complete, or not at all.
+        """Write one checkpoint atomically.
 
-        Everything goes to a hidden folder that is synced to disk and renamed, so that a process killed at any moment
-        leaves the previous checkpoint as it was.
+        The files are written to a hidden folder, which is synced to disk and then renamed. A process that is killed at
+        any moment therefore leaves the previous checkpoint intact.
 
         Args:
-            state: what `state.pt` holds.
-            metadata: JSON-ready; must contain `frames`.
-            replay: replay buffer to save with it, if this store keeps replays.
+            state: Content of `state.pt`.
+            metadata: Content of `metadata.json`; must contain `frames`.
+            replay: Replay buffer; saved if this store keeps replay buffers.
 
         Returns:
-            The folder.
+            The checkpoint's folder.
 
         Raises:
-            CheckpointError: if a weight is NaN or infinite; nothing is written.
-            OSError: if writing fails (disk full, no permission), with the space that is needed; the partial is removed.
+            CheckpointError: If a weight is NaN or infinite. Nothing is written.
+            OSError: If writing fails (disk full, no permission). The message names the space that is needed, and the
+                partial checkpoint is removed.
         """
         self._check_finite(state, int(metadata["frames"]))
         self.directory.mkdir(parents=True, exist_ok=True)
         replay = replay if self.replay else None
         required_bytes = tensor_bytes(state) + (0 if replay is None else record_bytes(replay.storage))
-        self._remove_partials()  # of a process that was killed: there may be no room for another one beside them
+        self._remove_partials()  # a killed process may have left some, which take up space
         name = self._free_name(int(metadata["frames"]))
         partial = self.directory / f".{name}.partial"
         try:
@@ -122,10 +124,10 @@ class CheckpointStore:
         return self.directory / name
 
     def try_save(self, state: Mapping[str, Any], metadata: Mapping[str, Any], replay: Any | None = None) -> Path | None:
-        """Like `save`, but a failed write only warns: a long training should outlive a disk that is full.
+        """Call `save`, but warn and return None if writing fails, because a full disk should not end a long training.
 
         Raises:
-            CheckpointError: if a weight is NaN or infinite: going on would only lose time.
+            CheckpointError: If a weight is NaN or infinite.
         """
         try:
             return self.save(state, metadata, replay)
@@ -141,7 +143,7 @@ class CheckpointStore:
         try:
             check_finite({name: state[name] for name in _WEIGHTS if name in state}, f"the agent at {frames} frames")
         except CheckpointError as error:
-            complete = _complete(self.directory) if self.directory.is_dir() else []
+            complete = _complete(self.directory)
             kept = f"{complete[-1]} is kept" if complete else "there is no earlier one"
             raise CheckpointError(
                 f"no checkpoint was written, {kept}: {error}. Look for rewards that are too large, lower the learning "
@@ -150,11 +152,8 @@ class CheckpointStore:
 
     def _free_name(self, frames: int) -> str:
         base = f"frames_{frames:012d}"
-        name, copy = base, 1
-        while (self.directory / name).exists():
-            copy += 1
-            name = f"{base}-{copy}"
-        return name
+        names = (base if copy == 1 else f"{base}-{copy}" for copy in itertools.count(1))
+        return next(name for name in names if not (self.directory / name).exists())
 
     def _prune(self, newest: str) -> None:
         others = [folder for folder in _complete(self.directory) if folder.name != newest]
@@ -165,7 +164,7 @@ class CheckpointStore:
                 self._remove(folder / "replay")
 
     def _remove(self, folder: Path) -> None:
-        """Removes a folder as a whole: a process that is killed meanwhile leaves nothing that looks complete."""
+        """Rename a folder before removing it, so that a process killed meanwhile leaves nothing that looks complete."""
         if folder.exists():
             with contextlib.suppress(OSError):
                 os.rename(folder, self.directory / f".frames_removed-{folder.parent.name}-{folder.name}.partial")
@@ -177,43 +176,43 @@ class CheckpointStore:
 
 
 def find_checkpoint(path: Path | str) -> Path:
-    """Finds a checkpoint folder.
+    """Return the folder of a checkpoint.
 
     Args:
-        path: a checkpoint, the `checkpoints` folder of a run, or the run's folder (then: its newest, in the last stage
-            that has any).
+        path: A checkpoint, the `checkpoints` folder of a run, or a run's folder. In the latter two cases the newest
+            checkpoint is returned, in a run with stages that of the last stage that has one.
 
     Raises:
-        CheckpointError: if there is none, or it links to what lies elsewhere.
+        CheckpointError: If there is no checkpoint, or it links to files elsewhere.
     """
     path = Path(path).expanduser()
     if (path / _STATE).is_file():
         found = path
     else:
         folder = _checkpoint_folder(path)
-        complete = _complete(folder) if folder.is_dir() else []
+        complete = _complete(folder)
         if not complete:
             raise CheckpointError(
-                f"no checkpoint at {path}: expected a run's folder, its checkpoints/ or one folder of them"
+                f"no checkpoint at {path}: expected a run's folder, its checkpoints/, or a folder in there"
             )
         newest = _pointed_to(folder)
         found = next((checkpoint for checkpoint in complete if checkpoint.name == newest), complete[-1])
         if not found.resolve().is_relative_to(path.resolve()):
-            raise CheckpointError(f"{found} lies at {found.resolve()}: expected a checkpoint inside of {path}, no link")
+            raise CheckpointError(f"{found} lies at {found.resolve()}: expected a checkpoint inside {path}, not a link")
     check_contained(found)
     return found
 
 
 def read_state(path: Path | str, device: torch.device | str = "cpu") -> dict[str, Any]:
-    """Reads `state.pt` of a checkpoint, or a weights file, without executing anything from it.
+    """Read `state.pt` of a checkpoint, or a weights file, without executing anything from it.
 
     Args:
-        path: a checkpoint folder, or a file.
-        device: where tensors go.
+        path: A checkpoint's folder, or a file.
+        device: Device of the tensors.
 
     Raises:
-        CheckpointError: if it is damaged, of another schema, would need pickle, holds weights that are not finite, or
-            was trained with an option that is gone.
+        CheckpointError: If the file is damaged, has another schema, would need pickle, contains weights that are not
+            finite, or was trained with an option value that no longer exists.
     """
     path = Path(path)
     file = path / _STATE if path.is_dir() else path
@@ -227,7 +226,7 @@ def read_state(path: Path | str, device: torch.device | str = "cpu") -> dict[str
 
 
 def _without_former_options(config: Any, file: Path) -> Any:
-    """Return a saved configuration without options that are gone; one with another behaviour is refused."""
+    """Return a saved configuration without the options in `_FORMER_OPTIONS`; raise if one has another value."""
     if isinstance(config, list):
         return [_without_former_options(entry, file) for entry in config]
     if not isinstance(config, dict):
@@ -242,23 +241,23 @@ def _without_former_options(config: Any, file: Path) -> Any:
 
 
 def check_fits(saved: Mapping[str, Tensor], present: Mapping[str, Tensor], what: str, source: Path | str) -> None:
-    """Compares two sets of parameters by name and shape.
+    """Check that two sets of parameters have the same names and shapes.
 
     Args:
-        saved: from the checkpoint.
-        present: of this run.
-        what: what they are, for the message ("actor").
-        source: where `saved` came from.
+        saved: Parameters of the checkpoint.
+        present: Parameters of this run.
+        what: Name of the set for the message, such as "actor".
+        source: File of `saved`.
 
     Raises:
-        CheckpointError: naming what is missing, unexpected or shaped differently.
+        CheckpointError: If a parameter is missing, unexpected or of another shape.
     """
     problems = [f"{name} is missing in the checkpoint" for name in present if name not in saved]
     problems += [f"{name} is unknown here" for name in saved if name not in present]
     for name, value in present.items():
         there = saved.get(name, value)
         if not isinstance(there, Tensor) or there.is_floating_point() != value.is_floating_point():
-            problems.append(f"{name} is no tensor of {value.dtype}s in the checkpoint")
+            problems.append(f"{name} is no tensor of {value.dtype} in the checkpoint")
         elif there.shape != value.shape:
             problems.append(f"{name} is {tuple(there.shape)} in the checkpoint, {tuple(value.shape)} here")
     if problems:
@@ -270,13 +269,13 @@ def check_fits(saved: Mapping[str, Tensor], present: Mapping[str, Tensor], what:
 
 
 def check_unused(directory: Path | str) -> None:
-    """Makes sure before a new training starts that its folder holds no other one.
+    """Check that the folder of a new run contains no checkpoints.
 
     Args:
-        directory: folder of the new run.
+        directory: Folder of the new run.
 
     Raises:
-        CheckpointError: if it holds checkpoints.
+        CheckpointError: If it contains checkpoints.
     """
     if _complete(_checkpoint_folder(Path(directory))):
         raise CheckpointError(
@@ -286,23 +285,20 @@ def check_unused(directory: Path | str) -> None:
 
 
 def check_writable(directory: Path | str, required_bytes: int = 0) -> None:
-    """Makes sure before a training starts that its folder can be written to and is large enough.
+    """Check that a run's folder can be written to and has enough space.
 
     Args:
-        directory: created if missing.
-        required_bytes: what the run is going to need.
+        directory: The folder, created if missing.
+        required_bytes: Space that the run is going to need [bytes].
 
     Raises:
-        CheckpointError: saying what is wrong and what to change.
+        CheckpointError: If writing fails or the space is too small.
     """
     directory = Path(directory)
     probe = directory / ".write_test"
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        with probe.open("wb") as file:
-            file.write(b"\0" * 2**20)
-            file.flush()
-            os.fsync(file.fileno())
+        write_text(probe, "\0" * 2**20)
     except OSError as error:
         raise CheckpointError(
             f"cannot write to {directory}: {error}. Choose another folder with run_dir=PATH"
@@ -319,7 +315,7 @@ def check_writable(directory: Path | str, required_bytes: int = 0) -> None:
 
 
 def _checkpoint_folder(run: Path) -> Path:
-    """The `checkpoints` folder of a run or of its last stage that has checkpoints; the folder itself without any."""
+    """Return the `checkpoints` folder of a run, or of its last stage that has checkpoints, or the run's folder."""
     if (run / "checkpoints").is_dir():
         return run / "checkpoints"
     stages = [folder for folder in run.glob("stages/[1-9]*_*/checkpoints") if _complete(folder)]
@@ -327,13 +323,13 @@ def _checkpoint_folder(run: Path) -> Path:
 
 
 def _complete(directory: Path) -> list[Path]:
-    """Complete checkpoints, oldest first (by time of writing: a resumed run may have gone back in frames)."""
+    """Return complete checkpoints by time of writing, because a resumed run may have gone back in frames."""
     found = [p for p in directory.glob("frames_*") if (p / _STATE).is_file()]
     return sorted(found, key=lambda p: ((p / _STATE).stat().st_mtime_ns, p.name))
 
 
 def _pointed_to(folder: Path) -> str:
-    """Name of the newest checkpoint, as the pointer says; it is only ever compared with names that exist."""
+    """Return the name in the file `LATEST`, or an empty string."""
     pointer = folder / _LATEST
     if not pointer.is_file() or pointer.is_symlink():
         return ""
@@ -342,6 +338,6 @@ def _pointed_to(folder: Path) -> str:
 
 
 def _provenance() -> dict[str, Any]:
-    packages = ("coachable", "torch", "torchrl", "tensordict")
+    versions = {name: version(name) for name in ("coachable", "torch", "torchrl", "tensordict")}
     created = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-    return {"schema": SCHEMA_VERSION, "created": created, "versions": {name: version(name) for name in packages}}
+    return {"schema": SCHEMA_VERSION, "created": created, "versions": versions}

@@ -1,4 +1,4 @@
-"""Collecting: TorchRL's collector with a state that a training can be resumed from, and a short evaluation."""
+"""Construction of collectors, saving and restoring their state, and a short evaluation of a policy."""
 
 import multiprocessing
 import os
@@ -6,6 +6,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any, Protocol, runtime_checkable
 
@@ -32,10 +33,10 @@ __all__ = [
 
 @runtime_checkable
 class SelfPlayEnv(Protocol):
-    """An env in which the agent meets its own past."""
+    """Environment in which the agent plays against copies of its own policy."""
 
     def follow(self, policy: nn.Module) -> None:
-        """The policy to take copies of."""
+        """Set the policy that self-play opponents copy."""
         ...
 
 
@@ -51,38 +52,38 @@ def make_collector(
     seed: int = 0,
     policy_device: torch.device | str | None = None,
 ) -> BaseCollector:
-    """Makes the collector of a training.
+    """Build the collector of a training.
 
     Args:
-        make_env: called with a seed, returns a batched env `[N]` that is already seeded (the collector's constructor
-            resets it, so seeding afterwards would miss the first episode).
-        policy: the actor; with `backend="direct"` it is used as it is, so updates reach it without a copy.
-        frames_per_batch: env-steps per iteration, a multiple of N.
-        init_random_frames: env-steps with uniformly random actions at the start.
-        backend: "direct" (this process), "process" (one host) or "ray" (many hosts).
-        num_collectors: workers of the latter two.
-        sync: whether an iteration waits for all workers.
-        seed: worker i gets `seed + i`.
-        policy_device: where the policy runs, if not where the env is.
+        make_env: Builds a batched environment `[N]` from a seed. It must be seeded already, because the collector's
+            constructor resets it, so that later seeding would miss the first episode.
+        policy: The actor. With `backend="direct"` the collector shares it, so that updates need no copy.
+        frames_per_batch: Number of env-steps per iteration, a multiple of N.
+        init_random_frames: Number of env-steps with uniformly random actions at the start.
+        backend: "direct" (this process), "process" (one host) or "ray" (several hosts).
+        num_collectors: Number of workers with "process" and "ray".
+        sync: Whether an iteration waits for all workers.
+        seed: Seed of the first worker; worker i gets `seed + i`.
+        policy_device: Device of the policy; None for the device of the environment.
 
     Raises:
-        ValueError: for an unknown backend.
-        ImportError: for Ray, where it is not installed.
+        ValueError: If the backend is unknown.
+        ImportError: If the backend is "ray" and Ray is not installed.
     """
     common: dict[str, Any] = {
         "frames_per_batch": frames_per_batch,
         "total_frames": -1,  # the loop decides when to stop
-        # rounded up to whole iterations, which TorchRL does too, but with a warning
+        # Rounded up to whole iterations, as TorchRL does with a warning.
         "init_random_frames": -(-init_random_frames // frames_per_batch) * frames_per_batch or -1,
         "exploration_type": ExplorationType.RANDOM,
     }
     if policy_device is not None and torch.device(policy_device).type != "cpu":
         common |= {"policy_device": policy_device, "env_device": "cpu", "storing_device": "cpu"}
-    plain: dict[str, Any] = {"auto_register_policy_transforms": False}  # ours need none
+    plain: dict[str, Any] = {"auto_register_policy_transforms": False}  # the policies here need none
     if backend == "direct":
         collector = Collector(make_env(seed), policy, use_buffers=False, trust_policy=True, **common, **plain)
         if next(collector.policy.parameters()) is not next(policy.parameters()):  # the loop relies on shared weights
-            raise RuntimeError(f"the collector copied the policy: build it on {policy_device}, where it is to run")
+            raise RuntimeError(f"the collector copied the policy: build the policy on {policy_device}, where it runs")
         simulation = simulation_env(collector.env)
         if isinstance(simulation, SelfPlayEnv):
             simulation.follow(policy)
@@ -92,7 +93,7 @@ def make_collector(
         common |= plain if backend == "process" else _ray_options(num_collectors, plain)
         collector = Collector(factories, policy, backend=backend, num_collectors=num_collectors, sync=sync, **common)
         if backend == "ray":
-            collector.update_policy_weights_(policy)  # RayCollector wants that before the first batch
+            collector.update_policy_weights_(policy)  # RayCollector needs the weights before the first batch
         return collector
     raise ValueError(f"collector backend must be direct, process or ray, got {backend!r}")
 
@@ -102,52 +103,52 @@ def _ray_options(num_collectors: int, plain: dict[str, Any]) -> dict[str, Any]:
         raise ImportError("collector=ray needs Ray: pip install 'coachable[cluster]', or choose collector=process")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray reports its use over the network otherwise
     return {
-        "total_frames": sys.maxsize,  # RayCollector has no number for "until it is shut down"
+        "total_frames": sys.maxsize,  # RayCollector has no value for "no limit"
         "collector_kwargs": [plain | {"postproc": _OwnTrajectories(i, num_collectors)} for i in range(num_collectors)],
         "ray_init_config": {"include_dashboard": False, "log_to_driver": False, "logging_level": "warning"},
     }
 
 
+@dataclass(eq=False)
 class _OwnTrajectories:
-    """Numbers the trajectories of a worker apart from those of the others: each counts from 0."""
+    """Postprocessor that makes a worker's trajectory numbers, which start at 0, unique among all workers."""
 
-    def __init__(self, worker: int, workers: int) -> None:
-        self.worker = worker
-        self.workers = workers
+    worker: int
+    workers: int
 
     def __call__(self, data: TensorDictBase) -> TensorDictBase:
         key = ("collector", "traj_ids")
         return data.set(key, data.get(key) * self.workers + self.worker)
 
 
+@dataclass(eq=False)
 class _SeededFactory:
-    """A picklable call of `make_env(seed)`."""
+    """Call of `make_env(seed)` that can be pickled."""
 
-    def __init__(self, make_env: Callable[[int], EnvBase], seed: int) -> None:
-        self.make_env = make_env
-        self.seed = seed
+    make_env: Callable[[int], EnvBase]
+    seed: int
 
     def __call__(self) -> EnvBase:
         if multiprocessing.parent_process() is not None and threading.current_thread() is threading.main_thread():
-            # Ctrl-C reaches the whole process group: the training process decides when its workers end.
+            # Ctrl-C reaches the whole process group, but the training process ends its workers itself.
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         return self.make_env(self.seed)
 
 
 def simulation_env(env: EnvBase) -> EnvBase:
-    """Peels the transforms off an env."""
+    """Return the environment below all transforms."""
     while isinstance(env, TransformedEnv):
         env = env.base_env
     return env
 
 
 def collector_state(collector: BaseCollector) -> dict[str, Any]:
-    """Reads what the next iteration of a collector depends on, besides policy and global generators.
+    """Return everything that a collector's next iteration depends on, except the policy and the global generators.
 
     Returns:
-        Tensors and plain containers: frame count, transforms' state (style generators), the simulation's own state and
-        the tensordict that the next step starts from. `not_saved` says why the latter two are missing. Of workers in
-        other processes only the counts.
+        Tensors and plain containers: frame count, state of the transforms (style generators) and of the simulation, and
+        the tensordict from which the next step starts. `not_saved` is the reason if the latter two are missing. If the
+        workers run in other processes, only the counts are returned.
     """
     counts: Any = collector  # typed too narrowly in TorchRL
     state: dict[str, Any] = {
@@ -168,19 +169,19 @@ def collector_state(collector: BaseCollector) -> dict[str, Any]:
 
 
 def load_collector_state(collector: BaseCollector, state: dict[str, Any]) -> None:
-    """Restores what `collector_state` read.
+    """Restore what `collector_state` returned.
 
     Args:
-        collector: a fresh one, made like the old one.
-        state: from `collector_state`.
+        collector: A new collector, made like the saved one.
+        state: From `collector_state`.
 
     Raises:
-        UnsavableError: if the running episodes cannot go on; says why. They restart then, and the rest is restored.
+        UnsavableError: If the running episodes cannot be continued. They restart, and everything else is restored.
     """
     counts: Any = collector  # typed too narrowly in TorchRL
     counts._frames, counts._iter = int(state.get("frames", 0)), int(state.get("iterations", 0))
     if not isinstance(collector, Collector):
-        counts.update_policy_weights_()  # for the first step, too
+        counts.update_policy_weights_()  # before the first step
         raise UnsavableError("environments in other processes cannot be saved (collector=direct saves its own)")
     env = collector.env
     if isinstance(env, TransformedEnv):
@@ -194,7 +195,7 @@ def load_collector_state(collector: BaseCollector, state: dict[str, Any]) -> Non
     try:
         load_simulator(simulation_env(env), state["simulation"])
     except UnsavableError:
-        present.update(env.reset())  # some of it may have been restored
+        present.update(env.reset())  # a part may have been restored
         raise
     collector._traj_pool.load_state_dict(state["trajectories"])
     collector._carrier = TensorDict(carrier, batch_size=present.batch_size).clone()
@@ -208,18 +209,18 @@ def evaluate_policy(
     keys: Iterable[str] = (),
     device: torch.device | str = "cpu",
 ) -> dict[str, float]:
-    """Runs one episode per environment; the policy acts as it does by default (`default_interaction_type`).
+    """Run one episode per environment, in the policy's default action mode (`default_interaction_type`).
 
     Args:
-        env: batched env `[N]`; it is reset first, with styles drawn by its sampler.
-        policy: writes `action`.
-        max_steps: episodes longer than this are cut.
-        keys: entries of `next`, (N, 1) each, to average per step beside the returns.
-        device: where the policy is.
+        env: Batched environment `[N]`. It is reset first, with styles drawn by its sampler.
+        policy: Writes `action`.
+        max_steps: Number of steps after which an episode is cut.
+        keys: Entries of `next`, (N, 1) each, whose averages per step are returned as well.
+        device: Device of the policy.
 
     Returns:
-        `return`, `task_return`, `length`, `survived` (share that did not terminate), one `NAME_per_step` for each key,
-        all averaged over episodes.
+        `return`, `task_return`, `length`, `survived` (share of episodes that did not terminate) and one `NAME_per_step`
+        for each key, all averaged over the episodes.
     """
     wanted = dict.fromkeys(["reward", "task_reward", *keys])
     with preserved_rng(), torch.no_grad():

@@ -1,4 +1,4 @@
-"""A training in stages: each stage starts from the actor and critics of the one before, in one run folder."""
+"""Training in stages, each of which starts from the actor and critics of the stage before, in one run folder."""
 
 import gc
 import re
@@ -16,19 +16,19 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 
 class Curriculum:
-    """Trains one stage after the other.
+    """Training that runs one stage after the other.
 
     Stage i of the run is a run of its own in `stages/i_NAME`, with an empty replay buffer and new optimisers. Its
     checkpoints hold the settings of all stages, so that the run can be resumed in any of them.
 
     Args:
-        config: `stages` is the list of the stages' complete configurations, plain containers, each with its name under
-            `stage`. With `resume`, `config["stage"]` is the stage of that checkpoint.
-        build: Makes the training of one stage from its configuration.
-        announce: Called with the configuration and the training of each stage before it runs.
+        config: `stages` is the list of the stages' complete configurations in plain containers, each with its name
+            under `stage`. With `resume`, `config["stage"]` is the stage of that checkpoint.
+        build: Builds the training of one stage from its configuration.
+        announce: Is called with the configuration and the training of each stage before the stage runs.
 
     Raises:
-        CheckpointError: If the stages are not such a list, or the run's folder holds another run.
+        CheckpointError: If the stages are not such a list, or the run's folder contains another run.
     """
 
     def __init__(
@@ -50,14 +50,14 @@ class Curriculum:
         else:
             check_unused(self.run_dir)
             self.number = 0
-        # Sums are rounded as the number of threads says: it is the same in all stages, and after a resumption.
+        # The rounding of sums depends on the number of threads, so all stages and resumptions use the same.
         learner = share_threads(**self.stages[0]["threads"]).learner
         for stage in self.stages:
             stage["threads"] = {**stage["threads"], "learner": stage["threads"]["learner"] or learner}
         self.train = self._start(resume)
 
     def run(self) -> dict[str, float]:
-        """Run the stages that are left, until the last one ends or a stop signal comes.
+        """Run the remaining stages until the last one ends or a stop signal arrives.
 
         Returns:
             The latest value of every metric of the last stage that ran.
@@ -67,14 +67,14 @@ class Curriculum:
             if self.train.frames < self.train.settings.total_frames or self.number + 1 == len(self.stages):
                 return latest
             self.number += 1
-            # The next stage needs the memory of this one's replay buffer. And TorchRL raises the number of threads when
-            # it closes a forgotten SerialEnv: now, before the next stage sets the number.
+            # The next stage needs the memory of this one's replay buffer. When a SerialEnv is collected, TorchRL also
+            # raises the number of threads, which must happen before the next stage sets it.
             del self.train
             gc.collect()
             self.train = self._start(None)
 
     def folder(self, number: int) -> Path:
-        """Return the folder of a stage, which are counted from 0 here and from 1 in names."""
+        """Return the folder of stage `number`, counted from 0; the folder's name counts from 1."""
         return self.run_dir / "stages" / f"{number + 1}_{self.stages[number]['stage']}"
 
     def _start(self, resume: str | None) -> Trainer:
@@ -99,13 +99,13 @@ class Curriculum:
 
 
 def _checked_stages(stages: Any) -> list[dict[str, Any]]:
-    """Copies of the stages; their names become folders, and may come from somebody else's checkpoint.
+    """Return copies of the stages, after checking their names, which become folders and may come from a checkpoint.
 
     Raises:
         CheckpointError: If a stage has no name of letters, digits, `_` and `-`, or names repeat.
     """
     if not isinstance(stages, list) or not all(isinstance(stage, dict) for stage in stages):
-        raise CheckpointError("the configuration holds stages of another kind: expected a list of settings")
+        raise CheckpointError("the configuration's stages are not usable: expected a list of settings")
     names = [stage.get("stage") for stage in stages]
     for name in names:
         if not isinstance(name, str) or not _NAME.fullmatch(name) or names.count(name) > 1:

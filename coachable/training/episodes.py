@@ -1,4 +1,4 @@
-"""Numbers about what was collected and learnt since the last look."""
+"""Statistics of collected episodes and of updates between two rows of the log."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -18,10 +18,10 @@ _SUMMED = {"reward": "return", TASK_REWARD: "task_return", STYLE_REWARD: "style_
 
 
 class EpisodeSums(Transform):
-    """Environment transform that carries the running episode's rewards, summed, and its length: `episode_sums` (N, 4).
+    """Environment transform that writes the running episode's summed rewards and its length: `episode_sums` (N, 4).
 
-    Columns: reward, task reward, style reward, steps. TorchRL's `RewardSum` only sums what a reward spec declares; the
-    task reward is an observation. Put it after `StyleRewardTransform`.
+    The columns are reward, task reward, style reward and steps. TorchRL's `RewardSum` cannot sum the task reward, which
+    is an observation. Put this transform after `StyleRewardTransform`.
     """
 
     def __init__(self) -> None:
@@ -37,7 +37,7 @@ class EpisodeSums(Transform):
         return tensordict_reset.set(_SUMS, torch.zeros(shape, device=tensordict_reset.device))
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Adds the sums."""
+        """Add the sums."""
         assert isinstance(observation_spec, Composite)
         shape = torch.Size((*observation_spec.shape, len(_SUMMED) + 1))
         observation_spec[_SUMS] = Unbounded(shape=shape, dtype=torch.float32, device=observation_spec.device)
@@ -45,7 +45,7 @@ class EpisodeSums(Transform):
 
 
 class Means:
-    """Running means of scalars that may live on a device: nothing is read from it before `flush`.
+    """Running means of scalars on any device; nothing is read from the device before `flush`.
 
     Example:
         >>> means = Means()
@@ -60,23 +60,23 @@ class Means:
         self._counts: dict[str, int] = {}
 
     def add(self, values: Mapping[str, Tensor]) -> None:
-        """Adds one value per name."""
+        """Add one value per name."""
         for name, value in values.items():
             self._sums[name] = self._sums[name] + value if name in self._sums else value.clone()
             self._counts[name] = self._counts.get(name, 0) + 1
 
     def flush(self) -> dict[str, float]:
-        """Returns the means since the last call, and starts anew."""
+        """Return the means since the last call, and reset them."""
         means = {name: total.item() / self._counts[name] for name, total in self._sums.items()}
         self._sums, self._counts = {}, {}
         return means
 
 
 class EpisodeStatistics:
-    """Return, length, task reward and style terms of what the training policy does.
+    """Statistics of the training's episodes: return, length, task reward and style terms.
 
     Args:
-        style_terms: maps style features `(B, F)` and theta `(B, d)` to named, unscaled terms `(B,)`, or None.
+        style_terms: Maps style features `(B, F)` and theta `(B, d)` to named, unscaled terms `(B,)`; None omits them.
     """
 
     def __init__(self, style_terms: Callable[[Any, Tensor], Mapping[str, Tensor]] | None = None) -> None:
@@ -86,7 +86,7 @@ class EpisodeStatistics:
         self._steps = Means()
 
     def add(self, data: TensorDictBase) -> None:
-        """Takes in collected transitions, flat `[B]`."""
+        """Add collected transitions `[B]`."""
         after = data.get("next")
         sums = after.get(_SUMS, None)
         done = after.get("done").reshape(-1)
@@ -102,11 +102,11 @@ class EpisodeStatistics:
         self._steps.add(per_step)
 
     def flush(self) -> dict[str, float]:
-        """Returns the numbers since the last call, and starts anew.
+        """Return the statistics since the last call, and reset them.
 
         Returns:
             `episode/count`; `episode/return`, `episode/task_return`, `episode/style_return`, `episode/length` and
-            `episode/terminated` (share), averaged over the episodes that ended, if any; `step/*`, averaged over
+            `episode/terminated` (share), averaged over the episodes that ended, if any did; and `step/*`, averaged over
             env-steps.
         """
         result: dict[str, float] = {"episode/count": 0}

@@ -1,4 +1,4 @@
-"""What this machine offers to a training, and how it is shared between simulator and learner."""
+"""Detection of the hardware, and its division between simulator and learner."""
 
 import os
 import time
@@ -15,14 +15,14 @@ _MAX_LEARNER_THREADS = 8  # 512-wide layers do not fill more cores; the barriers
 
 @dataclass(frozen=True)
 class Hardware:
-    """What was found.
+    """Hardware that a training can use.
 
     Attributes:
-        cores: cores that this process may use.
-        busy: cores' worth of load by others in the last minute.
-        memory_gb: physical memory [GB], 0 where it cannot be read.
-        gpu: name of the first CUDA device, or None.
-        bf16: whether bfloat16 matrix products run in hardware on the device that would be used.
+        cores: Number of cores that this process may use.
+        busy: System load of the last minute [cores].
+        memory_gb: Physical memory [GB], or 0 if it cannot be read.
+        gpu: Name of the first CUDA device, or None.
+        bf16: Whether the GPU, or without one the CPU, multiplies bfloat16 matrices in hardware.
     """
 
     cores: int
@@ -32,7 +32,7 @@ class Hardware:
     bf16: bool
 
     def describe(self) -> str:
-        """Names the hardware in one line."""
+        """Return a one-line description."""
         device = f"GPU {self.gpu}" if self.gpu else "no GPU"
         bf16 = "bf16" if self.bf16 else "no bf16"
         return f"{self.cores} cores ({self.busy:.1f} busy), {self.memory_gb:.0f} GB memory, {device}, {bf16}"
@@ -40,22 +40,23 @@ class Hardware:
 
 @dataclass(frozen=True)
 class Threads:
-    """How many threads the simulator and the learner get."""
+    """Numbers of threads of the simulator and of the learner."""
 
     simulator: int
     learner: int
 
 
 def detect() -> Hardware:
-    """Looks at cores, load, memory, GPU and bfloat16 support.
+    """Return the cores, load, memory, GPU and bfloat16 support of this machine.
 
     Example:
         >>> detect().cores >= 1
         True
     """
     gpu = torch.cuda.get_device_name(0) if torch.cuda.is_available() else None
+    affinity = getattr(os, "sched_getaffinity", None)  # missing on macOS and Windows
     return Hardware(
-        cores=_usable_cores(),
+        cores=len(affinity(0)) if affinity else os.cpu_count() or 1,
         busy=os.getloadavg()[0],
         memory_gb=_memory_gb(),
         gpu=gpu,
@@ -64,18 +65,18 @@ def detect() -> Hardware:
 
 
 def choose_preset(hardware: Hardware) -> str:
-    """Picks the preset for a machine: `gpu` where CUDA works, else `cpu`."""
+    """Return the name of the preset for a machine: `gpu` if it has a CUDA device, otherwise `cpu`."""
     return "gpu" if hardware.gpu else "cpu"
 
 
 def pick_device(name: str = "auto") -> torch.device:
-    """Turns a configured device into one with an index.
+    """Return a configured device, with an index if it is a CUDA device.
 
     Args:
-        name: "auto" (CUDA where there is one), "cpu", "cuda" or "cuda:1".
+        name: "auto" (CUDA if available), "cpu", "cuda" or a device with an index such as "cuda:1".
 
     Raises:
-        ValueError: if CUDA is asked for and there is none.
+        ValueError: If a CUDA device is named and none is available.
 
     Example:
         >>> pick_device("cpu")
@@ -86,25 +87,25 @@ def pick_device(name: str = "auto") -> torch.device:
         return device
     if not torch.cuda.is_available():
         raise ValueError(f"device={name} but torch finds no CUDA device here: set device=cpu, or choose preset=cpu")
-    # TorchRL takes "cuda" and "cuda:0" for different devices, and would copy the policy from one to the other.
+    # TorchRL treats "cuda" and "cuda:0" as different devices, and would copy the policy from one to the other.
     return torch.device("cuda", torch.cuda.current_device() if device.index is None else device.index)
 
 
 def share_threads(
     simulator: int | None = None, learner: int | None = None, hardware: Hardware | None = None
 ) -> Threads:
-    """Decides thread counts; None means automatic.
+    """Return the thread counts of simulator and learner.
 
-    Simulator and learner take turns in one process, so each may have all cores that are free. Threads beyond the free
-    cores are worse than none: OpenMP's barriers spin, which costs a factor of ten.
+    Simulator and learner take turns in one process, so each may use all free cores. More threads than free cores slow
+    a training down by a factor of ten, because OpenMP's barriers spin.
 
     Args:
-        simulator: threads for physics, or None.
-        learner: threads for updates, or None (then `OMP_NUM_THREADS` is respected).
-        hardware: from `detect`, or None to look now.
+        simulator: Threads for physics; None for one per free core.
+        learner: Threads for updates; None for one per free core, at most 8 and at most `OMP_NUM_THREADS`.
+        hardware: From `detect`; None calls it.
 
     Raises:
-        ValueError: if a count is below 1.
+        ValueError: If a count is below 1.
 
     Example:
         >>> share_threads(2, 1)
@@ -121,27 +122,27 @@ def share_threads(
 
 
 def estimate_update_seconds(parameters: int, batch_size: int, bf16: bool, device: torch.device | str = "cpu") -> float:
-    """Estimates one actor-critic update from a short matrix product on this machine.
+    """Estimate the duration of one actor-critic update from a short matrix product on this machine.
 
-    An update passes about 16 network-halves (forward, backward to weights, backward to inputs, over policy, twin
-    critics and twin targets); matrix products are half of its time at width 512 (measured), the rest is layer norms and
-    small calls.
+    An update multiplies by a network's weights about 16 times (forward, backward to weights and backward to inputs,
+    over policy, twin critics and twin targets). At width 512 these products take half of its time (measured); layer
+    norms and small calls take the rest.
 
     Args:
-        parameters: weights of one network.
-        batch_size: transitions per update.
-        bf16: whether the update runs in bfloat16.
-        device: where it runs.
+        parameters: Number of weights of one network.
+        batch_size: Transitions per update.
+        bf16: Whether the update runs in bfloat16.
+        device: Device of the update.
 
     Returns:
-        Seconds per update, good to a factor of about two.
+        Seconds per update, correct to a factor of about two.
     """
     device = torch.device(device)
     dtype = torch.bfloat16 if bf16 else torch.float32
     a = torch.ones(256, 512, dtype=dtype, device=device)
     b = torch.ones(512, 512, dtype=dtype, device=device)
     repeats, best = 20, float("inf")
-    for _ in range(4):  # the first rounds pay for start-up; the best one is the machine's
+    for _ in range(4):  # the first rounds include start-up costs, so the best one counts
         start = time.perf_counter()
         for _ in range(repeats):
             c = a @ b
@@ -152,12 +153,6 @@ def estimate_update_seconds(parameters: int, batch_size: int, bf16: bool, device
     operations = 16 * 2 * batch_size * parameters
     overhead = 0.003  # about 2-3 ms of Python per update, whatever its size (measured)
     return 2 * operations * best / (2 * 256 * 512 * 512) + overhead
-
-
-def _usable_cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return max(1, len(os.sched_getaffinity(0)))
-    return os.cpu_count() or 1
 
 
 def _memory_gb() -> float:

@@ -1,4 +1,4 @@
-"""Gradient updates of an actor-critic loss: update order, optimisers, target networks, precision."""
+"""Gradient updates of an actor-critic loss: update order, optimisers, target networks and precision."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ class NonFiniteLossError(NonFiniteError):
 
 
 class Learner:
-    """Update a TorchRL actor-critic loss module from batches.
+    """Learner that updates a TorchRL actor-critic loss module from batches.
 
-    Works with `SACLoss` and its relatives (QR-SAC, RAC, Cat-RAC): any `LossModule` with `actor_network_params`,
+    It works with `SACLoss`, QR-SAC, RAC, Cat-RAC and any other `LossModule` with `actor_network_params`,
     `qvalue_network_params`, their targets, and `loss_actor` and `loss_qvalue` among its outputs.
 
     Update orders:
 
-    - `"simultaneous"` (the paper's humanoid): both losses from the parameters before the update, then both
-      optimisers step, then the target networks move.
-    - `"policy_first"` (the paper's racing and combat): the policy steps on `actor_loss`, then the critics on a
+    - `"simultaneous"` (the paper's humanoid): both losses are computed from the parameters before the update, then
+      both optimisers step, then the target networks move.
+    - `"policy_first"` (the paper's racing and combat): the policy steps on `actor_loss`, then the critics step on a
       target whose next actions come from the updated policy.
 
-    Losses or gradients that are infinite or NaN reach no weight. On a CPU such an update raises. A GPU skips it, and
-    the next check raises (see `check_every`).
+    No weight is changed by losses or gradients that are infinite or NaN. On a CPU such an update raises. On a GPU it is
+    skipped, and the next check raises (see `check_every`).
 
     Args:
         loss_module: The loss.
@@ -52,7 +52,7 @@ class Learner:
         adam_eps: Adam's epsilon. The default is TensorFlow's 1e-7, not torch's 1e-8.
         tau: Polyak rate of the target networks per update.
         max_grad_norm: Clip the norm of the policy's and of the critics' gradient, each on its own, to this value.
-        update_order: See above.
+        update_order: `"simultaneous"` or `"policy_first"`.
         precision: `"bf16"` multiplies in bfloat16 and keeps weights, layer-norm statistics, heads, targets and losses
             in float32; `"auto"` chooses it where the device has it in hardware.
         compile: Compile the loss functions with `torch.compile`. On a CPU this needs a C++ compiler; without one it has
@@ -88,8 +88,8 @@ class Learner:
         self._options = {name: value for name, value in locals().items() if name not in ("self", "loss_module")}
         if update_order not in get_args(UpdateOrder):
             raise ValueError(f"update_order must be one of {get_args(UpdateOrder)}, got {update_order!r}")
-        rates = {"actor": actor_lr, "critic": critic_lr, "alpha": alpha_lr}
-        for name, rate in rates.items():
+        self._rates = {"actor": actor_lr, "critic": critic_lr, "alpha": alpha_lr}
+        for name, rate in self._rates.items():
             NOT_NEGATIVE.check(f"{name}_lr", rate)
         POSITIVE.check("adam_eps", adam_eps)
         Range("(0, 1]").check("tau", tau)
@@ -111,7 +111,6 @@ class Learner:
         self.precision = resolve_precision(precision, device)
         self._device_type = device.type
         self.target_updater = SoftUpdate(loss_module, tau=tau)
-        self._rates = rates
         loss: Any = loss_module
         fixed = hasattr(loss, "log_alpha") and not params["alpha"]
         self._log_alpha = float(loss.log_alpha) if fixed else None
@@ -121,7 +120,7 @@ class Learner:
         self.use_backend(Backend)
 
     def use_backend(self, make_backend: Callable[..., Backend]) -> None:
-        """Evaluate networks and step parameters with another backend from now on; the optimisers keep their state.
+        """Replace the backend, which evaluates networks and steps parameters; the optimisers keep their state.
 
         Args:
             make_backend: A subclass of `Backend`, or a function with the same arguments.
@@ -154,8 +153,8 @@ class Learner:
             that nothing waits for the device: call `.item()` when they are logged.
 
         Raises:
-            NonFiniteLossError: If a loss or a gradient is infinite or NaN (on a GPU: was, see `check_every`); no weight
-                has been changed by it.
+            NonFiniteLossError: If a loss or a gradient is infinite or NaN; on a GPU, if one was in an update since the
+                last check, see `check_every`. No weight has been changed by it.
         """
         self._follow()
         if self._to_compile:
@@ -172,16 +171,16 @@ class Learner:
         return metrics
 
     def scale_learning_rates(self, factor: float) -> None:
-        """Set every learning rate to `factor` times what the constructor was given."""
+        """Set every learning rate to `factor` times the constructor's value."""
         for name, optimizer in self.optimizers.items():
             for group in optimizer.param_groups:
                 group["lr"] = factor * self._rates[name]
 
     def scale_entropy_weight(self, factor: float) -> None:
-        """Set a fixed entropy weight to `factor` times what it was at construction.
+        """Set a fixed entropy weight to `factor` times its value at construction.
 
         Raises:
-            ValueError: if there is no fixed entropy weight and the factor is not 1.
+            ValueError: If there is no fixed entropy weight and the factor is not 1.
         """
         if self._log_alpha is not None:
             cast(Tensor, self.loss_module.log_alpha).fill_(self._log_alpha + math.log(factor))
@@ -189,7 +188,7 @@ class Learner:
             raise ValueError("this loss has no fixed entropy weight to scale: leave train.anneal_entropy at 1")
 
     def check_finite(self) -> None:
-        """Raise if a GPU skipped an update since the last check; this reads one number from the device."""
+        """Raise a `NonFiniteLossError` if a GPU skipped an update since the last check; this waits for the device."""
         found = float(self._skipped)
         self._skipped.zero_()
         if not math.isfinite(found):
@@ -198,13 +197,13 @@ class Learner:
             )
 
     def check_weights(self) -> None:
-        """Raise if a trained parameter is not finite. Updates keep finite parameters finite."""
+        """Raise a `NonFiniteError` if a parameter is not finite; updates keep finite parameters finite."""
         for name, value in self.loss_module.named_parameters():
             if not torch.isfinite(value).all():
                 raise NonFiniteError(f"{name} contains NaN or infinity: start from other weights.")
 
     def state_dict(self) -> dict[str, Any]:
-        """Return parameters, targets, optimiser moments and the update counter; the backend makes no difference."""
+        """Return parameters, targets, optimiser states and the update counter, in the same format for every backend."""
         return {
             "loss_module": self.loss_module.state_dict(),
             "optimizers": {name: optimizer.state_dict() for name, optimizer in self.optimizers.items()},
@@ -212,7 +211,7 @@ class Learner:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned. Rates and a fixed entropy weight stay those of the constructor."""
+        """Restore what :meth:`state_dict` returned, with the constructor's learning rates and fixed entropy weight."""
         self._follow()
         self.loss_module.load_state_dict(state["loss_module"])
         for name, optimizer in self.optimizers.items():
@@ -230,7 +229,6 @@ class Learner:
         return twin
 
     def _present_parameters(self) -> dict[str, list[nn.Parameter]]:
-        """Return the trained parameters that the loss has now."""
         every = dict(self.loss_module.named_parameters())
         return {kind: [every[name] for name in names] for kind, names in self._names.items()}
 
@@ -256,8 +254,8 @@ class Learner:
         """Clip and step, unless a number is not finite; return the norms of the gradients before clipping.
 
         Args:
-            losses: What the gradients are of, by name.
-            names: Groups of parameters to step on their gradients.
+            losses: Losses whose gradients are applied, by name.
+            names: Groups of parameters to step.
         """
         norms = {f"grad_norm_{name}": self.backend.gradient_norm(name, self._params[name]) for name in names}
         self._require_finite({**losses, **norms}, names)
@@ -284,8 +282,8 @@ class Learner:
                 )
             return
         total = torch.stack([value.detach().float() for value in values.values()]).sum()
-        self._skipped.add_(total)  # a sum stays NaN or infinite once a part was
-        for name in names:  # the fused Adam of a GPU then changes nothing, without waiting for the device
+        self._skipped.add_(total)  # once NaN or infinite, the sum stays so
+        for name in names:  # fused Adam then changes nothing, and nothing waits for the device
             cast(Any, self.optimizers[name]).found_inf = (~total.isfinite()).float()
 
     def _simultaneous(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -329,6 +327,6 @@ class Learner:
 
 
 def _critic_health(outputs: Any) -> dict[str, Tensor]:
-    """Return the share of targets outside a categorical critic's support; nothing for other critics."""
+    """Return the share of targets outside a categorical critic's support, or an empty dictionary."""
     clipped = outputs.get("clipped_fraction", None)
     return {} if clipped is None else {"clipped_fraction": clipped.mean()}

@@ -1,4 +1,4 @@
-"""Where a training's numbers go: a CSV file always, Weights & Biases on request, and a progress line."""
+"""Logging of metrics to a CSV file and, on request, to Weights & Biases, and a progress display."""
 
 import csv
 import json
@@ -19,12 +19,12 @@ _MOVE = "Move it away to go on with a new one"
 
 
 class CsvLog:
-    """Rows of numbers in one CSV file that may gain columns.
+    """CSV file of metrics to which rows and columns can be added.
 
-    A last line without its end, which a process leaves behind that is killed while it writes, is dropped.
+    An incomplete last line, which a process leaves behind if it is killed while writing, is dropped.
 
     Args:
-        path: the file; rows are appended when it exists.
+        path: The file; if it exists, rows are appended.
 
     Example:
         >>> import tempfile
@@ -39,11 +39,11 @@ class CsvLog:
         self.path = Path(path)
         self.columns: list[str] = []
         rows = self._read()
-        if self._torn():
+        if self.path.exists() and self.path.read_bytes()[-1:] not in (b"", b"\n"):
             self._rewrite(rows)
 
     def rewind(self, limit: float, key: str = "frames") -> None:
-        """Drops rows whose `key` exceeds `limit`: they belong to a course that a resumed training leaves behind."""
+        """Drop the rows whose `key` exceeds `limit`, which a resumed training writes again."""
         rows = self._read()
         try:
             kept = [row for row in rows if float(row.get(key) or 0) <= limit]
@@ -53,7 +53,7 @@ class CsvLog:
             self._rewrite(kept)
 
     def write(self, row: Mapping[str, Any]) -> None:
-        """Appends one row; unknown names become new columns."""
+        """Append one row; new names become new columns."""
         new = [name for name in row if name not in self.columns]
         if new:
             rows = self._read()
@@ -73,13 +73,6 @@ class CsvLog:
         except (UnicodeDecodeError, csv.Error) as error:
             raise ValueError(f"{self.path} is no table of metrics: {error}. {_MOVE}") from error
 
-    def _torn(self) -> bool:
-        if not self.path.exists() or self.path.stat().st_size == 0:
-            return False
-        with self.path.open("rb") as file:
-            file.seek(-1, os.SEEK_END)
-            return file.read() != b"\n"
-
     def _rewrite(self, rows: list[dict[str, Any]]) -> None:
         partial = self.path.with_name(self.path.name + ".partial")
         with partial.open("w", newline="", encoding="utf-8") as file:
@@ -90,17 +83,16 @@ class CsvLog:
 
 
 def wandb_logger(name: str, run_dir: Path, *, project: str = "coachable", mode: str = "auto") -> Any | None:
-    """Makes TorchRL's `WandbLogger`, or None when it is switched off.
+    """Return TorchRL's `WandbLogger`, or None if it is switched off.
 
     Args:
-        name: name of the run.
-        run_dir: W&B's files go to `run_dir/wandb`.
+        name: Name of the run.
+        run_dir: Folder of the run; W&B's files are written to `run_dir/wandb`.
         project: W&B project.
-        mode: "auto" logs online when `WANDB_API_KEY` is set and not at all otherwise; "online", "offline" and "off" say
-            so.
+        mode: "online", "offline" or "off"; "auto" means "online" if `WANDB_API_KEY` is set, otherwise "off".
 
     Raises:
-        ValueError: for any other mode.
+        ValueError: If the mode is unknown.
     """
     modes = ("auto", "online", "offline", "off")
     if mode not in modes:
@@ -114,11 +106,11 @@ def wandb_logger(name: str, run_dir: Path, *, project: str = "coachable", mode: 
 
 
 class MetricsLog:
-    """Sends every row of metrics to the CSV file and, where there is one, to a TorchRL logger.
+    """Log that writes every row of metrics to a CSV file and to an optional TorchRL logger.
 
     Args:
-        run_dir: `metrics.csv` is written here; created if missing.
-        logger: a TorchRL logger with `log_metrics`, or None.
+        run_dir: Folder of `metrics.csv`, created if missing.
+        logger: TorchRL logger with `log_metrics`, or None.
     """
 
     def __init__(self, run_dir: Path, logger: Any | None = None) -> None:
@@ -127,15 +119,15 @@ class MetricsLog:
         self.logger = logger
 
     def rewind(self, frames: int) -> None:
-        """Forgets rows after `frames` env-steps, before a training is resumed there."""
+        """Drop the rows after `frames` env-steps, before a training is resumed there."""
         self.csv.rewind(frames)
 
     def write(self, row: Mapping[str, float], step: int) -> None:
-        """Logs one row.
+        """Log one row.
 
         Args:
-            row: name -> number.
-            step: env-steps so far.
+            row: Numbers by name.
+            step: Number of env-steps so far.
         """
         self.csv.write({k: _short(v) for k, v in row.items()})
         if self.logger is not None:
@@ -144,12 +136,12 @@ class MetricsLog:
 
 
 class Progress:
-    """A tqdm bar on a terminal, otherwise one JSON line per minute.
+    """Progress display: a tqdm bar on a terminal, otherwise one JSON line per minute.
 
     Args:
-        total: env-steps of the whole training.
-        stream: where to write, standard error by default.
-        every: [s] between JSON lines.
+        total: Number of env-steps of the whole training.
+        stream: Stream to write to; None for standard error.
+        every: Time between JSON lines [s].
     """
 
     def __init__(self, total: int, stream: TextIO | None = None, every: float = 60.0) -> None:
@@ -161,11 +153,11 @@ class Progress:
         self._then = (0.0, 0, 0)
 
     def start(self, frames: int, updates: int) -> None:
-        """Begins to count.
+        """Start the display.
 
         Args:
-            frames: env-steps already done.
-            updates: updates already made.
+            frames: Number of env-steps already done.
+            updates: Number of updates already made.
         """
         self._last = time.monotonic()
         self._then = (self._last, frames, updates)
@@ -173,13 +165,13 @@ class Progress:
             self._bar = tqdm(total=self.total, initial=frames, unit="step", unit_scale=True, file=self.stream)
 
     def update(self, frames: int, updates: int, metrics: Mapping[str, float], *, force: bool = False) -> None:
-        """Shows where the training is.
+        """Show the progress of the training.
 
         Args:
-            frames: env-steps so far.
-            updates: learner updates so far.
-            metrics: shown beside it.
-            force: write the JSON line even if the last one is recent.
+            frames: Number of env-steps so far.
+            updates: Number of updates so far.
+            metrics: Metrics to show as well.
+            force: Whether to write even if the last line is recent.
         """
         now = time.monotonic()
         if self._bar is not None:
@@ -197,7 +189,7 @@ class Progress:
             self.stream.flush()
 
     def close(self) -> None:
-        """Ends the bar's line."""
+        """Close the bar."""
         if self._bar is not None:
             self._bar.close()
 

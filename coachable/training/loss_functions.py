@@ -1,4 +1,4 @@
-"""The functions of a loss module that an update evaluates."""
+"""Functions of a loss module that an update evaluates."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LOG = logging.getLogger(__name__)
 
 
 class LossFunctions(NamedTuple):
-    """Functions of a batch.
+    """Functions of a loss module, each of which takes a batch.
 
     Attributes:
         both: Returns a tensordict with `loss_actor` and `loss_qvalue`.
@@ -56,7 +56,7 @@ def compiled(functions: LossFunctions, device_type: str) -> LossFunctions:
 
 
 def check_loss(loss_module: LossModule) -> None:
-    """Check what TorchRL's losses accept without a check: the discount and the entropy weight.
+    """Check the discount and the entropy weight of a loss, which TorchRL does not check.
 
     Raises:
         ValueError: If the discount lies outside [0, 1], or the entropy weight is negative (its logarithm is NaN).

@@ -1,4 +1,4 @@
-"""Which numeric precision a device should train in."""
+"""Choice of the numeric precision in which a device trains."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ Precision = Literal["auto", "fp32", "bf16"]
 
 
 def supports_bf16(device: torch.device | str = "cpu") -> bool:
-    """Whether `device` multiplies bfloat16 matrices in hardware (elsewhere bfloat16 is slower than float32).
+    """Return whether `device` multiplies bfloat16 matrices in hardware; otherwise bfloat16 is slower than float32.
 
-    True for CPUs with AVX512-BF16 or AMX, and for CUDA devices that report bfloat16 support.
+    This is true for CPUs with AVX512-BF16 or AMX, and for CUDA devices that report bfloat16 support.
     """
     kind = torch.device(device).type
     if kind == "cuda":
@@ -26,17 +26,17 @@ def supports_bf16(device: torch.device | str = "cpu") -> bool:
 
 
 def resolve_precision(precision: Precision, device: torch.device | str = "cpu") -> Literal["fp32", "bf16"]:
-    """Turn `"auto"` into the faster of the two precisions that `device` offers.
+    """Return the given precision, and for `"auto"` the faster one on `device`.
 
     Args:
-        precision: `"auto"`, `"fp32"` or `"bf16"`. The last is taken literally, also where it is slow.
+        precision: `"auto"`, `"fp32"` or `"bf16"`. The last is returned even if it is slow on `device`.
         device: Device of the parameters.
 
     Returns:
         `"fp32"` or `"bf16"`.
 
     Raises:
-        ValueError: If `precision` is something else.
+        ValueError: If `precision` is none of the three.
 
     Example:
         >>> resolve_precision("fp32")

@@ -1,4 +1,4 @@
-"""The global random number generators as one plain, pickle-free state."""
+"""State of the global random number generators, and random streams that are independent of them."""
 
 import random
 import threading
@@ -11,14 +11,15 @@ import torch
 
 __all__ = ["RandomStream", "preserved_rng", "rng_state", "seed_everything", "set_rng_state"]
 
-_BORROWED = threading.RLock()  # the global generator, by one stream at a time
+_NUMPY = ("name", "keys", "position", "has_gauss", "cached")  # of its legacy state
+_BORROWED = threading.RLock()  # one stream at a time uses the global generator
 
 
 def seed_everything(seed: int) -> None:
-    """Seeds python, numpy and torch (every device).
+    """Seed the global generators of Python, NumPy and torch (on every device).
 
     Args:
-        seed: any integer in [0, 2**32).
+        seed: Integer in [0, 2**32).
     """
     random.seed(seed)
     np.random.seed(seed)  # noqa: NPY002 - third-party environments draw from the global generator
@@ -26,10 +27,10 @@ def seed_everything(seed: int) -> None:
 
 
 def rng_state() -> dict[str, Any]:
-    """Reads the state of python's, numpy's and torch's global generators.
+    """Return the state of the global generators of Python, NumPy and torch.
 
     Returns:
-        Tensors, numbers, strings and lists only, so that `torch.load(weights_only=True)` reads it back.
+        Tensors, numbers, strings and lists only, so that `torch.load(weights_only=True)` can read them.
 
     Example:
         >>> before = rng_state()
@@ -39,16 +40,10 @@ def rng_state() -> dict[str, Any]:
         True
     """
     version, words, gauss = random.getstate()
-    name, keys, position, has_gauss, cached = np.random.get_state(legacy=True)  # noqa: NPY002
+    numpy = dict(zip(_NUMPY, np.random.get_state(legacy=True), strict=True))  # noqa: NPY002
     state: dict[str, Any] = {
         "torch": torch.get_rng_state(),
-        "numpy": {
-            "name": str(name),
-            "keys": torch.from_numpy(np.asarray(keys).astype(np.int64)),
-            "position": int(position),
-            "has_gauss": int(has_gauss),
-            "cached": float(cached),
-        },
+        "numpy": {**numpy, "keys": torch.from_numpy(np.asarray(numpy["keys"]).astype(np.int64))},
         "python": {"version": int(version), "words": list(words), "gauss": gauss},
     }
     if torch.cuda.is_available():
@@ -57,22 +52,14 @@ def rng_state() -> dict[str, Any]:
 
 
 def set_rng_state(state: dict[str, Any]) -> None:
-    """Restores what `rng_state` read.
+    """Restore what `rng_state` returned.
 
     Args:
-        state: from `rng_state`. CUDA generators are restored only where as many devices exist as when it was read.
+        state: From `rng_state`. CUDA generators are restored only if the number of CUDA devices is unchanged.
     """
     torch.set_rng_state(state["torch"].cpu())
-    numpy = state["numpy"]
-    np.random.set_state(  # noqa: NPY002
-        (
-            numpy["name"],
-            numpy["keys"].numpy().astype(np.uint32),
-            numpy["position"],
-            numpy["has_gauss"],
-            numpy["cached"],
-        )
-    )
+    numpy = {**state["numpy"], "keys": state["numpy"]["keys"].numpy().astype(np.uint32)}
+    np.random.set_state(tuple(numpy[key] for key in _NUMPY))  # noqa: NPY002
     python = state["python"]
     random.setstate((python["version"], tuple(python["words"]), python["gauss"]))
     if "cuda" in state and torch.cuda.is_available() and len(state["cuda"]) == torch.cuda.device_count():
@@ -81,7 +68,7 @@ def set_rng_state(state: dict[str, Any]) -> None:
 
 @contextmanager
 def preserved_rng() -> Iterator[None]:
-    """Puts the global generators back afterwards, so that an evaluation cannot change the course of a training."""
+    """Restore the global generators on exit, so that an evaluation does not change the course of a training."""
     state = rng_state()
     try:
         yield
@@ -90,10 +77,10 @@ def preserved_rng() -> Iterator[None]:
 
 
 class RandomStream:
-    """Random numbers for policies that sample, from torch's global CPU generator but independent of its other users.
+    """Stream of random numbers for policies that sample, independent of other uses of torch's global CPU generator.
 
     Args:
-        seed: of the stream.
+        seed: Seed of the stream.
 
     Example:
         >>> first, second = RandomStream(0), RandomStream(0)
@@ -110,7 +97,7 @@ class RandomStream:
 
     @contextmanager
     def drawn(self) -> Iterator[None]:
-        """Random numbers drawn meanwhile are the stream's; other streams wait."""
+        """Make torch's global CPU generator continue the stream inside the context; other streams wait meanwhile."""
         with _BORROWED:
             outside = torch.get_rng_state()
             torch.set_rng_state(self._state)

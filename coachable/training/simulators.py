@@ -1,4 +1,4 @@
-"""The state of running episodes: what environments save themselves, and what can be read from third-party ones."""
+"""Saving and restoring the running episodes of environments, including third-party ones."""
 
 from typing import Any, Protocol, runtime_checkable
 
@@ -13,30 +13,30 @@ _WRAPPED = ("DMControlWrapper", "GymWrapper")  # TorchRL's environments around o
 
 @runtime_checkable
 class ResumableEnv(Protocol):
-    """An env whose running episodes can be saved and continued."""
+    """Environment whose running episodes can be saved and continued."""
 
     def simulator_state(self) -> dict[str, Any]:
-        """Everything that the next step depends on, as tensors and plain values."""
+        """Return everything that the next step depends on, as tensors and plain values."""
         ...
 
     def load_simulator_state(self, state: dict[str, Any]) -> None:
-        """Restores what `simulator_state` returned."""
+        """Restore what `simulator_state` returned."""
         ...
 
 
 def save_simulator(env: EnvBase) -> dict[str, Any]:
-    """Reads the state of an environment's running episodes.
+    """Return the state of an environment's running episodes.
 
     Args:
-        env: a `ResumableEnv`, one of TorchRL's wrappers of Gymnasium or dm_control, or a `SerialEnv` of them.
+        env: A `ResumableEnv`, one of TorchRL's wrappers of Gymnasium or dm_control, or a `SerialEnv` of them.
 
     Returns:
         Tensors and plain containers.
 
     Raises:
-        UnsavableError: if it has state that cannot be saved.
+        UnsavableError: If a part of its state cannot be saved.
     """
-    if isinstance(env, SerialEnv):  # it passes questions for methods on to its parts
+    if isinstance(env, SerialEnv):  # first, because it forwards attributes to its parts
         return {"parts": [save_simulator(part) for part in env._envs]}
     if isinstance(env, TransformedEnv):
         return {"transforms": dict(env.state_dict()), "base": save_simulator(env.base_env)}
@@ -48,14 +48,14 @@ def save_simulator(env: EnvBase) -> dict[str, Any]:
 
 
 def load_simulator(env: EnvBase, state: dict[str, Any]) -> None:
-    """Restores what `save_simulator` returned.
+    """Restore what `save_simulator` returned.
 
     Args:
-        env: made like the one that was saved, and reset.
-        state: from `save_simulator`.
+        env: Environment made like the saved one, and reset.
+        state: From `save_simulator`.
 
     Raises:
-        UnsavableError: if something of it is not restored; the environment has to be reset then.
+        UnsavableError: If a part cannot be restored. Reset the environment then.
     """
     if isinstance(env, SerialEnv):
         for part, saved in zip(env._envs, state["parts"], strict=True):

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a request, so that a training ends with a checkpoint."""
+"""Handling of Ctrl-C and SIGTERM, so that a training ends with a checkpoint."""
 
 import signal
 import threading
@@ -12,9 +12,9 @@ __all__ = ["stop_signals"]
 
 @contextmanager
 def stop_signals() -> Iterator[threading.Event]:
-    """Turns the first Ctrl-C or SIGTERM into an event; the second one acts as usual.
+    """Set the yielded event on the first Ctrl-C or SIGTERM; the second one acts as usual.
 
-    Outside of the main thread, where python delivers no signals, the event is never set.
+    Outside the main thread, to which Python delivers all signals, the event is never set.
     """
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():

@@ -1,4 +1,4 @@
-"""When the training loop does what."""
+"""Settings of the training loop."""
 
 from dataclasses import dataclass, field, fields
 
@@ -9,20 +9,20 @@ __all__ = ["TrainSettings"]
 
 @dataclass(frozen=True)
 class TrainSettings:
-    """When the loop does what; the metadata of each field holds its range.
+    """Settings of the training loop; the metadata of each field contains its range.
 
     Attributes:
-        total_frames: [env-steps] of the whole training, resumed parts included.
-        batch_size: transitions per update.
-        warmup_frames: [env-steps] before the first update.
-        utd_ratio: updates per env-step, fractions allowed; None makes as many as fit into the time that the throttle
-            leaves.
-        throttle: [env-steps/s] upper bound on collection, or None.
-        anneal: share of total_frames, at its end, over which the learning rates fall linearly to a tenth.
-        anneal_entropy: what the entropy weight falls to meanwhile, as a share of its value before.
-        eval_interval: [env-steps] between evaluations, 0 for none but the last.
-        log_interval: [s] between rows of metrics.
-        checkpoint_interval: [s] between checkpoints.
+        total_frames: Length of the whole training, including resumed parts [env-steps].
+        batch_size: Transitions per update.
+        warmup_frames: Length of the collection before the first update [env-steps].
+        utd_ratio: Updates per env-step, which may be a fraction; None makes as many as fit in the time that the
+            throttle leaves.
+        throttle: Highest rate of the collection [env-steps/s]; None for no limit.
+        anneal: Share of `total_frames`, at its end, over which the learning rates fall linearly to a tenth.
+        anneal_entropy: Factor to which the entropy weight falls over the same share.
+        eval_interval: Distance between evaluations [env-steps]; with 0 there is one, at the end.
+        log_interval: Time between rows of metrics [s].
+        checkpoint_interval: Time between checkpoints [s].
     """
 
     total_frames: int = field(metadata={"range": COUNT})
@@ -37,7 +37,7 @@ class TrainSettings:
     checkpoint_interval: float = field(default=300.0, metadata={"range": NOT_NEGATIVE})
 
     def __post_init__(self) -> None:
-        """Refuse numbers outside of their ranges, and as many updates as fit where collection has no throttle."""
+        """Check that numbers are within their ranges, and that `utd_ratio=None` has a throttle."""
         for entry in fields(self):
             if "range" in entry.metadata:
                 entry.metadata["range"].check(entry.name, getattr(self, entry.name))
@@ -45,14 +45,14 @@ class TrainSettings:
             raise ValueError("utd_ratio=null (as many updates as fit) needs a throttle: set train.throttle=RATE")
 
     def learning_rate_factor(self, frames: int) -> float:
-        """What the learning rates are multiplied with after so many env-steps (see `anneal`)."""
+        """Return the factor on the learning rates after `frames` env-steps (see `anneal`)."""
         return 1.0 - 0.9 * self._annealed(frames)
 
     def entropy_factor(self, frames: int) -> float:
-        """What the entropy weight is multiplied with after so many env-steps (see `anneal_entropy`)."""
+        """Return the factor on the entropy weight after `frames` env-steps (see `anneal_entropy`)."""
         return 1.0 - (1.0 - self.anneal_entropy) * self._annealed(frames)
 
     def _annealed(self, frames: int) -> float:
-        """From 0 before the last part of the training to 1 at its end."""
+        """Return 0 before the annealed share of the training, rising to 1 at its end."""
         left = max(0.0, 1.0 - frames / self.total_frames)
         return 0.0 if left >= self.anneal else 1.0 - left / self.anneal

@@ -1,4 +1,4 @@
-"""The trained parameters of a loss, and how optimisers keep hold of them when others take their place."""
+"""Trained parameters of a loss, and the replacement of those that an optimiser steps."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ __all__ = ["Watch", "adopt_actor", "follow", "loaded", "share_actor", "trained_p
 
 
 def trained_parameters(loss_module: LossModule) -> dict[str, list[str]]:
-    """Return the names of the trained parameters: `"actor"` of the policy, `"critic"`, and `"alpha"`, the temperature.
+    """Return the names of the trained parameters of the policy (`"actor"`), critics and temperature (`"alpha"`).
 
     Raises:
-        ValueError: If the policy or the critics have none.
+        ValueError: If the policy or the critics have no trained parameters.
     """
     groups: dict[str, list[str]] = {"actor": [], "critic": [], "alpha": []}
     for name, parameter in loss_module.named_parameters():
@@ -34,10 +34,9 @@ def trained_parameters(loss_module: LossModule) -> dict[str, list[str]]:
 
 
 class Watch:
-    """Notices when a loss or its policy has other parameters, or the same ones elsewhere in memory or of another dtype.
+    """Detector of changes of a loss's or its policy's parameters: other ones, another place in memory, another dtype.
 
-    Memory may be exchanged, as in `tensor.data = other` or `.to(dtype)`, or move together with everybody who uses it,
-    as in `share_memory_()`.
+    A parameter gets other memory by `tensor.data = other` or `.to(dtype)`, and its memory moves by `share_memory_()`.
 
     Args:
         loss_module: The loss.
@@ -49,7 +48,7 @@ class Watch:
         self._memory: list[tuple[Tensor, Tensor, int]] = []
 
     def look(self) -> None:
-        """Take note of the parameters as they are now, and of where modules keep them."""
+        """Record the present parameters and the modules that contain them."""
         loss: Any = self._loss
         places = [*loss.modules(), *_policy(loss).modules()]
         kept = [module._parameters for module in places] + [params._buffers for params in _sets(loss)]
@@ -58,7 +57,7 @@ class Watch:
         self._memory = [(tensor, tensor.detach(), tensor.data_ptr()) for tensor in tensors.values()]
 
     def changed(self) -> bool:
-        """Whether anything is other than at the last look."""
+        """Return whether anything has changed since the last call of `look`."""
         return any(owner.get(name) is not value for owner, name, value in self._seen) or not all(
             tensor.is_set_to(alias) and tensor.data_ptr() == address for tensor, alias, address in self._memory
         )
@@ -85,33 +84,30 @@ def _erase_caches(params: Any) -> None:
 
 
 def share_actor(loss_module: LossModule) -> None:
-    """Give the loss's policy the parameters that the loss trains; in a copy of a loss it has its own.
-
-    This also happens each time that the loss loads a state.
-    """
+    """Give the loss's policy the parameters that the loss trains; in a copied loss the policy has its own."""
     if _apart(loss_module):
         loss: Any = loss_module
         loss.actor_network_params.to_module(loss.actor_network)
 
 
 def adopt_actor(loss_module: LossModule) -> None:
-    """Let the loss train the parameters that its policy has now, if `load_state_dict(assign=True)` replaced them."""
+    """Make the loss train its policy's present parameters, which `load_state_dict(assign=True)` may have replaced."""
     if _apart(loss_module):
         loss: Any = loss_module
         loss.actor_network_params = TensorDict.from_module(loss.actor_network, as_module=True)
 
 
 def loaded(loss_module: LossModule, _: Any) -> None:
-    """Hook after the loss loaded a state, which goes through `.data`, so that versions do not tell of it.
+    """Share the actor and raise the parameters' versions after the loss loaded a state, which does neither.
 
-    It knows nothing but its arguments, so that a copy of the loss has one of its own.
+    This hook of a loss uses only its arguments, so that it also works for copies of the loss.
     """
     share_actor(loss_module)
     increment_version([*loss_module.parameters(), *loss_module.buffers()])
 
 
 def follow(optimizer: torch.optim.Optimizer, params: list[nn.Parameter]) -> None:
-    """Let an optimiser of one group go on with `params` in place of its own, in their dtype, with the state it has."""
+    """Replace the parameters of an optimiser with one group; its state is kept and cast to their dtype."""
     (group,) = optimizer.param_groups
     moment = optimizer.state[params[0]].get("exp_avg") if params[0] in optimizer.state else None
     same = all(new is old for new, old in zip(params, group["params"], strict=True))
@@ -124,13 +120,13 @@ def follow(optimizer: torch.optim.Optimizer, params: list[nn.Parameter]) -> None
 
 
 def _apart(loss_module: LossModule) -> bool:
-    """Whether the loss's policy has other parameters than those that the loss trains."""
+    """Return whether the loss's policy has other parameters than those that the loss trains."""
     loss: Any = loss_module
     own, trained = dict(_policy(loss).named_parameters()), dict(loss.actor_network_params.named_parameters())
     return own.keys() == trained.keys() and any(own[name] is not trained[name] for name in own)
 
 
 def _policy(loss_module: LossModule) -> nn.Module:
-    """The policy's own module, or an empty one."""
+    """Return the policy's module, or an empty one."""
     actor = getattr(loss_module, "actor_network", None)
     return actor if isinstance(actor, nn.Module) else nn.Module()

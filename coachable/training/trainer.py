@@ -1,4 +1,4 @@
-"""The one training loop: collect, store, update, evaluate, log, checkpoint."""
+"""Training loop: collect, store, update, evaluate, log and write checkpoints."""
 
 import threading
 import time
@@ -44,16 +44,16 @@ REPLAY_KEYS: tuple[NestedKey, ...] = (
     ("next", TASK_REWARD),
     ("next", STYLE_FEATURES),
 )
-"""What replay stores: what losses and relabelling read. `("next", "style")` equals `style` and is not stored."""
+"""Keys of the entries that losses and relabelling read. `("next", "style")` equals `style` and is not stored."""
 
 
 def replay_keys(env: EnvBase, *, tables: bool = False, scenarios: bool = False) -> tuple[NestedKey, ...]:
-    """What replay stores of an env's transitions.
+    """Return the keys of the entries that a replay buffer stores of each transition.
 
     Args:
-        env: its observation spec tells whether there are events.
-        tables: whether the buffer is an `EventTableBuffer`, which reads trajectory numbers and events.
-        scenarios: whether its tables are scenarios.
+        env: The environment; its observation spec shows whether it emits events and scenarios.
+        tables: Whether the buffer is an `EventTableBuffer`, which reads trajectory numbers and events.
+        scenarios: Whether the buffer has one table per scenario.
     """
     if not tables:
         return REPLAY_KEYS
@@ -64,22 +64,20 @@ def replay_keys(env: EnvBase, *, tables: bool = False, scenarios: bool = False) 
 
 
 class Trainer:
-    """Trains until `total_frames`, a stop signal or an error.
+    """Training loop that runs until `total_frames`, a stop signal or an error.
 
     Args:
-        collector: a TorchRL collector.
-        replay: buffer whose `sample(batch_size)` gives batches for the learner.
-        learner: makes the updates.
-        settings: see `TrainSettings`.
-        log: where metrics go.
-        progress: what a person sees meanwhile.
-        checkpoints: where checkpoints go, or None for none.
-        describe: returns what identifies the agent (style space, network, config, weights); every checkpoint contains
-            it.
-        evaluate: called without arguments now and then, returns metrics; it must leave the global generators as they
-            were.
-        style_terms: maps style features `(B, F)` and theta `(B, d)` to named, unscaled terms `(B,)` for the log.
-        replay_keys: see the function of that name.
+        collector: TorchRL collector.
+        replay: Replay buffer whose `sample(batch_size)` returns batches for the learner.
+        learner: Learner that makes the updates.
+        settings: Settings of the loop, see `TrainSettings`.
+        log: Log that receives a row of metrics now and then.
+        progress: Progress display.
+        checkpoints: Store of the run's checkpoints; None writes none.
+        describe: Returns the agent's style space, network, configuration and weights, which every checkpoint contains.
+        evaluate: Returns metrics of an evaluation. It must leave the global random number generators unchanged.
+        style_terms: Maps style features `(B, F)` and theta `(B, d)` to named, unscaled terms `(B,)` for the log.
+        replay_keys: Keys of the stored entries, see the function `replay_keys`.
     """
 
     def __init__(
@@ -108,7 +106,7 @@ class Trainer:
         self.evaluate = evaluate
         self.replay_keys = replay_keys
         self.frames = 0
-        self.owed = 0.0  # updates that utd_ratio asks for and that are not made yet
+        self.owed = 0.0  # updates that utd_ratio asks for and that have not been made yet
         parts = ("collect", "store", "update", "evaluate", "log", "checkpoint", "wait")
         self.seconds: dict[str, float] = dict.fromkeys(parts, 0.0)
         self._device = next(learner.loss_module.parameters()).device
@@ -123,17 +121,17 @@ class Trainer:
         self._logged_frames = 0
 
     def run(self) -> dict[str, float]:
-        """Runs the loop.
+        """Run the loop.
 
         Returns:
             The latest value of every metric.
 
         Raises:
-            NonFiniteError: if a number of a transition, loss or gradient is not finite. It is not stored, it changes
-                no weight, and no checkpoint is written after it. Or if a weight was not finite from the start.
+            NonFiniteError: If a number in a transition, loss or gradient is not finite, or a weight was not finite at
+                the start. Such a number is not stored, no weight is changed by it, and no checkpoint is written.
         """
         if self.frames == 0:
-            self.log.rewind(0)  # of a training that was killed here before its first checkpoint
+            self.log.rewind(0)  # drops rows of a training that was killed before its first checkpoint
         self.progress.start(self.frames, self.learner.updates)
         batches = iter(self.collector)
         try:
@@ -166,11 +164,11 @@ class Trainer:
 
     def _store(self, data: TensorDictBase) -> None:
         with self._timed("store"):
-            data = data.contiguous()  # flattening the lazy stack without it takes 25 times as long
+            data = data.contiguous()  # without this, flattening the lazy stack takes 25 times as long
             stored = data.select(*self.replay_keys)
             require_finite(stored)
             self._episodes.add(data.reshape(-1))
-            # Of one trajectory, earlier steps come first: all that an EventTableBuffer needs besides its number.
+            # Flattening keeps the steps of each trajectory in order, as an EventTableBuffer requires.
             self.replay.extend(stored.reshape(-1))
 
     def _update(self, new_frames: int, stop: threading.Event) -> None:
@@ -180,7 +178,7 @@ class Trainer:
         with self._timed("update"):
             self.learner.scale_learning_rates(self.settings.learning_rate_factor(self.frames))
             self.learner.scale_entropy_weight(self.settings.entropy_factor(self.frames))
-            if self.settings.utd_ratio is None:  # the learner fills the time that the throttle leaves
+            if self.settings.utd_ratio is None:  # update until the throttle allows the next frames
                 while self._throttle.remaining() > 0 and not stop.is_set():
                     self._update_once()
             else:
@@ -188,15 +186,13 @@ class Trainer:
                 while self.owed >= 1.0:
                     self._update_once()
                     self.owed -= 1.0
-            if not isinstance(
-                self.collector, Collector
-            ):  # a single-process collector acts with the learner's own weights
+            if not isinstance(self.collector, Collector):  # a single-process collector shares the learner's weights
                 self.collector.update_policy_weights_()  # pyright: ignore[reportCallIssue]
 
     def _update_once(self) -> None:
         batch = self.replay.sample(self.settings.batch_size).to(self._device)
         if ("next", STYLE) not in batch.keys(True):
-            batch.set(("next", STYLE), batch.get(STYLE))  # theta is fixed within a training episode
+            batch.set(("next", STYLE), batch.get(STYLE))  # theta does not change within a training episode
         self._losses.add(self.learner.update(batch))
         if isinstance(self.replay, EventTableBuffer):
             self.replay.update_tensordict_priority(batch)
@@ -235,7 +231,7 @@ class Trainer:
     def _write(self, row: Mapping[str, float]) -> None:
         try:
             self.log.write(row, step=self.frames)
-        except OSError as error:  # a full disk must not end a training that may outlive it
+        except OSError as error:  # a full disk must not end a training
             warnings.warn(f"metrics at {self.frames} frames were not written: {error}", stacklevel=2)
 
     def _position(self) -> dict[str, float]:
@@ -243,20 +239,18 @@ class Trainer:
 
     def _checkpoint_if_due(self) -> None:
         if time.monotonic() - self._saved >= self.settings.checkpoint_interval:
-            if self._logged_frames < self.frames:  # a checkpoint does not hold what the next row would tell of so far
+            if self._logged_frames < self.frames:  # a checkpoint does not contain the statistics since the last row
                 self._log()
             self._checkpoint()
 
-    def _checkpoint(self) -> Path | None:
-        if self.checkpoints is None:
-            return None
-        with self._timed("checkpoint"):
-            path = self.checkpoints.try_save({**self.describe(), **self.state_dict()}, self._position(), self.replay)
-            self._saved = time.monotonic()
-        return path
+    def _checkpoint(self) -> None:
+        if self.checkpoints is not None:
+            with self._timed("checkpoint"):
+                self.checkpoints.try_save({**self.describe(), **self.state_dict()}, self._position(), self.replay)
+                self._saved = time.monotonic()
 
     def _finish(self, *, interrupted: bool) -> None:
-        # A training that is resumed at its end, or whose last step was one to evaluate at, repeats neither row.
+        # Neither row is repeated if the training was resumed at its end or has just been evaluated.
         if not interrupted and self._evaluated_frames < self.frames:
             self._evaluate()
         if self._logged_frames < self.frames:
@@ -265,7 +259,7 @@ class Trainer:
         self.progress.update(self.frames, self.learner.updates, self._latest, force=True)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the rest of the training depends on, but for the replay buffer."""
+        """Return everything that the rest of the training depends on, except the replay buffer."""
         return {
             "learner": self.learner.state_dict(),
             "loop": {
@@ -282,16 +276,16 @@ class Trainer:
         }
 
     def resume(self, path: Path | str) -> Path:
-        """Continues from a checkpoint of the same agent.
+        """Restore the state of a checkpoint of the same agent.
 
         Args:
-            path: a run's folder or a checkpoint.
+            path: A run's folder or a checkpoint.
 
         Returns:
-            The checkpoint.
+            The checkpoint's folder.
 
         Raises:
-            CheckpointError: if there is none, it is damaged, or style space or network shapes differ.
+            CheckpointError: If there is no checkpoint, it is damaged, or style space or network shapes differ.
         """
         path = find_checkpoint(path)
         state = read_state(path)
@@ -302,7 +296,7 @@ class Trainer:
         return path
 
     def _restore(self, state: Mapping[str, Any], replay: Path) -> None:
-        """Continue from what `state_dict` returned; without a saved replay buffer, warn and start it empty."""
+        """Restore what `state_dict` returned; warn and leave the replay buffer empty if none was saved."""
         self.learner.load_state_dict(state["learner"])
         self.frames = int(state["loop"]["frames"])
         self.owed = float(state["loop"]["owed"])
@@ -324,10 +318,10 @@ class Trainer:
         if threads != torch.get_num_threads():
             warnings.warn(
                 f"the checkpoint was written with {threads} torch threads, this run has {torch.get_num_threads()}: "
-                "sums are rounded differently, so the training does not go on bit for bit (threads.learner)",
+                "sums are rounded differently, so the training does not continue bit for bit (set threads.learner)",
                 stacklevel=2,
             )
-        set_rng_state(state["rng"])  # last: what is restored above draws random numbers
+        set_rng_state(state["rng"])  # last, because restoring the rest draws random numbers
 
     def _load_episodes(self, state: dict[str, Any]) -> None:
         try:
@@ -336,13 +330,13 @@ class Trainer:
             if isinstance(self.replay, EventTableBuffer):
                 self.replay.finish()
             warnings.warn(
-                f"the running episodes of {self._environment()} are not restored: {error}. They start anew, so the "
-                "training does not go on bit for bit; everything else that the checkpoint holds is restored",
+                f"the running episodes of {self._environment()} are not restored: {error}. New episodes start, so the "
+                "training does not continue bit for bit; everything else that the checkpoint holds is restored",
                 stacklevel=4,
             )
 
     def _environment(self) -> str:
-        """Name of the environment, or of the agent's domain where the environments are in other processes."""
+        """Return the environment's name, or the domain's if the environments run in other processes."""
         if isinstance(self.collector, Collector):
             return type(simulation_env(self.collector.env)).__name__
         return str(self.describe().get("domain", "the environment"))

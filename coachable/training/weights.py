@@ -1,4 +1,4 @@
-"""Agents in files: what identifies one, loading its policy, exporting and reusing its weights."""
+"""Agents in files: their description, loading their policy, exporting and reusing their weights."""
 
 import os
 from collections.abc import Mapping
@@ -34,9 +34,9 @@ __all__ = [
 
 _PRETRAINED = Path(__file__).resolve().parent.parent / "pretrained"
 _CRITICS = "qvalue_network_params."
-_PATHS = ("run_dir", "resume", "init_from")  # of the machine that trained, not of the agent
+_PATHS = ("run_dir", "resume", "init_from")  # describe the machine that trained, not the agent
 _AGENT = {"domain": str, "space": dict, "config": dict, "network": dict, "actor": dict, "critics": dict}
-_ACTORS = {  # what a file may name as its network: nothing else is called
+_ACTORS = {  # the only functions that a file may name as its network
     f"{module}.{make.__name__}": make
     for make in (make_gaussian_actor, make_mixed_actor)
     for module in ("coachable.networks", make.__module__)
@@ -44,13 +44,13 @@ _ACTORS = {  # what a file may name as its network: nothing else is called
 
 
 class LoadedPolicy(NamedTuple):
-    """What `load_policy` returns.
+    """Trained policy with the description of its training.
 
     Attributes:
-        actor: the policy, in eval mode; reads `observation` and `style`, writes `action`.
-        space: the styles it was trained on.
-        config: the resolved configuration of its training, as plain containers.
-        metadata: `domain`, `source` (file), `frames` and `updates` where known.
+        actor: Policy in evaluation mode, which reads `observation` and `style` and writes `action`.
+        space: Style space that it was trained on.
+        config: Resolved configuration of its training, in plain containers.
+        metadata: `domain`, `source` (the file), and `frames` and `updates`, each None if unknown.
     """
 
     actor: TensorDictModuleBase
@@ -68,16 +68,16 @@ def agent_state(
     network: Mapping[str, Any],
     config: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Gathers what identifies an agent, for a checkpoint or a weights file.
+    """Return the description and the weights of an agent, for a checkpoint or a weights file.
 
     Args:
-        domain: name under which it is registered.
-        space: its styles.
-        actor: its policy.
-        loss_module: holds the critics' weights.
-        network: how to build the actor again: `{"actor": {"_target_": "coachable.networks...", **arguments}}`; the
-            argument `space` is added.
-        config: resolved configuration, plain containers.
+        domain: Name under which its domain is registered.
+        space: Its style space.
+        actor: Its policy.
+        loss_module: Loss that contains its critics.
+        network: Description from which the actor can be built again, without its argument `space`:
+            `{"actor": {"_target_": "coachable.networks...", **arguments}}`.
+        config: Resolved configuration, in plain containers.
 
     Returns:
         A dictionary of plain containers and tensors, readable with `weights_only=True`.
@@ -88,26 +88,26 @@ def agent_state(
         "config": dict(config),
         "network": dict(network),
         "actor": _tensors(actor.state_dict()),
-        "critics": _with_prefix(loss_module.state_dict(), _CRITICS),
+        "critics": _tensors(loss_module.state_dict(), _CRITICS),
     }
 
 
 def load_policy(path_or_domain: Path | str, device: torch.device | str = "cpu") -> LoadedPolicy:
-    """Loads a trained policy.
+    """Load a trained policy.
 
     Args:
-        path_or_domain: a run's folder, a checkpoint, a weights file, or the name of a domain that ships with weights.
-        device: where the actor goes.
+        path_or_domain: A run's folder, a checkpoint, a weights file, or the name of a domain that ships with weights.
+        device: Device of the actor.
 
     Raises:
-        CheckpointError: if there is no such thing, or it does not describe its policy.
+        CheckpointError: If there is no such file or domain, or the file does not describe its policy.
     """
     file = _locate(path_or_domain)
     state = _read_agent(file, device)
     with refusing(file, "a style space"):
         space = StyleSpace.from_dict(state["space"])
     with refusing(file, "a network"):
-        with torch.device("meta"):  # no file makes this machine allocate more than it holds itself
+        with torch.device("meta"):  # checks the shapes before a file can make this machine allocate memory
             check_fits(state["actor"], _tensors(_build(state["network"], space, file).state_dict()), "actor", file)
         actor = _build(state["network"], space, file).to(device)
         actor.load_state_dict(state["actor"])
@@ -120,14 +120,16 @@ def load_policy(path_or_domain: Path | str, device: torch.device | str = "cpu") 
 
 
 def domain_of(agent: LoadedPolicy) -> Domain:
-    """Return the registered domain of an agent as its training had it; its environments are checked against the agent.
+    """Return the domain of an agent, configured as in its training.
+
+    The returned domain's `make_env` raises a `CheckpointError` if an environment does not fit the agent.
 
     Args:
-        agent: from `load_policy`.
+        agent: From `load_policy`.
 
     Raises:
-        ValueError: if there is no such domain.
-        CheckpointError: if the agent has other styles, or its configuration makes no environment.
+        ValueError: If there is no such domain.
+        CheckpointError: If the agent has other styles, or no environment can be made from its configuration.
     """
     name, source = agent.metadata["domain"], agent.metadata["source"]
     load_domain(name)
@@ -160,31 +162,34 @@ def _check_widths(source: str, reads: tuple[int, int], gives: tuple[int, int], d
 
 
 def widths_of(agent: LoadedPolicy) -> tuple[int, int]:
-    """Number of observations that an agent reads, and of actions that it gives."""
+    """Return the widths of an agent's observation and of its action."""
     policy = policy_network(agent.actor)
     actions = policy.heads.action_dim if isinstance(policy, MixedPolicy) else (policy.trunk.out_features or 0) // 2
     return policy.trunk.in_features - agent.space.dim, actions
 
 
 def export_weights(checkpoint: Path | str, out: Path | str) -> Path:
-    """Writes the small final weights file: actor, critics and what identifies them, without optimisers and replay.
+    """Write a weights file: actor, critics and their description, without optimisers and replay buffer.
 
     Args:
-        checkpoint: a run's folder or a checkpoint.
-        out: the file, for example `weights.pt`.
+        checkpoint: A run's folder or a checkpoint.
+        out: The file to write, for example `weights.pt`.
 
     Returns:
         The file.
+
+    Raises:
+        CheckpointError: If there is no checkpoint, or `checkpoint` is a weights file itself.
+        OSError: If writing fails.
     """
     source = _locate(checkpoint)
     state = _read_agent(source)
     if "loop" not in state and "counters" in state:
         raise CheckpointError(f"{source} is a small weights file already: expected a run's folder or a checkpoint")
     agent = {name: state[name] for name in _AGENT}
-    # Tensors are copied, because a slice or a shared parameter would drag its whole storage into the file.
     with refusing(source, "weights"):
-        agent["actor"] = {name: value.clone() for name, value in agent["actor"].items()}
-        agent["critics"] = {name: value.clone() for name, value in agent["critics"].items()}
+        for part in ("actor", "critics"):  # copied, because a view would bring its whole storage into the file
+            agent[part] = {name: value.clone() for name, value in agent[part].items()}
         counters = {"frames": state["loop"]["frames"], "updates": state["learner"]["updates"]}
     check_finite({"actor": agent["actor"], "critics": agent["critics"]}, source)
     agent["config"] = {**agent["config"], **dict.fromkeys(_PATHS)}
@@ -207,25 +212,25 @@ def initialise_from(
     space: StyleSpace,
     new_observations: int = 0,
 ) -> None:
-    """Starts a new training from the actor and critics of another one; optimisers and replay start empty.
+    """Overwrite the actor and critics of a new training with those of another one.
 
     Args:
-        path_or_domain: as for `load_policy`.
-        actor: overwritten.
-        loss_module: built from `actor`; its critics and their targets are overwritten.
-        space: of the new training; it may draw its styles otherwise.
-        new_observations: columns at the end of the observation that the other training did not have. While they are 0
-            the networks do what they did.
+        path_or_domain: See `load_policy`.
+        actor: Actor to overwrite.
+        loss_module: Loss built from `actor`; its critics and their targets are overwritten.
+        space: Style space of the new training. Only its sampler may differ from that of the other training.
+        new_observations: Number of columns at the end of the observation that the other training did not have. While
+            they are 0, the outputs of the networks are those of the other training.
 
     Raises:
-        CheckpointError: if style parameters or network shapes differ, or there is no room for new observations.
+        CheckpointError: If style parameters or network shapes differ, or the networks cannot take new observations.
     """
     file = _locate(path_or_domain)
     state = _read_agent(file)
     with refusing(file, "a style space"):
         _check_space({**state["space"], "sampler": space.to_dict()["sampler"]}, space, file)
     present = loss_module.state_dict()
-    for part, fresh in (("actor", _tensors(actor.state_dict())), ("critics", _with_prefix(present, _CRITICS))):
+    for part, fresh in (("actor", _tensors(actor.state_dict())), ("critics", _tensors(present, _CRITICS))):
         if new_observations:
             with refusing(file, "a network"):
                 state[part] = _widened(state[part], state["network"]["actor"]["obs_dim"], new_observations)
@@ -237,26 +242,26 @@ def initialise_from(
 
 
 def _widened(saved: Mapping[str, Tensor], seen: int, new: int) -> dict[str, Tensor]:
-    """Weights with `new` inputs after the first `seen`, in networks of residual layers."""
+    """Return the weights of residual networks with `new` more inputs after the first `seen`."""
     first = "blocks.0.linear.weight"
     trunks = [name.removesuffix(first) for name in saved if name.endswith(first)]
     widened = dict(saved)
     for trunk in trunks:
-        own = _with_prefix(saved, trunk)
+        own = _tensors(saved, trunk)
         widened |= {trunk + name: value for name, value in with_new_inputs(own, seen, new).items()}
     return widened
 
 
 def require_same_agent(saved: Mapping[str, Any], present: Mapping[str, Any], source: Path | str) -> None:
-    """Compares a checkpoint with the run that wants to continue it.
+    """Check that a checkpoint belongs to the agent of this run.
 
     Args:
-        saved: state of the checkpoint.
+        saved: State of the checkpoint.
         present: `agent_state` of this run.
-        source: the checkpoint, for the message.
+        source: The checkpoint, for the message.
 
     Raises:
-        CheckpointError: saying how domain, style space or network shapes differ.
+        CheckpointError: If domain, style space or network shapes differ.
     """
     _check_agent(saved, source)
     if saved["domain"] != present["domain"]:
@@ -273,12 +278,12 @@ def _check_space(saved: Mapping[str, Any], space: StyleSpace, source: Path | str
     if differences:
         raise CheckpointError(
             f"{source} was trained on another style space: {' '.join(differences)} (Here is this run, there the "
-            "checkpoint.) Train afresh, or declare the space as it was."
+            "checkpoint.) Start a new training, or declare the space as it was."
         )
 
 
 def _essentials(description: Mapping[str, Any]) -> StyleSpace:
-    """The space without what may change freely: help texts and ranges of reports."""
+    """Return the space without help texts and evaluation ranges, which may change freely."""
     parameters = [
         {key: value for key, value in parameter.items() if key not in ("help", "evaluation")}
         for parameter in description["parameters"]
@@ -330,11 +335,8 @@ def _names(space: StyleSpace) -> list[str]:
     return [f"{p.name} ({'/'.join(p.options)})" if isinstance(p, Choice) else p.name for p in space.parameters]
 
 
-def _tensors(state: Mapping[str, Any]) -> dict[str, Tensor]:
-    return {name: value.detach() for name, value in state.items() if isinstance(value, Tensor)}
-
-
-def _with_prefix(state: Mapping[str, Any], prefix: str) -> dict[str, Tensor]:
+def _tensors(state: Mapping[str, Any], prefix: str = "") -> dict[str, Tensor]:
+    """Return the tensors whose names begin with a prefix, named without it."""
     return {
         k.removeprefix(prefix): v.detach() for k, v in state.items() if k.startswith(prefix) and isinstance(v, Tensor)
     }

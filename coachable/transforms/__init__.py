@@ -1,4 +1,4 @@
-"""TorchRL transforms: styles and style rewards in environments, relabelling and mirror images in replay."""
+"""TorchRL transforms: styles and style rewards for environments, relabelling and mirror images for replay."""
 
 from coachable.transforms.mirror import MirrorMap, MirrorSymmetry
 from coachable.transforms.style_features import StyleFeatures

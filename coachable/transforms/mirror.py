@@ -1,4 +1,4 @@
-"""`MirrorSymmetry`: sampled transitions as their mirror image."""
+"""`MirrorSymmetry`, which replaces sampled transitions by their mirror images."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,8 +17,11 @@ class MirrorMap:
     """Mirror image of a vector: `mirrored[i] = sign[i] * vector[source[i]]`.
 
     Attributes:
-        source: where each entry of the image comes from.
-        sign: +1 or -1 each.
+        source: Index of the source of each entry of the image.
+        sign: Sign of each entry, +1 or -1.
+
+    Raises:
+        ValueError: If mirroring a vector twice would change it.
     """
 
     source: tuple[int, ...]
@@ -31,29 +34,28 @@ class MirrorMap:
         for i, (j, sign) in enumerate(zip(self.source, self.sign, strict=True)):
             if self.source[j] != i or self.sign[j] != sign or abs(sign) != 1:
                 raise ValueError(
-                    f"entries {i} and {j} are not each other's mirror image: mirroring twice must be nothing"
+                    f"entries {i} and {j} are not each other's mirror image: expected a map that is its own inverse"
                 )
 
     @property
     def width(self) -> int:
-        """Length of the vectors."""
+        """Number of entries of a vector."""
         return len(self.source)
 
 
 class MirrorSymmetry(Transform):
-    """Replay transform that replaces a random part of the sampled transitions by their mirror image.
+    """Replay transform that replaces a random part of the sampled transitions by their mirror images.
 
-    For bodies and tasks that are symmetric, the image of a transition is as true as the transition, so that every
-    experience teaches both sides, and neither the policy nor its gait prefers one. The paper does not use it.
+    If body and task are symmetric, the image of a transition is a valid transition, so that the policy learns both
+    sides from each and prefers neither. The paper does not use it.
 
     Args:
-        maps: by key, in the order of the vector's entries; keys that are not named stay (rewards, flags, styles that
-            mean the same on both sides).
-        probability: share of mirrored transitions.
-        seed: of the transform's own generator, whose state is in the state dict.
+        maps: Maps by key. Other entries do not change, such as rewards and styles without a side.
+        probability: Share of mirrored transitions.
+        seed: Seed of the transform's own generator, whose state is in the state dict.
 
     Raises:
-        ValueError: if the probability is none, or a vector's width is not its map's.
+        ValueError: If `probability` is not in [0, 1].
 
     Example:
         >>> from tensordict import TensorDict
@@ -74,7 +76,11 @@ class MirrorSymmetry(Transform):
         }
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Mirrors a random part of a batch `[B]`."""
+        """Mirror a random part of a batch `[B]`.
+
+        Raises:
+            ValueError: If an entry and its map have different widths.
+        """
         shape = tensordict.batch_size
         chosen = torch.rand((*shape, 1), generator=self.generator) < self.probability
         result = tensordict.copy()
@@ -89,7 +95,7 @@ class MirrorSymmetry(Transform):
         return result
 
     def get_extra_state(self) -> Tensor:
-        """State of the generator, for `state_dict`."""
+        """Return the state of the generator, for `state_dict`."""
         return self.generator.get_state()
 
     def set_extra_state(self, state: Any) -> None:

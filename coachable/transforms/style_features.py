@@ -1,4 +1,4 @@
-"""`StyleFeatures` adds what a coachable environment emits to an environment that knows nothing of styles."""
+"""`StyleFeatures`, which adds task reward and style features to an environment that has none."""
 
 from collections.abc import Callable
 
@@ -12,10 +12,10 @@ from coachable.keys import STYLE_FEATURES, TASK_REWARD
 
 
 class StyleFeatures(Transform):
-    """Copies the reward to `task_reward` and writes `style_features`, the raw quantities that styles judge.
+    """Environment transform that copies the reward to `task_reward` and writes `style_features`.
 
     Args:
-        features: From the TensorDict after a step, of batch shape `(...)`, to `(..., size)`.
+        features: Maps the tensordict after a step, of batch shape `(...)`, to features `(..., size)`.
         size: Number of features.
 
     Example:
@@ -40,7 +40,7 @@ class StyleFeatures(Transform):
         return tensordict_reset
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Adds both keys."""
+        """Add both keys."""
         for key, width in ((TASK_REWARD, 1), (STYLE_FEATURES, self.size)):
             shape = torch.Size((*observation_spec.shape, width))
             observation_spec[key] = Unbounded(shape=shape, device=observation_spec.device)

@@ -1,4 +1,4 @@
-"""`StyleRewardTransform`: adds the style part to the task reward of an environment."""
+"""`StyleRewardTransform`, which adds the style part to the task reward of an environment."""
 
 from collections.abc import Iterable
 
@@ -12,13 +12,13 @@ from coachable.styles.reward import StyleReward
 
 
 class StyleRewardTransform(Transform):
-    """Writes `reward = task_reward + style_reward(style_features, theta)`, theta being the style that the policy saw.
+    """Environment transform that writes `reward = task_reward + style_reward(style_features, theta)`.
 
-    The sum is the one that relabelling computes from stored transitions, bit for bit. The style part is also written,
-    as `style_reward`, and declared where the task reward is declared (as a reward or as an observation).
+    Theta is the style that the policy read. Relabelling computes the same sum from stored transitions, bit for bit. The
+    style part is also written as `style_reward`, and its spec is beside that of the task reward.
 
     Args:
-        style_reward: The only code that computes style rewards.
+        style_reward: Style reward of the domain.
     """
 
     def __init__(self, style_reward: StyleReward) -> None:
@@ -51,7 +51,7 @@ class StyleRewardTransform(Transform):
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         task_reward = tensordict_reset.get(TASK_REWARD, None)
-        if task_reward is not None:  # the task reward is an observation: so is the style reward, zero at reset
+        if task_reward is not None:  # then both are observations, and the style reward is 0 at reset
             tensordict_reset.set(STYLE_REWARD, torch.zeros_like(task_reward))
         return tensordict_reset
 
@@ -60,7 +60,7 @@ class StyleRewardTransform(Transform):
         return self._beside_task_reward(observation_spec)
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        """Lifts bounds of the task reward, and adds the style reward if the task reward is declared as a reward."""
+        """Remove the bounds of the reward, and add the style reward if the task reward is declared as a reward."""
         spec = reward_spec["reward"]
         reward_spec["reward"] = Unbounded(shape=spec.shape, dtype=spec.dtype, device=spec.device)
         return self._beside_task_reward(reward_spec)

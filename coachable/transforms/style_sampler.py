@@ -1,4 +1,4 @@
-"""`StyleSampler` draws a style at every reset and carries it along; `CoachableEnv` seeds it with the environment."""
+"""`StyleSampler`, which draws a style at every reset, and `CoachableEnv`, an environment with styles."""
 
 import secrets
 import zlib
@@ -20,36 +20,31 @@ _MASK = (1 << 64) - 1
 
 
 def derive_seed(seed: int, salt: str) -> int:
-    """Mixes a seed with a name, so that streams seeded with one number are independent (splitmix64 finaliser)."""
+    """Combine a seed with a name, so that streams with the same seed are independent (splitmix64 finaliser)."""
     z = (int(seed) * 0x9E3779B97F4A7C15 + zlib.crc32(salt.encode())) & _MASK
     z = ((z ^ (z >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
     z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) & _MASK
-    return (z ^ (z >> 31)) >> 1  # torch wants it below 2^63
+    return (z ^ (z >> 31)) >> 1  # torch needs a seed below 2^63
 
 
 class StyleSampler(Transform):
     """Environment transform that draws theta at reset and copies it from step to step.
 
-    The style lives in the tensordict, nowhere else: writing another `style` before a step changes it from that step on,
-    and a partial reset changes it exactly where an episode ended. At reset, in this order: a style given by the caller
-    (`env.reset(TensorDict({"style": theta}, [N]))`), a held style (`hold`), a draw.
+    The style is stored only in the tensordict. If you write another `style` before a step, it is used from that step
+    on. A partial reset changes it only in the environments that are reset. The style after a reset is the caller's
+    (`env.reset(TensorDict({"style": theta}, [N]))`), or otherwise the one set by `hold`, or otherwise a new draw.
 
     Args:
-        space: What theta means; gives the spec its bounds.
-        sampler: Distribution to draw from; the space's own if None.
-        seed: Seed of this transform's generator; taken from the operating system if None, so that workers differ. With
-            `CoachableEnv`, `env.set_seed` reaches it.
+        space: Style space.
+        sampler: Distribution to draw from; None for the space's own.
+        seed: Seed of this transform's generator; None for one from the operating system, so that workers differ.
+            `CoachableEnv.set_seed` also sets it.
 
     Raises:
         ValueError: If the sampler's dimension is not the space's.
     """
 
-    def __init__(
-        self,
-        space: StyleSpace,
-        sampler: Sampler | None = None,
-        seed: int | None = None,
-    ) -> None:
+    def __init__(self, space: StyleSpace, sampler: Sampler | None = None, seed: int | None = None) -> None:
         super().__init__(in_keys=[], out_keys=[STYLE])
         self.space = space
         self.sampler = space.sampler if sampler is None else sampler
@@ -63,20 +58,20 @@ class StyleSampler(Transform):
         self.set_seed(seed)
 
     def set_seed(self, seed: int | None = None) -> None:
-        """Restarts the random stream; from the operating system's entropy if None."""
+        """Set the seed of the generator; None for one from the operating system."""
         self._seeded = seed is not None
-        # Salted: an environment seeded with the same number would otherwise draw start states that match the styles.
+        # Otherwise the styles would correlate with the start states of an environment that has the same seed.
         self.generator.manual_seed(secrets.randbits(63) if seed is None else derive_seed(seed, f"style:{STYLE}"))
 
     def hold(self, theta: Tensor, strict: bool = False) -> None:
-        """Uses this style at every reset, automatic ones included, until `release`. Running episodes keep theirs.
+        """Use a style at every reset, including automatic ones, until `release`; running episodes keep theirs.
 
         Args:
-            theta: `(dim,)` for all environments, or `(*batch, dim)`, one each.
-            strict: Raise instead of clamping to the trained range with a warning.
+            theta: Style `(dim,)` for all environments, or one for each `(*batch, dim)`.
+            strict: Whether to raise instead of clamping to the trained range with a warning.
 
         Raises:
-            ValueError: If the shape is wrong, a value is NaN, or `strict` and out of range.
+            ValueError: If the shape is wrong, a value is NaN, or theta is out of range with `strict`.
         """
         self._held = self.space.clamp(theta.detach(), strict=strict)
 
@@ -85,7 +80,7 @@ class StyleSampler(Transform):
         self._held = None
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        # Styles for all rows: TorchRL keeps only those that are being reset.
+        # Styles for all rows, of which TorchRL keeps only those that are reset.
         given = tensordict.get(STYLE, None)
         shape, device = tensordict_reset.batch_size, tensordict_reset.device
         if given is not None:
@@ -97,7 +92,7 @@ class StyleSampler(Transform):
         return tensordict_reset.set(STYLE, style)
 
     def _checked(self, given: Tensor) -> Tensor:
-        """A copy of the caller's style, which may lie outside the trained range: such tests are legitimate."""
+        """Return a copy of the caller's style, which may lie outside the trained range."""
         if given.shape[-1] != self.space.dim or bool(given.isnan().any()):
             raise ValueError(
                 f"reset got the style {given.tolist()}: expected (..., {self.space.dim}) numbers, none of them NaN, "
@@ -106,7 +101,7 @@ class StyleSampler(Transform):
         return given.to(torch.float32, copy=True)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        # A copy: writing into the next style in place must not rewrite the style of the transition before it.
+        # A copy, so that changing the next style in place does not change this transition's.
         return next_tensordict.set(STYLE, tensordict.get(STYLE).clone())
 
     def _reset_on_native_autoreset(
@@ -118,7 +113,7 @@ class StyleSampler(Transform):
         )
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add the style, bounded by the space's ranges."""
+        """Add the style, with the space's bounds."""
         shape = torch.Size((*observation_spec.shape, self.space.dim))
         device = observation_spec.device
         low, high = self.space.low.to(device).expand(shape), self.space.high.to(device).expand(shape)
@@ -126,11 +121,11 @@ class StyleSampler(Transform):
         return observation_spec
 
     def transform_state_spec(self, state_spec: Composite) -> Composite:
-        """Add the style here too: otherwise a style given at reset would be ignored."""
+        """Add the style, because otherwise a style given at reset would be ignored."""
         return self.transform_observation_spec(state_spec)
 
     def get_extra_state(self) -> Tensor:
-        """State of the generator, for `state_dict`."""
+        """Return the state of the generator, for `state_dict`."""
         return self.generator.get_state()
 
     def set_extra_state(self, state: Tensor) -> None:
@@ -149,17 +144,17 @@ class StyleSampler(Transform):
         self.generator = torch.Generator()
         if self._seeded:
             self.generator.set_state(generator_state)
-        else:  # copies sent to workers must not draw the same styles
+        else:  # copies in workers must not draw the same styles
             self.set_seed(None)
 
 
 class CoachableEnv(TransformedEnv):
-    """`TransformedEnv` whose `set_seed` reaches every transform that has a `set_seed` (TorchRL's does not)."""
+    """`TransformedEnv` whose `set_seed` also seeds its transforms, which TorchRL's does not."""
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
-        """Seeds the environment and its transforms; returns the seed for the next environment.
+        """Seed the environment and its transforms, and return the seed for the next environment.
 
-        The first episode starts in `reset`, which a collector calls on construction: seed the environment before.
+        Seed an environment before you give it to a collector, whose constructor resets it.
         """
         following = super().set_seed(seed, static_seed=static_seed)
         for module in self.transform.modules():
@@ -168,7 +163,7 @@ class CoachableEnv(TransformedEnv):
         return following
 
     def hold_style(self, theta: Tensor, strict: bool = False) -> None:
-        """Uses this style at every reset until `release_style`; see `StyleSampler.hold`."""
+        """Use a style at every reset until `release_style`; see `StyleSampler.hold`."""
         for sampler in self._samplers():
             sampler.hold(theta, strict)
 
@@ -193,16 +188,16 @@ def coachable_env(
     seed: int | None = None,
     **kwargs: Any,
 ) -> CoachableEnv:
-    """Add styles to a domain: `StyleSampler`, then `StyleRewardTransform`, then any further transforms.
+    """Add `StyleSampler`, `StyleRewardTransform` and any further transforms to an environment, in this order.
 
     Args:
-        base_env: Emits `task_reward` and `style_features`, and never sees theta.
-        space: What can be coached.
-        style_reward: What it is rewarded with.
+        base_env: Environment that emits `task_reward` and `style_features` and does not use theta.
+        space: Style space.
+        style_reward: Style reward.
         *transforms: Further transforms, such as `StepCounter` or `RewardSum`.
-        sampler: Distribution of styles; the space's own if None.
-        seed: Seeds the environment and its transforms, if given.
-        **kwargs: For `TransformedEnv`.
+        sampler: Distribution of styles; None for the space's own.
+        seed: Seed of the environment and its transforms; None does not seed them.
+        **kwargs: Further arguments of `TransformedEnv`.
 
     Returns:
         The environment, ready for a collector.

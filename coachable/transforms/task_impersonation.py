@@ -1,4 +1,4 @@
-"""`TaskImpersonation`: sampled transitions under further styles (paper, Task Impersonation)."""
+"""`TaskImpersonation`, which relabels sampled transitions with further styles (paper, Task Impersonation)."""
 
 from typing import Any
 
@@ -15,27 +15,26 @@ from coachable.styles.space import StyleSpace
 
 
 class TaskImpersonation(Transform):
-    """Replay transform `[B]` to `[B, n+1]`: every transition with its own style and n freshly drawn ones.
+    """Replay transform from `[B]` to `[B, n+1]` that adds n newly drawn styles to every transition.
 
-    Column 0 keeps the stored label and reward. Columns 1 to n get a style each, drawn independently for every
-    transition from the training distribution, and `reward = task_reward + style_reward(style_features, style)` by the
-    StyleReward that the environment uses. `style` and `("next", "style")` are both written, and `style_reward` if the
-    data has it. Nothing is filtered, weighted or written back (paper). Everything else is expanded without a copy, so
-    do not write to it in place. With n = 0 the sample passes through untouched, and no random number is drawn.
+    Column 0 keeps the stored style and reward. Each of the columns 1 to n gets a style that is drawn independently for
+    every transition from the training distribution, and `reward = task_reward + style_reward(style_features, style)`.
+    `style` and `("next", "style")` are both written, and `style_reward` if the data has it. Nothing is filtered,
+    weighted or written back (paper). Other entries are expanded without a copy, so do not write to them in place. With
+    n = 0 the sample is returned unchanged, and no random number is drawn.
 
-    TorchRL expands what a sample carries besides, `index`, `table` and `priority_weight`, over the columns, and a
-    priority update takes the largest over a transition's columns (`EventTableBuffer`, or the default reduction of
-    TorchRL's own buffers).
+    TorchRL expands `index`, `table` and `priority_weight` of a sample over the columns. A priority update uses the
+    largest priority of a transition's columns (`EventTableBuffer`, or the default reduction of TorchRL's buffers).
 
-    Of n-step transitions only style rewards that are linear in the features can be relabelled, and samples of several
-    steps are refused with any other: let the buffer sum the features too (`discounted_keys` of `EventTableBuffer`).
+    Transitions of several steps can be relabelled only if the style reward is linear in the features; others raise. The
+    buffer must then sum the features as well (`discounted_keys` of `EventTableBuffer`).
 
     Args:
-        style_reward: The only code that computes style rewards, the environment's own object.
-        space: Source of styles; the one of `style_reward` if None.
-        n: Further styles per transition (paper: 4).
-        sampler: Distribution of styles if not the one the space trains with.
-        seed: Of the transform's own generator, whose state is in the state dict.
+        style_reward: The environment's style reward.
+        space: Style space; None for that of `style_reward`.
+        n: Number of further styles per transition (paper: 4).
+        sampler: Distribution of styles; None for the space's own.
+        seed: Seed of the transform's own generator, whose state is in the state dict.
 
     Raises:
         ValueError: If n is negative, or the sampler draws styles of another size.
@@ -74,21 +73,21 @@ class TaskImpersonation(Transform):
         self.generator = torch.Generator().manual_seed(seed)
 
     def set_seed(self, seed: int) -> None:
-        """Restarts the transform's generator."""
+        """Set the seed of the generator."""
         self.generator.manual_seed(seed)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Relabels a sample.
+        """Relabel a sample.
 
         Args:
-            tensordict: `[...]`, transitions with the style, features and task reward.
+            tensordict: Transitions `[...]` with style, features and task reward.
 
         Returns:
-            `[..., n+1]`, a new tensordict; the input itself for n = 0.
+            A new tensordict `[..., n+1]`, or the input itself for n = 0.
 
         Raises:
             KeyError: If an entry is missing.
-            ValueError: If the stored style has another size than the space, or transitions sum several steps while the
+            ValueError: If the stored style has another size than the space, or transitions sum several steps and the
                 style reward is not linear in the features.
         """
         if not self.n:
@@ -122,18 +121,17 @@ class TaskImpersonation(Transform):
         steps = tensordict.get("steps_to_next_obs", None)
         if steps is None or steps.max() <= 1:
             return
-        if self.style_reward.is_linear and ("next", "original_reward") in tensordict.keys(True):
+        sums = f"TaskImpersonation got sums over up to {int(steps.max())} steps"
+        if not self.style_reward.is_linear:
             raise ValueError(
-                f"TaskImpersonation got sums over up to {int(steps.max())} steps from TorchRL's MultiStep, which sums "
-                "no style features: let EventTableBuffer sum rewards and features (n_steps, discounted_keys)"
+                f"{sums}: the style reward is not linear in its features, so that another style's reward does not "
+                "follow from their sum. Store single steps (n_steps=1), or give TaskImpersonation n=0."
             )
-        if self.style_reward.is_linear:
-            return
-        raise ValueError(
-            f"TaskImpersonation got sums over up to {int(steps.max())} steps: the style reward is not linear in its "
-            "features, and their sum does not tell what another style would have earned. Store single steps "
-            "(n_steps=1), or give TaskImpersonation n=0."
-        )
+        if ("next", "original_reward") in tensordict.keys(True):
+            raise ValueError(
+                f"{sums} from TorchRL's MultiStep, which sums no style features: let EventTableBuffer sum rewards and "
+                "features (n_steps, discounted_keys)"
+            )
 
     def _entries(self, tensordict: TensorDictBase) -> tuple[Tensor, Any, Tensor, Tensor]:
         wanted = (STYLE, ("next", STYLE_FEATURES), ("next", TASK_REWARD), ("next", "reward"))
@@ -159,13 +157,13 @@ class TaskImpersonation(Transform):
         )
 
     def get_extra_state(self) -> dict[str, Tensor]:
-        """State of the generator, part of the state dict."""
+        """Return the state of the generator, for `state_dict`."""
         return {"generator": self.generator.get_state()}
 
     def set_extra_state(self, state: dict[str, Tensor]) -> None:
-        """Restore the generator."""
+        """Restore the generator from `state_dict`."""
         self.generator.set_state(state["generator"].cpu().clone())
 
     def extra_repr(self) -> str:
-        """Number of styles per transition."""
+        """Return the number of styles per transition, for `repr`."""
         return f"n={self.n}"
