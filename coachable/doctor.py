@@ -55,12 +55,11 @@ def python_version() -> tuple[int, int]:
 def _python() -> Check:
     found = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
     first, last = (".".join(map(str, version)) for version in PYTHON)
-    if python_version() < PYTHON[0]:
-        return Check("python", "problem", f"{found}: expected Python {first} or {last}")
-    if python_version() > PYTHON[1]:
-        reason = "labmaze, which dm-control needs, has no files for it"
-        return Check("python", "problem", f"{found}: expected Python {first} or {last}, because {reason}")
-    return Check("python", "ok", found)
+    if PYTHON[0] <= python_version() <= PYTHON[1]:
+        return Check("python", "ok", found)
+    newer = python_version() > PYTHON[1]
+    reason = ", because labmaze, which dm-control needs, has no files for it" if newer else ""
+    return Check("python", "problem", f"{found}: expected Python {first} or {last}{reason}")
 
 
 def _versions() -> list[Check]:

@@ -99,7 +99,7 @@ def cheetah_events() -> PredicateEvents:
 
 
 def build(config: dict[str, Any]) -> Trainer:
-    """Compose the training, one box after the other."""
+    """Make the training from its parts, see recipe_boxes.py."""
     run = boxes.start_run(config)
     cfg = run.settings
 

@@ -25,7 +25,7 @@ from coachable.transforms import CoachableEnv, StyleRewardTransform, StyleSample
 
 
 def build(config: dict[str, Any]) -> Trainer:
-    """Compose the training, one box after the other."""
+    """Make the training from its parts, see recipe_boxes.py."""
     run = boxes.start_run(config)
     cfg = run.settings
 

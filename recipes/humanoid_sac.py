@@ -1,6 +1,6 @@
 """Train the DMC humanoid to walk with a requested arm pose and step length (SAC).
 
-python recipes/humanoid_sac.py                            cpu or gpu, whatever this machine has
+python recipes/humanoid_sac.py                            on a CPU or a GPU
 python recipes/humanoid_sac.py preset=smoke               every part once, within a minute
 python recipes/humanoid_sac.py preset=paper               the paper's settings
 python recipes/humanoid_sac.py loss=qr_sac                another loss; see --help for all groups
@@ -25,7 +25,7 @@ from coachable.transforms import CoachableEnv, MirrorSymmetry, StyleRewardTransf
 
 
 def build(config: dict[str, Any]) -> Trainer:
-    """Compose the training, one box after the other."""
+    """Make the training from its parts, see recipe_boxes.py."""
     run = boxes.start_run(config)
     cfg = run.settings
 

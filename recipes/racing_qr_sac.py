@@ -1,6 +1,6 @@
 """Train a racing driver whose style is chosen at run time (QR-SAC).
 
-python recipes/racing_qr_sac.py                                tyre and fuel saving, cpu or gpu
+python recipes/racing_qr_sac.py                                tyre and fuel saving, on a CPU or a GPU
 python recipes/racing_qr_sac.py preset=resources               the same, then overtaking and defending in traffic
 python recipes/racing_qr_sac.py preset=drift                   drifting on request
 python recipes/racing_qr_sac.py preset=aggressiveness          margins to two agents and two rivals, in four stages
@@ -25,7 +25,7 @@ from coachable.transforms import CoachableEnv, StyleRewardTransform, StyleSample
 
 
 def build(config: dict[str, Any]) -> Trainer:
-    """Compose the training, one box after the other."""
+    """Make the training from its parts, see recipe_boxes.py."""
     run = boxes.start_run(config)
     cfg = run.settings
 

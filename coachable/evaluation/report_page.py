@@ -141,5 +141,4 @@ def _shade(value: Estimate, bounds: tuple[float, float]) -> str:
     low, high = bounds
     if math.isnan(value.value) or high <= low:
         return ""
-    share = (value.value - low) / (high - low)
-    return f' style="background: rgba(29, 95, 168, {0.30 * share:.3f})"'
+    return f' style="background: rgba(29, 95, 168, {0.30 * ((value.value - low) / (high - low)):.3f})"'

@@ -93,12 +93,11 @@ def default_tour(domain: Domain, space: StyleSpace) -> list[dict[str, Any]]:
         return domain.cells()
     choices = [p for p in space.parameters if isinstance(p, Choice)]
     others = [p for p in space.parameters if not isinstance(p, Choice)]
-    tour = []
-    for options in itertools.product(*(p.options for p in choices)):
-        for level in (0.0, 0.5, 1.0):
-            values = {p.name: p.low + level * (p.high - p.low) for p in others}
-            tour.append({p.name: option for p, option in zip(choices, options, strict=True)} | values)
-    return tour
+    levels = [{p.name: p.low + level * (p.high - p.low) for p in others} for level in (0.0, 0.5, 1.0)]
+    options = itertools.product(*(p.options for p in choices))
+    return [
+        dict(zip((p.name for p in choices), chosen, strict=True)) | values for chosen in options for values in levels
+    ]
 
 
 def write_video(frames: Iterable[np.ndarray], out: Path, fps: int) -> None:

@@ -50,12 +50,7 @@ class GymnasiumEnv(EnvBase):
     """
 
     def __init__(
-        self,
-        make: str | Callable[[], gymnasium.Env],
-        features: Features,
-        num_envs: int = 1,
-        *,
-        seed: int | None = None,
+        self, make: str | Callable[[], gymnasium.Env], features: Features, num_envs: int = 1, *, seed: int | None = None
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
@@ -75,23 +70,14 @@ class GymnasiumEnv(EnvBase):
         self._set_seed(seed)
 
     def _make_specs(self) -> None:
-        def rows(width: int) -> torch.Size:
-            return torch.Size((*self.batch_size, width))
-
-        self.action_spec = self.heads.spec(self.batch_size)
-        self.observation_spec = Composite(
-            {
-                "observation": Unbounded(shape=rows(self._observation.shape[1]), dtype=torch.float32),
-                TASK_REWARD: Unbounded(shape=rows(1), dtype=torch.float32),
-                STYLE_FEATURES: Unbounded(shape=rows(self._num_features), dtype=torch.float32),
-            },
-            shape=self.batch_size,
-        )
-        self.reward_spec = Unbounded(shape=rows(1), dtype=torch.float32)
-        self.done_spec = Composite(
-            {name: Binary(n=1, shape=rows(1), dtype=torch.bool) for name in ("done", "terminated", "truncated")},
-            shape=self.batch_size,
-        )
+        shape, column = self.batch_size, torch.Size((*self.batch_size, 1))
+        widths = {"observation": self._observation.shape[1], TASK_REWARD: 1, STYLE_FEATURES: self._num_features}
+        floats = {name: Unbounded(torch.Size((*shape, width)), dtype=torch.float32) for name, width in widths.items()}
+        flags = {name: Binary(1, column, dtype=torch.bool) for name in ("done", "terminated", "truncated")}
+        self.action_spec = self.heads.spec(shape)
+        self.observation_spec = Composite(floats, shape=shape)
+        self.reward_spec = Unbounded(column, dtype=torch.float32)
+        self.done_spec = Composite(flags, shape=shape)
 
     def _set_seed(self, seed: int | None) -> None:
         """Derive the seeds that the environments get at their next reset."""

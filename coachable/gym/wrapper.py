@@ -75,11 +75,9 @@ class StyleWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         if flat:
             inner = spaces.flatten_space(env.observation_space)
             assert isinstance(inner, spaces.Box)
-            self._flat_dtype = np.result_type(inner.dtype, np.float32)
+            dtype = self._flat_dtype = np.result_type(inner.dtype, np.float32)
             low, high = np.append(inner.low, style.low), np.append(inner.high, style.high)
-            self.observation_space = spaces.Box(
-                low.astype(self._flat_dtype), high.astype(self._flat_dtype), dtype=self._flat_dtype.type
-            )
+            self.observation_space = spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype.type)
         else:
             self.observation_space = spaces.Dict({"observation": env.observation_space, STYLE: style})
         self._generator = torch.Generator()

@@ -200,11 +200,10 @@ def _is_upgrade(headers: Headers) -> bool:
 
 
 def _is_address(name: str) -> bool:
-    try:
+    with contextlib.suppress(ValueError):
         ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
+        return True
+    return False
 
 
 def _refused(status: http.HTTPStatus, reason: str) -> Response:

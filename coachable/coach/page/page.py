@@ -102,11 +102,11 @@ class CoachPage:
         self.widgets[name] = ParameterWidget(self.server, parameter, value, lambda: request(self.widgets[name]))
 
     def _set(self, widget: ParameterWidget) -> None:
-        self.loop.submit(lambda session: self._carry_out(session, widget))
+        def change(session: CoachSession) -> None:
+            self.chart.follow(widget.parameter.name)
+            session.set(**widget.take())
 
-    def _carry_out(self, session: CoachSession, widget: ParameterWidget) -> None:
-        self.chart.follow(widget.parameter.name)
-        session.set(**widget.take())
+        self.loop.submit(change)
 
     def _steer(self, widget: ParameterWidget) -> None:
         self.loop.submit(lambda session: session.steer(**widget.take()))  # pyright: ignore[reportArgumentType]

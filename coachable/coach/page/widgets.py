@@ -162,11 +162,8 @@ class Chart:
         """Show the chosen parameter: the value of a number, or the share of time in which a choice was met."""
         self.shown = self._names.get(str(self.choice.value), self.shown)
         now = self._history[-1][0]
-        rows = [
-            (moment - now, self._requested(report), self._measured(report))
-            for moment, report in self._history
-            if moment >= now - _SPAN
-        ]
+        recent = [(moment - now, report) for moment, report in self._history if moment >= now - _SPAN]
+        rows = [(ago, self._requested(report), self._measured(report)) for ago, report in recent]
         measured = [row for row in rows if math.isfinite(row[2])]  # uPlot draws nothing at all if there are NaN
         columns = np.array(measured or rows, dtype=float).T
         self._plot((self.shown, bool(measured)), tuple(columns if measured else columns[:2]))

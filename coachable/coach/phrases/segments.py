@@ -24,13 +24,7 @@ from coachable.coach.phrases.vocabulary import (
     stem,
 )
 
-_FLAGS = {
-    "preferred": PREFERENCES,
-    "default": DEFAULTS,
-    "keep": KEEPS,
-    "repeated": REPEATS,
-    "absolute": ABSOLUTE,
-}
+_FLAGS = {"preferred": PREFERENCES, "default": DEFAULTS, "keep": KEEPS, "repeated": REPEATS, "absolute": ABSOLUTE}
 """Words by the attribute of `Segment` that they set."""
 
 
