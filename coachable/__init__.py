@@ -1,7 +1,7 @@
 """Style-conditioned reinforcement learning on TorchRL: train one agent, coach it while it acts.
 
-Importing the package is cheap: names are resolved on first use, so that `import coachable` loads neither torch nor a
-simulator, a logger or a plotting library.
+Names are imported on first use, so that `import coachable` loads neither torch nor a simulator, a logger or a plotting
+library.
 """
 
 from importlib import import_module
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from coachable.gl import choose_gl_backend
 
-choose_gl_backend()  # MuJoCo, which TorchRL imports, reads the choice once, when it is imported
+choose_gl_backend()  # MuJoCo, which TorchRL imports, reads the variable only when it is imported
 
 if TYPE_CHECKING:
     from coachable.coach.session.session import CoachSession
@@ -19,21 +19,14 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0.dev0"
 
-# Where each public name lives. Resolved lazily by `__getattr__` (PEP 562).
-_MODULE_OF = {
-    "Choice": "coachable.styles",
-    "EventTableBuffer": "coachable.replay",
-    "Setpoint": "coachable.styles",
-    "StyleReward": "coachable.styles",
-    "StyleSpace": "coachable.styles",
-    "Weight": "coachable.styles",
-    "CoachSession": "coachable.coach.session.session",
-    "CoachableEnv": "coachable.transforms",
-    "StyleRewardTransform": "coachable.transforms",
-    "StyleSampler": "coachable.transforms",
-    "TaskImpersonation": "coachable.transforms",
-    "coachable_env": "coachable.transforms",
+# Public names by module, which `__getattr__` imports lazily (PEP 562).
+_NAMES = {
+    "coachable.styles": "Choice Setpoint StyleReward StyleSpace Weight",
+    "coachable.replay": "EventTableBuffer",
+    "coachable.coach.session.session": "CoachSession",
+    "coachable.transforms": "CoachableEnv StyleRewardTransform StyleSampler TaskImpersonation coachable_env",
 }
+_MODULE_OF = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 __all__ = [
     "Choice",

@@ -1,4 +1,4 @@
-"""The `coachable` command. Each sub-command imports what it needs only when it runs."""
+"""The `coachable` command; each sub-command imports its modules only when it runs."""
 
 import argparse
 import glob
@@ -7,6 +7,7 @@ import runpy
 import sys
 import zipfile
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +25,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Args:
-        arguments: without the program's name; `sys.argv` by default.
+        arguments: Arguments without the program's name; `sys.argv` by default.
 
     Returns:
-        The exit status: 0, 1 where a check failed, 2 for something that the user has to change, 130 after Ctrl-C.
+        The exit status: 0 for success, 1 if a check failed, 2 for an error that you can fix, 130 after Ctrl-C.
     """
     options = _parser().parse_args(arguments)
     run: Callable[[argparse.Namespace], int] = options.run
@@ -36,15 +37,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f"coachable {options.command}: interrupted, nothing was written", file=sys.stderr)
         return 130
-    except (ValueError, ImportError, OSError, RenderingError) as error:
-        print(f"coachable {options.command}: {_sentence(error)}", file=sys.stderr)
-        return 2
-    except RuntimeError as error:
-        from coachable.training.checkpoint import CheckpointError
+    except (ValueError, ImportError, OSError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and not isinstance(error, RenderingError):
+            from coachable.files import CheckpointError
 
-        if not isinstance(error, CheckpointError):
-            raise
-        print(f"coachable {options.command}: {error}", file=sys.stderr)
+            if not isinstance(error, CheckpointError):
+                raise
+        print(f"coachable {options.command}: {_sentence(error)}", file=sys.stderr)
         return 2
 
 
@@ -59,53 +58,47 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"coachable {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def command(name: str, run: Callable[[argparse.Namespace], int], text: str) -> argparse.ArgumentParser:
+    def command(
+        name: str, run: Callable[[argparse.Namespace], int], text: str, source: str = ""
+    ) -> argparse.ArgumentParser:
         parser = commands.add_parser(name, help=text)
         parser.set_defaults(run=run)
+        if source:
+            parser.add_argument("source", help=source)
         return parser
 
     train = command("train", _train, "train an agent with a recipe, as python recipes/RECIPE.py does")
     train.add_argument("recipe", choices=sorted(_recipes()), help="one of %(choices)s")
-    train.add_argument("arguments", nargs=argparse.REMAINDER, help="KEY=VALUE ..., or --help for what there is")
+    train.add_argument("arguments", nargs=argparse.REMAINDER, help="KEY=VALUE ..., or --help for all of them")
 
-    evaluate = command("evaluate", _evaluate, "measure every style of an agent: tables and a figure")
-    evaluate.add_argument("source", help=_SOURCE_HELP)
+    evaluate = command("evaluate", _measure, "measure every style of an agent: tables and a figure", _SOURCE_HELP)
     _add_out(evaluate, "evaluation", "folder")
     _add_number(evaluate, "--episodes", 20, "per style")
     _add_number(evaluate, "--switch-episodes", 60, "with switching styles")
     _add_rollout(evaluate)
 
-    render = command("render", _render, "film an agent whose style is switched while it acts")
-    render.add_argument("source", help=_SOURCE_HELP)
+    render = command("render", _render, "film an agent whose style is switched while it acts", _SOURCE_HELP)
     _add_out(render, "coachable.mp4", ".mp4, .gif or .png")
-    render.add_argument(
-        "--style",
-        action="append",
-        type=_style,
-        dest="styles",
-        metavar="NAME=VALUE,...",
-        help="one request, NAME=VALUE,NAME=VALUE; repeat it to switch (default: a tour of the styles)",
-    )
-    render.add_argument(
-        "--seconds", type=_seconds, default=4.0, dest="seconds_per_style", help="per style (%(default)s)"
-    )
+    text = "one request, NAME=VALUE,NAME=VALUE; repeat it to switch (default: a tour of the styles)"
+    render.add_argument("--style", action="append", type=_style, dest="styles", metavar="NAME=VALUE,...", help=text)
+    text = "per style (%(default)s)"
+    render.add_argument("--seconds", type=_seconds, default=4.0, dest="seconds_per_style", help=text)
     render.add_argument("--size", type=_size, default=(640, 480), metavar="WIDTHxHEIGHT")
     render.add_argument("--seed", type=_at_least(0), default=0)
 
     curves = command("curves", _curves, "draw learning curves of runs, with intervals over seeds")
-    curves.add_argument(
-        "groups", nargs="+", type=_group, metavar="LABEL=PATTERN", help="runs by label, such as bf16='runs/bf16_*'"
-    )
+    text = "runs by label, such as bf16='runs/bf16_*'"
+    curves.add_argument("groups", nargs="+", type=_group, metavar="LABEL=PATTERN", help=text)
     curves.add_argument("--x", default="updates", help="metric of the horizontal axis (default: %(default)s)")
     curves.add_argument("--y", default="episode/return", help="metric to draw (default: %(default)s)")
     _add_number(curves, "--smooth", 5, "rows of the moving average")
     _add_out(curves, "curves.png")
 
-    weights = command("weights", _weights, "write the small weights file of a checkpoint")
-    weights.add_argument("source", help="a run's folder or a checkpoint")
+    source = "a run's folder or a checkpoint"
+    weights = command("weights", _weights, "write the small weights file of a checkpoint", source)
     weights.add_argument("out", type=Path, help="the file, such as weights.pt")
 
-    report = command("report", _report, "everything that can be measured of an agent, on one page")
+    report = command("report", _report, "write all measurements of an agent on one page")
     report.add_argument("sources", nargs="+", metavar="source", help=f"{_SOURCE_HELP}; several: one per training seed")
     _add_out(report, "report", "folder")
     _add_number(report, "--seeds", 5, "runs of a single agent")
@@ -114,22 +107,20 @@ def _parser() -> argparse.ArgumentParser:
     _add_number(report, "--sweep-points", 5, "values of each weight", lowest=2)
     _add_rollout(report)
 
-    explain = command("explain", _explain, "rank the inputs that the agent listens to, by SHAP and saliency")
-    explain.add_argument("source", help=_SOURCE_HELP)
+    explain = command("explain", _measure, "rank the inputs of an agent, by SHAP and saliency", _SOURCE_HELP)
     _add_out(explain, "explanation", "folder")
     _add_number(explain, "--episodes", 100, "trajectories", lowest=2)
     _add_number(explain, "--states", 16, "of each trajectory")
     _add_rollout(explain)
 
-    export = command("export", _export, "write the policy as one ONNX file, to run it without torch")
-    export.add_argument("source", help=_SOURCE_HELP)
+    export = command("export", _export, "write the policy as one ONNX file, to run it without torch", _SOURCE_HELP)
     _add_out(export, "policy.onnx")
 
     from coachable.coach.page.command import add_parser
 
     add_parser(commands, _SOURCE_HELP, _coach)
 
-    command("doctor", _doctor, "check this installation and say what it can do")
+    command("doctor", _doctor, "check this installation")
     return parser
 
 
@@ -142,16 +133,15 @@ def _add_number(parser: argparse.ArgumentParser, flag: str, default: int, what: 
 
 
 def _add_rollout(parser: argparse.ArgumentParser) -> None:
-    """Add `coachable.evaluation.rollouts.RolloutOptions`."""
+    """Add the arguments of `coachable.evaluation.rollouts.RolloutOptions`."""
     parser.add_argument("--steps", type=_at_least(1), help="length of an episode (default: the domain's)")
     parser.add_argument("--seed", type=_at_least(0), default=0)
-    parser.add_argument(
-        "--threads", type=_at_least(1), dest="num_threads", help="physics threads (default: all free cores)"
-    )
+    text = "physics threads (default: all free cores)"
+    parser.add_argument("--threads", type=_at_least(1), dest="num_threads", help=text)
 
 
 def _recipes() -> dict[str, Path]:
-    """The recipes of this installation: in the package, or beside it in a clone."""
+    """Return the recipes by name, from the installed package or from the folder beside it in a clone."""
     here = Path(__file__).resolve().parent
     folder = here / "recipes" if (here / "recipes").is_dir() else here.parent / "recipes"
     return {file.stem: folder / f"{file.stem}.py" for file in (folder / "configs").glob("*_*.yaml")}
@@ -165,23 +155,13 @@ def _train(options: argparse.Namespace) -> int:
     return 0
 
 
-def _evaluate(options: argparse.Namespace) -> int:
-    from coachable.evaluation.evaluate import evaluate
-
-    return _measure(options, evaluate)
-
-
-def _explain(options: argparse.Namespace) -> int:
-    from coachable.evaluation.explain import explain
-
-    return _measure(options, explain)
-
-
-def _measure(options: argparse.Namespace, function: Callable[..., str]) -> int:
+def _measure(options: argparse.Namespace) -> int:
+    """Run `coachable.evaluation.evaluate.evaluate` or `coachable.evaluation.explain.explain`."""
     from coachable.evaluation.outputs import complete_folder
 
+    function = getattr(import_module(f"coachable.evaluation.{options.command}"), options.command)
     with complete_folder(options.out) as options.out:
-        text = function(options.source, **_arguments(options, without=("source",)))
+        text = function(**_arguments(options))
     print(text)
     return 0
 
@@ -190,7 +170,7 @@ def _render(options: argparse.Namespace) -> int:
     choose_gl_backend()  # before MuJoCo is imported
     from coachable.evaluation.video import render
 
-    print(f"wrote {render(options.source, **_arguments(options, without=('source',)))}")
+    print(f"wrote {render(**_arguments(options))}")
     return 0
 
 
@@ -217,7 +197,7 @@ def _weights(options: argparse.Namespace) -> int:
 def _report(options: argparse.Namespace) -> int:
     from coachable.evaluation.report import report
 
-    print(report(options.sources, **_arguments(options, without=("sources",))))
+    print(report(**_arguments(options)))
     return 0
 
 
@@ -246,15 +226,15 @@ def _doctor(_options: argparse.Namespace) -> int:
     return 1 if any(check.verdict == "problem" for check in checks) else 0
 
 
-def _arguments(options: argparse.Namespace, without: Sequence[str] = ()) -> dict[str, Any]:
-    return {name: value for name, value in vars(options).items() if name not in ("run", "command", *without)}
+def _arguments(options: argparse.Namespace) -> dict[str, Any]:
+    return {name: value for name, value in vars(options).items() if name not in ("run", "command")}
 
 
 def _require_agent(source: str) -> None:
-    """Refuse what cannot be an agent, without the seconds that it takes to load torch.
+    """Check that a source can be an agent, without importing torch, which takes seconds.
 
     Raises:
-        ValueError: saying which agents there are.
+        ValueError: If it cannot; the message lists the agents that ship with weights.
     """
     shipped = Path(__file__).parent / "pretrained"
     if source and ((shipped / source / "weights.pt").is_file() or Path(source).is_dir()):
@@ -273,7 +253,7 @@ def _at_least(lowest: int) -> Callable[[str], int]:
         except ValueError:
             value = lowest - 1
         if value < lowest:
-            raise argparse.ArgumentTypeError(f"{text!r} is no whole number of at least {lowest}")
+            raise argparse.ArgumentTypeError(f"{text!r}: expected a whole number of at least {lowest}")
         if value > _LARGEST:
             raise argparse.ArgumentTypeError(f"{text} is too large: expected at most {_LARGEST}")
         return value
@@ -287,7 +267,7 @@ def _seconds(text: str) -> float:
     except ValueError:
         value = math.nan
     if not 0.0 < value <= 3600.0:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of seconds above 0 and up to 3600")
+        raise argparse.ArgumentTypeError(f"{text!r}: expected a number of seconds above 0 and up to 3600")
     return value
 
 
@@ -296,7 +276,7 @@ def _style(text: str) -> dict[str, Any]:
     for part in text.split(","):
         name, equals, value = part.partition("=")
         if not equals:
-            raise argparse.ArgumentTypeError(f"{part!r} is no NAME=VALUE")
+            raise argparse.ArgumentTypeError(f"{part!r}: expected NAME=VALUE")
         try:
             style[name.strip()] = float(value)
         except ValueError:
@@ -307,7 +287,7 @@ def _style(text: str) -> dict[str, Any]:
 def _group(text: str) -> tuple[str, list[Path]]:
     label, equals, pattern = text.partition("=")
     if not equals:
-        raise argparse.ArgumentTypeError(f"{text!r} is no LABEL=PATTERN")
+        raise argparse.ArgumentTypeError(f"{text!r}: expected LABEL=PATTERN")
     runs = [Path(run) for run in sorted(glob.glob(pattern)) if (Path(run) / "metrics.csv").is_file()]
     if not runs:
         raise argparse.ArgumentTypeError(f"no run with a metrics.csv matches {pattern!r}")
@@ -318,7 +298,7 @@ def _size(text: str) -> tuple[int, int]:
     try:
         width, height = map(int, text.lower().split("x"))
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no WIDTHxHEIGHT, such as 640x480") from None
+        raise argparse.ArgumentTypeError(f"{text!r}: expected WIDTHxHEIGHT, such as 640x480") from None
     return width, height
 
 

@@ -1,4 +1,4 @@
-"""What a domain gets that declares only an environment, a style space and a style reward."""
+"""Defaults of a `Domain` that declares only an environment, a style space and a style reward."""
 
 from __future__ import annotations
 
@@ -31,29 +31,29 @@ from coachable.styles import (
 __all__ = ["EnvPictures", "RewardMeasures", "simulation_of", "steps_per_episode", "style_grid", "time_per_step"]
 
 _SLACK = 0.05  # of a set-point's range: a measured value this close to the request complies
-_MET = 0.9  # a choice's tolerance from which on it counts as met
+_MET = 0.9  # least tolerance with which a choice counts as met
 _GRID = (5, 3)  # values of a numeric parameter in the grid, of a single one and of several
 _LARGEST_GRID = 36  # cells; beyond it parameters are varied one at a time
 _EPISODE_STEPS = 1000
 
 
 class RewardMeasures:
-    """Measured style by the terms of the style reward.
+    """Measured style from the terms of the style reward.
 
     - `SetpointTolerance`: the feature that it compares with the request, under the set-point's name, and the distance
       from the request as `<name>_error`. Steps in which its gate is 0 have no value.
     - `WeightedFeature`, `WeightedSum`: the feature that the weight scales, under the weight's name.
-    - Any other term: what it pays per step before its scale, as `<term>_reward`.
+    - Any other term: its reward per step before scaling, as `<term>_reward`.
 
-    The agent complies in steps in which every such set-point is within 5 % of its range of the request and every
-    `ChoiceTolerance` pays at least 0.9. A reward without either gives nothing to judge.
+    The agent complies in a step if every such set-point differs from the request by at most 5 % of its range and every
+    `ChoiceTolerance` is at least 0.9. If the reward has neither term, no step can be judged.
 
     Args:
-        reward: of the domain.
+        reward: The domain's style reward.
     """
 
     needs = "a set-point or choice that the style reward compares with a feature"
-    """What it takes to tell whether the agent complies."""
+    """What is needed to judge whether the agent complies."""
 
     def __init__(self, reward: StyleReward) -> None:
         self._reward = reward
@@ -80,7 +80,7 @@ class RewardMeasures:
         return found
 
     def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
-        """See `StyleMeasures.summarise`: means over the steps that count."""
+        """Compute means over the steps that count; see `StyleMeasures.summarise`."""
         return {name: torch.where(alive, values, torch.nan).nanmean(0) for name, values in record.items()}
 
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
@@ -91,12 +91,12 @@ class RewardMeasures:
         return torch.stack([*kept, self.judged(record)]).all(0)
 
     def judged(self, record: Mapping[str, Tensor]) -> Tensor:
-        """(T, N) bool: every value that is compared with a request exists."""
+        """Return the steps (T, N) bool in which every value that is compared with a request exists."""
         values = [~record[name].isnan() for name, _, _ in self._limits()]
         return torch.stack(values).all(0) if values else torch.zeros_like(next(iter(record.values())), dtype=torch.bool)
 
     def _limits(self) -> list[tuple[str, float, bool]]:
-        """Name of a measure, its limit, and whether that is the largest value that complies or else the smallest."""
+        """Return names of measures, their limits, and whether the limit is the largest complying value or the least."""
         limits: list[tuple[str, float, bool]] = []
         for name, term in self._reward.terms.items():
             if isinstance(term, SetpointTolerance):
@@ -109,11 +109,11 @@ class RewardMeasures:
 
 
 class EnvPictures:
-    """Pictures that the environment draws itself: `render()` of Gymnasium, or the camera of a dm_control task.
+    """Renderer that uses the environment's own pictures: `render()` of Gymnasium, or the camera of a dm_control task.
 
     Args:
-        width: of a picture [px].
-        height: of a picture [px].
+        width: Width of a picture [px].
+        height: Height of a picture [px].
     """
 
     def __init__(self, width: int = 640, height: int = 480) -> None:
@@ -122,10 +122,14 @@ class EnvPictures:
         self._mujoco: OffscreenMujoco | None = None
 
     def draw(self, env: EnvBase, row: int = 0) -> np.ndarray:
-        """Return a picture (height, width, 3) uint8 of one row.
+        """Draw a picture (height, width, 3) uint8 of one row of a batch.
+
+        Args:
+            env: Environment of any batch size.
+            row: Row of the batch.
 
         Raises:
-            RenderingError: if the environment draws no pictures; says what to declare instead.
+            RenderingError: If the environment draws no pictures; the message says what to declare instead.
         """
         simulation, _ = simulation_of(env, row)
         if hasattr(simulation, "physics"):  # dm_control
@@ -138,14 +142,14 @@ class EnvPictures:
             )
         try:
             picture = simulation.render()
-        except Exception as error:  # whatever the environment needs for it
+        except Exception as error:  # environments of other libraries may raise anything
             raise RenderingError(f"{name} draws no pictures: {error}") from error
         return self._fitted(picture)
 
     def _draw_mujoco(self, model: Any, data: Any) -> np.ndarray:
-        if self._mujoco is None or self._model is not model:  # an environment may make another one for each episode
+        if self._mujoco is None or self._model is not model:  # an environment may make a new model for each episode
             self.close()
-            buffer = model.vis.global_  # the largest picture that MuJoCo draws
+            buffer = model.vis.global_  # limits the size of pictures
             width, height = min(self.size[0], buffer.offwidth), min(self.size[1], buffer.offheight)
             self._model, self._mujoco = model, OffscreenMujoco(model, width, height)
         return self._fitted(self._mujoco.draw(data))
@@ -154,21 +158,21 @@ class EnvPictures:
         return np.asarray(Image.fromarray(np.asarray(picture, dtype=np.uint8)).resize(self.size))
 
     def close(self) -> None:
-        """Release the OpenGL context, where MuJoCo draws."""
+        """Release MuJoCo's OpenGL context, if there is one."""
         if self._mujoco is not None:
             self._mujoco.close()
             self._mujoco = None
 
 
 def simulation_of(env: EnvBase, row: int = 0) -> tuple[Any, int]:
-    """Return the simulation of one row, below the transforms and wrappers of TorchRL, and how often it is stepped.
+    """Return the simulation of one row without TorchRL's transforms and wrappers, and how often it is stepped.
 
     Args:
-        env: of any batch size.
-        row: of the batch.
+        env: Environment of any batch size.
+        row: Row of the batch.
 
     Returns:
-        The innermost environment that can be reached in this process, and its steps in one step of `env`.
+        The innermost environment that can be reached in this process, and its number of steps per step of `env`.
     """
     inner: Any = env
     repeats = 1
@@ -188,25 +192,21 @@ def simulation_of(env: EnvBase, row: int = 0) -> tuple[Any, int]:
 
 
 def time_per_step(make_env: Callable[..., EnvBase]) -> float:
-    """Return the duration of one step of an environment [s] as it tells it; 1 where it does not."""
+    """Return the duration of one step of an environment [s], or 1 if its attributes do not contain it."""
     env = make_env(num_envs=1)
     simulation, repeats = simulation_of(env)
-    steps_per_second = (getattr(simulation, "metadata", None) or {}).get("render_fps")
+    steps_per_second = (getattr(simulation, "metadata", None) or {}).get("render_fps") or 1.0
     innermost = getattr(simulation, "unwrapped", simulation)
     if hasattr(simulation, "control_timestep"):  # dm_control
         found = simulation.control_timestep()
-    elif getattr(innermost, "control_step", None):
-        found = innermost.control_step
-    elif getattr(innermost, "dt", None):  # Gymnasium: classic control and MuJoCo
-        found = innermost.dt
-    else:
-        found = 1.0 / steps_per_second if steps_per_second else 1.0
+    else:  # `dt` is Gymnasium's, of classic control and MuJoCo
+        found = getattr(innermost, "control_step", None) or getattr(innermost, "dt", None) or 1.0 / steps_per_second
     env.close()
     return float(found) * repeats
 
 
 def steps_per_episode(make_env: Callable[..., EnvBase]) -> int:
-    """Return the length of a full episode as an environment tells it; 1000 steps where it does not."""
+    """Return the length of a full episode of an environment, or 1000 steps if its attributes do not contain it."""
     env = make_env(num_envs=1)
     simulation, repeats = simulation_of(env)
     limits = (
@@ -222,7 +222,11 @@ def steps_per_episode(make_env: Callable[..., EnvBase]) -> int:
 def style_grid(space: StyleSpace) -> list[dict[str, Any]]:
     """Return the styles to evaluate: every option, and a few values over each parameter's evaluation range.
 
-    All combinations where there are at most 36, otherwise one parameter at a time, the others at their defaults.
+    These are all combinations if there are at most 36. Otherwise one parameter is varied at a time, with the others at
+    their defaults.
+
+    Args:
+        space: The style space.
     """
     numeric = [p for p in space.parameters if not isinstance(p, Choice)]
     count = _GRID[0] if len(numeric) == 1 else _GRID[1]
@@ -236,5 +240,5 @@ def style_grid(space: StyleSpace) -> list[dict[str, Any]]:
 
 
 def _spread(low: float, high: float, count: int) -> list[float]:
-    """Evenly spaced values with few digits."""
+    """Return evenly spaced values of at most six digits."""
     return [min(max(float(f"{value:.6g}"), low), high) for value in np.linspace(low, high, count)]

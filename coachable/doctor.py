@@ -1,4 +1,4 @@
-"""`coachable doctor`: whether this installation is sound, and what this machine offers."""
+"""`coachable doctor`: check the installation and the hardware of this machine."""
 
 import os
 import platform
@@ -14,18 +14,18 @@ __all__ = ["Check", "examine"]
 
 Verdict = Literal["ok", "note", "problem"]
 _SHOWN = ("torch", "torchrl", "tensordict", "mujoco", "dm_control", "numpy", "hydra-core", "wandb")
-PYTHON = ((3, 11), (3, 12))  # first and last version that all dependencies have files for
+PYTHON = ((3, 11), (3, 12))  # first and last version for which all dependencies have files
 _REINSTALL = "pip install coachable (in a clone: pip install -e .) in a fresh environment"
 
 
 @dataclass(frozen=True)
 class Check:
-    """One finding.
+    """Result of one check.
 
     Attributes:
-        name: what was looked at.
-        verdict: "ok", "note" (works, but good to know) or "problem" (to be changed).
-        finding: one sentence, with the remedy where one is needed.
+        name: The part that was checked.
+        verdict: The result: "ok", "note" (it works with a restriction) or "problem" (it has to be fixed).
+        finding: One sentence, with the remedy if one is needed.
     """
 
     name: str
@@ -34,17 +34,13 @@ class Check:
 
 
 def examine() -> list[Check]:
-    """Looks at versions, MuJoCo, rendering, precision, threads and extras.
-
-    Returns:
-        The findings; nothing is changed.
-    """
+    """Check versions, MuJoCo, rendering, precision, threads and extras, without changing anything."""
     parts: tuple[Callable[[], list[Check]], ...] = (_versions, _mujoco, _rendering, _hardware, _extras)
     return [check for part in parts for check in part()]
 
 
 def installed(name: str) -> str | None:
-    """Version of an installed distribution, or None."""
+    """Return the version of a distribution, or None if it is not installed."""
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -52,19 +48,18 @@ def installed(name: str) -> str | None:
 
 
 def python_version() -> tuple[int, int]:
-    """Major and minor version of the interpreter."""
+    """Return the major and minor version of the interpreter."""
     return sys.version_info[:2]
 
 
 def _python() -> Check:
     found = f"{platform.python_version()} on {platform.system()} {platform.machine()}"
     first, last = (".".join(map(str, version)) for version in PYTHON)
-    if python_version() < PYTHON[0]:
-        return Check("python", "problem", f"{found}: expected Python {first} or {last}")
-    if python_version() > PYTHON[1]:
-        reason = "labmaze, which dm-control needs, has no files for it"
-        return Check("python", "problem", f"{found}: expected Python {first} or {last}, because {reason}")
-    return Check("python", "ok", found)
+    if PYTHON[0] <= python_version() <= PYTHON[1]:
+        return Check("python", "ok", found)
+    newer = python_version() > PYTHON[1]
+    reason = ", because labmaze, which dm-control needs, has no files for it" if newer else ""
+    return Check("python", "problem", f"{found}: expected Python {first} or {last}{reason}")
 
 
 def _versions() -> list[Check]:
@@ -77,16 +72,10 @@ def _versions() -> list[Check]:
 
 
 def _mujoco() -> list[Check]:
-    """An in-place downgrade from MuJoCo 4 leaves files of mujoco-core 4 in the same folder."""
     mujoco, core = installed("mujoco"), installed("mujoco-core")
-    if mujoco and core and _major(mujoco) < 4:
-        return [
-            Check(
-                "mujoco",
-                "problem",
-                f"mujoco-core {core} lies beside mujoco {mujoco}, in the same folder: make a fresh virtual environment",
-            )
-        ]
+    if mujoco and core and _major(mujoco) < 4:  # a downgrade from MuJoCo 4 in place leaves files of mujoco-core 4
+        finding = f"mujoco-core {core} lies beside mujoco {mujoco}, in the same folder: make a new virtual environment"
+        return [Check("mujoco", "problem", finding)]
     if mujoco and _major(mujoco) >= 4:
         return [Check("mujoco", "problem", f"{mujoco} breaks dm_control: pip install 'mujoco>=3.17,<4' afresh")]
     return []

@@ -1,4 +1,4 @@
-"""What the training, evaluation and coaching code needs to know of a domain, in one declaration."""
+"""`Domain`: the declaration of a domain for training, evaluation and coaching."""
 
 from __future__ import annotations
 
@@ -24,41 +24,41 @@ _GROUP = "coachable.domains"  # entry points: name = "package.module:DOMAIN"
 
 
 class StyleMeasures(Protocol):
-    """Measured style: what the agent did, in the units of what was requested."""
+    """Measured style of an agent, in the units of the request."""
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
-        """Quantities of one env step.
+        """Measure one env step.
 
         Args:
-            transition: output of `env.step`, batch shape (N,), with `style` and `next`.
+            transition: Output of `env.step`, batch shape (N,), with `style` and `next`.
 
         Returns:
-            Name to (N,) tensors.
+            Measured values (N,) by name.
         """
         ...
 
     def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
-        """Quantities of whole episodes, or of any stretch of them.
+        """Summarise whole episodes, or parts of them.
 
         Args:
-            record: name to (T, N), the outputs of `step`.
-            alive: (T, N) bool, steps that count.
+            record: Outputs of `step` (T, N), by name.
+            alive: Steps that count (T, N) bool.
 
         Returns:
-            Name to (N,); NaN where an episode gives no value.
+            Summarised values (N,) by name; NaN where an episode has no value.
         """
         ...
 
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
-        """(T, N) bool: in this step the agent did what its style asks for."""
+        """Return the steps (T, N) bool in which the agent complied with its style."""
         ...
 
 
 class Renderer(Protocol):
-    """Draws one env of a batch."""
+    """Renderer of one env of a batch."""
 
     def draw(self, env: EnvBase, row: int = 0) -> np.ndarray:
-        """(height, width, 3) uint8."""
+        """Draw a picture (height, width, 3) uint8 of one row of the batch."""
         ...
 
     def close(self) -> None:
@@ -68,12 +68,12 @@ class Renderer(Protocol):
 
 @dataclass(frozen=True)
 class Control:
-    """Something that is steered while the agent acts and is no style: the policy sees it in its observation.
+    """Live control: a value that is steered while the agent acts and that the policy reads in its observation.
 
     Attributes:
-        parameter: name, range, unit and neutral value.
-        apply: writes a value into the base environment.
-        circular: values beyond one end go on at the other, such as angles.
+        parameter: Name, range, unit and neutral value.
+        apply: Function that writes a value into the base environment.
+        circular: Whether values wrap around at the ends of the range, as angles do.
     """
 
     parameter: Setpoint
@@ -81,10 +81,10 @@ class Control:
     circular: bool = False
 
     def fit(self, value: float) -> float:
-        """Return the value brought into the control's range.
+        """Wrap a value around or clamp it to the control's range.
 
         Raises:
-            ValueError: if it is no finite number.
+            ValueError: If the value is not finite.
         """
         low, high = self.parameter.low, self.parameter.high
         if not math.isfinite(value):
@@ -96,13 +96,13 @@ class Control:
 
 @dataclass(frozen=True)
 class Words:
-    """How people speak of a domain, beyond the names and help texts of its styles.
+    """Words for a domain, in addition to the names and help texts of its styles.
 
     Attributes:
-        vocabulary: phrases by meaning; see `coachable.coach.phrases.grammar.StyleGrammar`.
-        presets: named styles.
-        examples: phrases that the phrase box suggests.
-        terminated: what a terminated episode means, in the past tense: "the agent fell".
+        vocabulary: Phrases by meaning; see `coachable.coach.phrases.grammar.StyleGrammar`.
+        presets: Named styles.
+        examples: Phrases that the phrase box suggests.
+        terminated: Verb for a terminated episode in the past tense, such as "fell" in "the agent fell".
     """
 
     vocabulary: Mapping[str, Sequence[str]] = field(default_factory=dict)
@@ -112,7 +112,7 @@ class Words:
 
 
 class _WorkedOut:
-    """Default of a field of `Domain` that is worked out from other fields when it is first read."""
+    """Default of a field of `Domain` that is computed from other fields when it is first read."""
 
     def __init__(self, work_out: Callable[[Domain], Any]) -> None:
         self._work_out = work_out
@@ -122,7 +122,7 @@ class _WorkedOut:
 
     def __get__(self, domain: Domain | None, owner: type) -> Any:
         if domain is None:
-            return self  # the dataclass takes it for the field's default
+            return self  # the dataclass uses it as the field's default
         if vars(domain)[self._name] is self:
             vars(domain)[self._name] = self._work_out(domain)
         return vars(domain)[self._name]
@@ -139,32 +139,31 @@ _EPISODE_STEPS: Any = _WorkedOut(lambda domain: steps_per_episode(domain.make_en
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Domain:
-    """One domain: an environment, what can be coached in it, and how that is rewarded. All else has a default.
+    """Declaration of a domain: its environment, styles and style reward; all other fields have defaults.
 
     Attributes:
-        name: as the user types it.
+        name: Name on the command line.
         make_env: `(num_envs, ...) -> EnvBase`, without style transforms; it may also take `seed` and `num_threads`.
-        make_space: `() -> StyleSpace`, the styles that its agents are trained on.
+        make_space: `() -> StyleSpace`, the styles on which its agents are trained.
         make_reward: `(space) -> StyleReward`; a recipe may pass further settings.
-        measures: measured style; default `RewardMeasures`: what the terms of the reward read and pay.
-        make_renderer: `(width, height) -> Renderer`; default `EnvPictures`: what the environment draws itself.
-        make_scene: `(server, session) -> coachable.coach.page.views.View`, which draws the live page in 3-D; None
-            shows the renderer's pictures.
-        grid: values of each style parameter, whose combinations make up the evaluation grid; or its styles one by one,
-            by parameter name. Default: a few values over each parameter's evaluation range.
-        control_step: duration of one env step [s]; default: as the environment tells it, or 1.
-        episode_steps: length of a full episode; default: as the environment tells it, or 1000.
-        columns: metrics of the published table, in order, with the format of their values; default: all.
-        units: of measured quantities, by name, for the axes of figures.
-        observation_groups: name and width of each block of the observation, in order, for explanations; without it
+        measures: Measured style; by default `RewardMeasures`, from the terms of the style reward.
+        make_renderer: `(width, height) -> Renderer`; by default `EnvPictures`, the environment's own pictures.
+        make_scene: `(server, session) -> coachable.coach.page.views.View`, which draws the page in 3-D; None shows the
+            renderer's pictures.
+        grid: Values of each style parameter, of which the evaluation grid has all combinations, or a list of styles by
+            parameter name. By default a few values over each parameter's evaluation range.
+        control_step: Duration of one env step [s]; by default from the environment's attributes, or 1.
+        episode_steps: Length of a full episode; by default from the environment's attributes, or 1000.
+        columns: Metrics of the published table, in order, with the format of their values; by default all.
+        units: Units of measured quantities by name, for the axes of figures.
+        observation_groups: Name and width of each block of the observation, in order, for explanations; by default
             every entry is a group of its own.
-        controls: what can be steered while the agent acts and is no style.
-        words: how people speak of it.
-        as_trained: this domain as the settings of a training made it (`env` of its configuration: which machines,
-            which cars); None where trainings do not differ.
-        coached: options of `make_env` for an agent that a person watches, where it then meets others than when it is
-            measured.
-        evaluation: what `coachable evaluate` does instead of running the grid and switched styles: `(domain, policy,
+        controls: Live controls, which are steered while the agent acts.
+        words: Words for the domain, for phrases and presets.
+        as_trained: Function from `env` of a training's configuration to this domain with these settings (such as the
+            machines or cars); None if trainings do not differ.
+        coached: Options of `make_env` for coaching and films, if they differ from those of evaluations.
+        evaluation: Function that replaces the grid and the switching test of `coachable evaluate`: `(domain, policy,
             folder, settings) -> report`, with the loaded policy and `coachable.evaluation.evaluation_settings`.
     """
 
@@ -201,13 +200,13 @@ class Domain:
         """Make an environment with styles.
 
         Args:
-            space: the agent's styles.
-            num_envs: N.
-            seed: of the initial states and of the styles that are drawn.
-            transforms: further ones, such as `EpisodeSums`.
-            num_threads: physics threads, where `make_env` takes them.
-            reward: style reward; default: the domain's own.
-            **options: further arguments of `make_env`.
+            space: The agent's style space.
+            num_envs: Number of environments N.
+            seed: Seed of the initial states and of drawn styles.
+            transforms: Further transforms, such as `EpisodeSums`.
+            num_threads: Number of physics threads, if `make_env` takes it.
+            reward: Style reward; by default the domain's own.
+            **options: Further arguments of `make_env`.
         """
         if _takes(self.make_env, "num_threads"):
             options["num_threads"] = num_threads
@@ -216,23 +215,23 @@ class Domain:
         return coachable_env(simulation, space, reward, *transforms, seed=seed)
 
     def cells(self) -> list[dict[str, Any]]:
-        """The styles of the evaluation grid, by parameter name."""
+        """Return the styles of the evaluation grid, by parameter name."""
         if isinstance(self.grid, Mapping):
             return [dict(zip(self.grid, values, strict=True)) for values in product(*self.grid.values())]
         return [dict(cell) for cell in self.grid]
 
 
 def _takes(function: Any, argument: str) -> bool:
-    """Whether a function accepts a keyword argument; of a class, whether its constructor does."""
+    """Return whether a function, or the constructor of a class, accepts a keyword argument."""
     while isinstance(function, partial) or hasattr(function, "__wrapped__"):
         function = function.func if isinstance(function, partial) else function.__wrapped__
-    # A class of TorchRL seems to take anything, because its metaclass does.
+    # The metaclass of TorchRL's classes takes any argument, so look at the constructor.
     parameters = signature(function.__init__ if isinstance(function, type) else function).parameters
     return argument in parameters or any(p.kind is p.VAR_KEYWORD for p in parameters.values())
 
 
 def domain_names() -> list[str]:
-    """List the domains that installed packages register, this one among them."""
+    """List the domains that installed packages register, including this one."""
     return sorted({entry.name for entry in entry_points(group=_GROUP)})
 
 
@@ -243,13 +242,12 @@ def load_domain(name: str, config: Mapping[str, Any] | None = None) -> Domain:
     `[project.entry-points."coachable.domains"]` in pyproject.toml, `pendulum = "my_package.domain:DOMAIN"` below it.
 
     Args:
-        name: of the domain.
-        config: of a training; the domain is as it was there.
+        name: Name of the domain.
+        config: Configuration of a training whose settings the domain gets, see `Domain.as_trained`.
 
     Raises:
-        ValueError: if no installed package registers such a domain, or more than one does; lists the domains that
-            exist, or names the packages.
-        TypeError: if a package registers something that is not a `Domain`.
+        ValueError: If no installed package registers such a domain, or more than one does.
+        TypeError: If a package registers something that is not a `Domain`.
     """
     entries = list(entry_points(group=_GROUP, name=name))
     if not entries:

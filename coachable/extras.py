@@ -1,8 +1,8 @@
-"""The optional parts of an installation, and how each is installed."""
+"""Extras of an installation, and the commands that install them."""
 
 __all__ = ["EXTRAS", "how_to_install"]
 
-# By name of the extra: the distributions that it brings.
+# Distributions by extra.
 EXTRAS = {
     "ui": ("viser", "mjviser"),
     "video": ("av",),

@@ -1,4 +1,4 @@
-"""Files that may come from anybody: read without executing anything of them, checked for damage, written completely."""
+"""Safe reading and writing of files: no code from a file is executed, and damage is detected."""
 
 import contextlib
 import os
@@ -28,19 +28,20 @@ _PLAIN = (bool, int, float, str, type(None))
 
 
 class CheckpointError(RuntimeError):
-    """A checkpoint or a weights file is missing, damaged, or does not fit what wants to use it."""
+    """A checkpoint or a weights file is missing, damaged, or does not fit its use."""
 
 
 @contextlib.contextmanager
 def refusing(source: Path | str, what: str) -> Iterator[None]:
-    """Turn errors met while something from a file is used into one sentence that names the file.
+    """Turn errors in the block into a `CheckpointError` that names the file.
 
     Args:
         source: The file or folder.
-        what: What was taken from it, for the message ("a style space").
+        what: Name of the content that is used in the block, such as "a style space".
 
     Raises:
-        CheckpointError: For anything but a `CheckpointError`, `OSError`, `ImportError` or a warning, which pass.
+        CheckpointError: For any exception but a `CheckpointError`, `OSError`, `ImportError` or a warning, which are
+            raised unchanged.
     """
     try:
         yield
@@ -56,14 +57,14 @@ def refusing(source: Path | str, what: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def space_named(target: Path, required_bytes: int) -> Iterator[None]:
-    """Say of a failed write how much space it needs and how much there is.
+    """Add the required and the free space to the message of a failed write.
 
     Args:
-        target: What is written; its folder exists.
-        required_bytes: What it takes.
+        target: File to write, in an existing folder.
+        required_bytes: Size of the file [byte].
 
     Raises:
-        OSError: With one sentence, for any `OSError`.
+        OSError: For any `OSError` in the block.
     """
     try:
         yield
@@ -76,7 +77,7 @@ def space_named(target: Path, required_bytes: int) -> Iterator[None]:
 
 
 def tensor_bytes(value: Any) -> int:
-    """Size of all tensors in nested containers."""
+    """Return the size of all tensors in nested containers [byte]."""
     if isinstance(value, Tensor):
         return value.numel() * value.element_size()
     if isinstance(value, Mapping):
@@ -90,7 +91,7 @@ def save_state(state: Mapping[str, Any], file: Path) -> None:
     The file is a zip archive, which has a checksum of every member.
 
     Raises:
-        CheckpointError: If there is anything else in `state`, which could not be read back.
+        CheckpointError: If `state` contains anything else, which could not be read back.
         OSError: If writing fails.
     """
     _check_plain(state, file.name)
@@ -104,14 +105,14 @@ def save_state(state: Mapping[str, Any], file: Path) -> None:
 
 
 def load_state(file: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
-    """Read what `save_state` wrote, without executing anything from it.
+    """Read a file of `save_state`, without executing code from it.
 
     Args:
         file: The file.
-        device: Where tensors go.
+        device: Device of the tensors.
 
     Raises:
-        CheckpointError: If it is missing, damaged, of another kind, or would need pickle.
+        CheckpointError: If the file is missing, damaged, of another kind, or contains pickled objects.
     """
     if not file.is_file():
         raise CheckpointError(f"no such file: {file}")
@@ -135,11 +136,11 @@ def check_finite(values: Any, source: Path | str, name: str = "") -> None:
 
     Args:
         values: Containers, tensors and anything else.
-        source: Where they are from, for the message.
-        name: Of `values` in the source.
+        source: The file they come from, for the message.
+        name: Name of `values` in the source.
 
     Raises:
-        CheckpointError: Naming the tensor.
+        CheckpointError: If a tensor contains NaN or infinity; the message names it.
     """
     if isinstance(values, Tensor):
         finite = torch.isfinite(values)
@@ -157,10 +158,10 @@ def check_finite(values: Any, source: Path | str, name: str = "") -> None:
 
 
 def check_contained(folder: Path) -> None:
-    """Refuse links in a folder that lead out of it: what is read and written there must lie there.
+    """Refuse links in a folder that lead out of it, so that nothing is read or written elsewhere.
 
     Raises:
-        CheckpointError: Naming the link.
+        CheckpointError: If there is such a link; the message names it.
     """
     home = folder.resolve()
     for place, folders, files in os.walk(folder):
@@ -191,10 +192,10 @@ def sync_folder(folder: Path) -> None:
 
 
 def _check_archive(file: Path) -> None:
-    """Compare the archive with its checksums, which torch does not read."""
+    """Check the archive's checksums, which torch ignores."""
     size = file.stat().st_size
     whole = False
-    with contextlib.suppress(Exception), zipfile.ZipFile(file) as archive:  # it raises errors of many kinds
+    with contextlib.suppress(Exception), zipfile.ZipFile(file) as archive:  # damaged files raise many kinds of errors
         members = archive.infolist()
         stored = all(member.compress_type == zipfile.ZIP_STORED for member in members)  # as torch does
         whole = stored and sum(member.file_size for member in members) <= size and archive.testzip() is None

@@ -1,4 +1,4 @@
-"""Numbers that would ruin a training are refused before they reach the replay buffer or a weight."""
+"""Checks that keep non-finite numbers out of the replay buffer and the weights."""
 
 import torch
 from tensordict import TensorDictBase
@@ -10,17 +10,18 @@ LARGEST = 1e18  # float32 ends at 3.4e38: squares of larger numbers, summed over
 
 
 class NonFiniteError(ValueError):
-    """A number is NaN, infinite, or so large that its square is."""
+    """A number is NaN, infinite, or so large that its square is infinite."""
 
 
 def require_finite(data: TensorDictBase) -> None:
     """Refuse collected transitions that would poison the replay buffer and then the weights.
 
     Args:
-        data: `(environments, steps)` or `(steps,)`; every floating-point entry is looked at, nested ones included.
+        data: Transitions `(environments, steps)` or `(steps,)`; all floating-point entries are checked, including
+            nested ones.
 
     Raises:
-        NonFiniteError: If a number is NaN, infinite or beyond `LARGEST`; names the first step at which one is, the
+        NonFiniteError: If a number is NaN, infinite or beyond `LARGEST`; the message names the first such step, its
             environment and the entries.
     """
     steps = data.batch_size[-1]
@@ -28,7 +29,7 @@ def require_finite(data: TensorDictBase) -> None:
     bad = {key: value.reshape(-1, steps, value.numel() // data.numel()) for key, value in floats.items() if _bad(value)}
     if not bad:
         return
-    # The first step counts, and there the first environment.
+    # Report the first step, and the first environment in that step.
     marked = torch.stack([_beyond(value).any(-1).T for value in bad.values()]).any(0)
     step, row = marked.nonzero()[0].tolist()
     at_fault = {key: value[row, step][_beyond(value[row, step])] for key, value in bad.items()}
@@ -41,13 +42,13 @@ def require_finite(data: TensorDictBase) -> None:
 
 
 def require_finite_action(action: Tensor) -> None:
-    """Refuse to simulate a NaN.
+    """Refuse actions that contain NaN.
 
     Args:
-        action: `(environments, components)`.
+        action: Actions `(environments, components)`.
 
     Raises:
-        NonFiniteError: Naming the first environment whose action contains NaN.
+        NonFiniteError: If an action contains NaN; the message names the first such environment.
     """
     missing = action.isnan()
     if missing.any():

@@ -1,4 +1,4 @@
-"""Which OpenGL library renders, decided before MuJoCo is imported."""
+"""Choice of the OpenGL library for rendering, before MuJoCo is imported."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ NO_BACKEND = "disable"
 
 
 class RenderingError(RuntimeError):
-    """Pictures cannot be drawn on this machine as it is."""
+    """Pictures cannot be drawn with the present settings and libraries of this machine."""
 
 
 INSTALL_HINT = (
@@ -19,20 +19,13 @@ INSTALL_HINT = (
 
 
 def choose_gl_backend() -> str:
-    """Set MUJOCO_GL where the user did not, to a backend that exists here, and return it.
+    """Set the environment variable MUJOCO_GL to an available backend, unless you have set it, and return it.
 
-    Without a display, MuJoCo and dm_control would try GLFW first, warn and fail. Software rendering by OSMesa is taken
-    before EGL because it needs no device.
+    Without a display, MuJoCo and dm_control would try GLFW first, warn and fail. Software rendering by OSMesa is
+    preferred to EGL because it needs no device.
     """
-    chosen = os.environ.get("MUJOCO_GL")
-    if chosen is None:
-        if os.environ.get("DISPLAY"):
-            chosen = "glfw"
-        elif ctypes.util.find_library("OSMesa"):
-            chosen = "osmesa"
-        elif ctypes.util.find_library("EGL"):
-            chosen = "egl"
-        else:
-            chosen = NO_BACKEND
-        os.environ["MUJOCO_GL"] = chosen
-    return chosen
+    if "MUJOCO_GL" not in os.environ:
+        libraries = {"osmesa": "OSMesa", "egl": "EGL"}
+        found = (backend for backend, library in libraries.items() if ctypes.util.find_library(library))
+        os.environ["MUJOCO_GL"] = "glfw" if os.environ.get("DISPLAY") else next(found, NO_BACKEND)
+    return os.environ["MUJOCO_GL"]

@@ -8,19 +8,19 @@ STYLE = "style"
 """Raw, un-encoded style theta, `(..., d_theta)`, float32, in the units of the `StyleSpace`."""
 
 TASK_REWARD = "task_reward"
-"""Reward of the task alone, free of the style, `(..., 1)`."""
+"""Reward of the task alone, independent of the style, `(..., 1)`."""
 
 STYLE_FEATURES = "style_features"
-"""What the style terms read: one tensor `(..., F)`, or a nested tensordict. Free of the style."""
+"""Inputs of the style terms, independent of the style: one tensor `(..., F)`, or a nested tensordict."""
 
 STYLE_REWARD = "style_reward"
 """Style part of the reward, `(..., 1)`; logged only, `reward = task_reward + style_reward`."""
 
 EVENTS = "events"
-"""Boolean `(..., n_events)`, what the event tables route by."""
+"""Events of a step, boolean `(..., n_events)`, by which transitions are routed to event tables."""
 
 SCENARIO = "scenario"
-"""How the episode started, integer `(..., 1)`; what multi-tables route by, where an environment has scenarios."""
+"""Scenario in which the episode started, integer `(..., 1)`, by which transitions are routed to multi-tables."""
 
 TABLE = "table"
-"""Which replay table a sample came from, integer `(...,)`."""
+"""Index of the replay table of a sample, integer `(...,)`."""

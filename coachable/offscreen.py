@@ -1,4 +1,4 @@
-"""Pictures of a MuJoCo model without a window."""
+"""Offscreen rendering of MuJoCo models."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ __all__ = ["OffscreenMujoco"]
 
 
 class OffscreenMujoco:
-    """Draw states of a MuJoCo model as RGB images.
+    """Renderer that draws states of a MuJoCo model as RGB images.
 
-    `mujoco.Renderer` is not used because it knows only the backend that was set when MuJoCo was first imported. The
-    OpenGL context belongs to the thread that makes, uses and closes this object.
+    `mujoco.Renderer` is not used because it supports only the backend that was set when MuJoCo was first imported. Use
+    and close this object in the thread in which it was made, to which the OpenGL context belongs.
 
     Args:
-        model: compiled model. Its offscreen buffer is at least as large as the image.
-        width: image width [px].
-        height: image height [px].
+        model: Compiled model, with an offscreen buffer of at least the size of the image.
+        width: Image width [px].
+        height: Image height [px].
 
     Raises:
-        RenderingError: if no OpenGL library is installed; names the package that gives one.
+        RenderingError: If no OpenGL library is installed; the message names the package to install.
 
     Attributes:
-        camera: the model's first camera, or a free one that sees all of the model where it has none.
+        camera: The model's first camera, or a free one that shows the whole model if it has none.
     """
 
     def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
@@ -37,11 +37,8 @@ class OffscreenMujoco:
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._scene = mujoco.MjvScene(model, maxgeom=1000)
-        for slow in (
-            mujoco.mjtRndFlag.mjRND_SHADOW,
-            mujoco.mjtRndFlag.mjRND_REFLECTION,
-        ):  # most of the time, in software
-            self._scene.flags[slow] = False
+        for slow in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            self._scene.flags[slow] = False  # they take most of the time of software rendering
         self._option = mujoco.MjvOption()
         self._viewport = mujoco.MjrRect(0, 0, width, height)
         self.camera = mujoco.MjvCamera()
@@ -66,7 +63,7 @@ class OffscreenMujoco:
 
 
 def _make_gl_context(width: int, height: int) -> Any:
-    """Make an OpenGL context of the chosen backend the current one, and return it."""
+    """Make an OpenGL context of the chosen backend, and make it the current one."""
     backend = choose_gl_backend()
     if backend == NO_BACKEND:
         raise RenderingError(INSTALL_HINT)

@@ -1,4 +1,4 @@
-"""Ranges of numbers, and the sentence that refuses a number outside of them."""
+"""Ranges of numbers, and checks with an error message for numbers outside of them."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ __all__ = ["AMOUNT", "COUNT", "FINITE", "NOT_NEGATIVE", "POSITIVE", "SHARE", "Ra
 
 @dataclass(frozen=True)
 class Range:
-    """Numbers that make sense for one quantity; never NaN, and infinite only if a closed bound is.
+    """Range of valid numbers; NaN is never valid, and infinity only if a closed bound is infinite.
 
     Args:
-        interval: Such as `"[0, 1]"`, `"(0, 1]"` or `"[1, inf)"`; a round bracket leaves the bound out.
-        whole: Whether only whole numbers make sense.
-        optional: Whether `None` does, too.
+        interval: The interval, such as `"[0, 1]"`, `"(0, 1]"` or `"[1, inf)"`; a round bracket excludes the bound.
+        whole: Whether only whole numbers are valid.
+        optional: Whether `None` is valid, too.
 
     Example:
         >>> Range("(0, 1]").check("tau", 0.005)
@@ -32,7 +32,7 @@ class Range:
     optional: bool = False
 
     def holds(self, value: Any) -> bool:
-        """Whether a value is a number of this range."""
+        """Return whether a value lies in the range."""
         if value is None:
             return self.optional
         if isinstance(value, bool) or not isinstance(value, numbers.Real):
@@ -46,7 +46,7 @@ class Range:
         """Refuse a value that is not in the range.
 
         Raises:
-            ValueError: Naming the quantity, what was given and what was expected.
+            ValueError: If it does not; the message names the quantity, the value and the range.
         """
         if not self.holds(value):
             raise ValueError(f"{name} is {value!r}: expected {self}")

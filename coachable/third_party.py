@@ -1,4 +1,4 @@
-"""The state of environments of other libraries, Gymnasium and dm_control, read from their attributes."""
+"""Saving and restoring the state of Gymnasium and dm_control environments from their attributes."""
 
 import sys
 from functools import partial
@@ -10,10 +10,10 @@ import torch
 
 __all__ = ["UnsavableError", "load_object", "save_object"]
 
-# Whose attributes are their state.
+# Types whose attributes are their state, by module.
 _STATEFUL = {"gymnasium": ("Env",), "dm_env": ("Environment",), "dm_control.rl.control": ("Task",)}
 
-# What is the same in every environment made alike.
+# Types whose objects are equal in all environments that are made in the same way, by module.
 _CONSTANT = {
     "gymnasium": ("Space",),
     "gymnasium.envs.registration": ("EnvSpec",),
@@ -24,34 +24,36 @@ _CODE = (type, partial, FunctionType, MethodType, BuiltinFunctionType, ModuleTyp
 
 
 class UnsavableError(ValueError):
-    """The state of an environment cannot be saved or restored; the message names what of it."""
+    """A part of an environment's state cannot be saved or restored; the message names it."""
 
 
 def save_object(thing: Any) -> dict[str, Any]:
-    """Reads the attributes of an environment of another library, nested wrappers, tasks, physics and generators too.
+    """Save the attributes of an environment of another library, including nested wrappers, tasks and generators.
 
     Args:
-        thing: of `gymnasium` or `dm_control`. What all environments made alike share, such as spaces, models and
-            functions, is left out.
+        thing: Object of `gymnasium` or `dm_control`. Spaces, models and functions are left out, because they are equal
+            in all environments that are made in the same way.
 
     Returns:
         Tensors and plain containers.
 
     Raises:
-        UnsavableError: if an attribute is neither plain, nor shared, nor of a known kind.
+        UnsavableError: If an attribute is of an unknown kind.
     """
-    state = {}
-    for name, value in vars(thing).items():
-        if not _is_constant(value):
-            state[name] = _pack(value, f"{type(thing).__name__}.{name}")
-    return state
+    kind = type(thing).__name__
+    changing = {name: value for name, value in vars(thing).items() if not _is_constant(value)}
+    return {name: _pack(value, f"{kind}.{name}") for name, value in changing.items()}
 
 
 def load_object(thing: Any, state: dict[str, Any]) -> None:
-    """Restores what `save_object` returned.
+    """Restore the output of `save_object`.
+
+    Args:
+        thing: Object of the same kind as the saved one.
+        state: Output of `save_object`.
 
     Raises:
-        UnsavableError: if it does not fit.
+        UnsavableError: If the state does not fit the object.
     """
     for name, saved in state.items():
         if name not in vars(thing) and hasattr(type(thing), name):
@@ -81,8 +83,8 @@ def _pack(value: Any, where: str) -> Any:
 
 
 def _unpack(saved: Any, present: Any, where: str) -> Any:
-    """Value of an attribute; what has an identity, such as a generator, is the present one, brought to its state."""
-    if isinstance(saved, str) and saved != present:  # names of files, for instance: they are not a checkpoint's to set
+    """Return the value of an attribute; generators, simulations and objects are restored in place and returned."""
+    if isinstance(saved, str) and saved != present:  # a checkpoint must not change texts such as names of files
         raise UnsavableError(f"{where} is text that changes, which is not restored")
     if not isinstance(saved, dict):
         return saved
@@ -116,13 +118,13 @@ def _is_constant(value: Any) -> bool:
 
 
 def _is_one_of(value: Any, kinds: dict[str, tuple[str, ...]]) -> bool:
-    """Without an import: a value can only be of a kind whose module is loaded."""
+    """Return whether a value is of one of the kinds, whose modules are imported already if there are such values."""
     modules = [(sys.modules.get(module), names) for module, names in kinds.items()]
     return any(isinstance(value, getattr(module, name)) for module, names in modules if module for name in names)
 
 
 def _mujoco(value: Any) -> tuple[Any, Any] | None:
-    """Model and data of a MuJoCo simulation, whether MuJoCo's own or dm_control's, or None."""
+    """Return model and data of a MuJoCo or dm_control simulation, or None for other values."""
     if _is_one_of(value, {"mujoco": ("MjData",)}):
         return value.model, value
     if _is_one_of(value, {"dm_control.mujoco": ("Physics",)}):
@@ -131,7 +133,7 @@ def _mujoco(value: Any) -> tuple[Any, Any] | None:
 
 
 def _save_mujoco(model: Any, data: Any) -> dict[str, Any]:
-    """All that a step depends on, and what was derived from it, as rewards may read it before the next step."""
+    """Return the state that a step depends on, and derived arrays, which rewards may read before the next step."""
     import mujoco
 
     what = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -147,13 +149,11 @@ def _load_mujoco(model: Any, data: Any, saved: dict[str, Any]) -> None:
     mujoco.mj_setState(model, data, saved["state"].numpy(), mujoco.mjtState.mjSTATE_INTEGRATION)
     mujoco.mj_forward(model, data)  # contacts and constraints
     for name, array in _float_arrays(data).items():
-        # mj_step computes positions and so on before it moves on: what it leaves behind is of the moment before.
+        # mj_step derives arrays before it advances the state, so that they belong to the previous state.
         if name in saved["derived"] and tuple(saved["derived"][name].shape) == array.shape:
             array[:] = saved["derived"][name].numpy()
 
 
 def _float_arrays(data: Any) -> dict[str, np.ndarray]:
-    arrays = {name: getattr(data, name) for name in dir(data) if not name.startswith("_")}
-    return {
-        name: array for name, array in arrays.items() if isinstance(array, np.ndarray) and array.dtype == np.float64
-    }
+    arrays = ((name, getattr(data, name)) for name in dir(data) if not name.startswith("_"))
+    return {name: a for name, a in arrays if isinstance(a, np.ndarray) and a.dtype == np.float64}

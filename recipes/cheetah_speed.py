@@ -30,23 +30,28 @@ SPEED = 0  # in the suite's velocity, and in the style features
 
 
 def cheetah_space() -> StyleSpace:
-    """What can be asked for: one speed."""
+    """Return the style space of the cheetah: one speed."""
     return StyleSpace([Setpoint("speed", 0.0, 3.0, unit="m/s", help="forward speed")], name="cheetah")
 
 
 def cheetah_style_reward(space: StyleSpace, *, scale: float = 2.0, margin: float = 3.0) -> StyleReward:
-    """Up to `scale` per step for the requested speed, linearly less down to nothing `margin` [m/s] off.
+    """Return a style reward that is highest at the requested speed and falls linearly to 0.
 
-    The margin is as wide as the range: where a reward is flat, standing still looks as good as a little running.
+    The margin is as wide as the range, because a flat reward would not tell a slow run from standing still.
+
+    Args:
+        space: The style space.
+        scale: Reward per step at the requested speed.
+        margin: Difference from the requested speed at which the reward is 0 [m/s].
     """
     term = SetpointTolerance("speed", SPEED, margin=margin, sigmoid="linear", value_at_margin=0.0)
     return StyleReward(space, {"speed": term}, scales={"speed": scale})
 
 
 class CheetahTask(Transform):
-    """Adds what a coachable environment emits: the reward of the task, and the raw features that styles judge.
+    """Transform that adds the outputs of a coachable environment: the task reward and the style features.
 
-    The task: stay on your feet, at little effort. It says nothing about speed.
+    The task is to stay upright with little effort, at any speed.
     """
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -68,7 +73,13 @@ class CheetahTask(Transform):
 
 
 def cheetah_env(num_envs: int = 16, seed: int = 0, seconds: float = 10.0) -> EnvBase:
-    """`num_envs` cheetahs, one after the other in this process, in episodes of `seconds`, 25 steps per second."""
+    """Make cheetahs that are stepped one after the other in this process, with 25 steps per second.
+
+    Args:
+        num_envs: Number of cheetahs.
+        seed: Seed of the initial states.
+        seconds: Length of an episode [s].
+    """
     cheetahs = SerialEnv(num_envs, lambda: DMControlEnv("cheetah", "run", frame_skip=4, time_limit=seconds))
     env = TransformedEnv(
         cheetahs,
@@ -83,21 +94,21 @@ def cheetah_env(num_envs: int = 16, seed: int = 0, seconds: float = 10.0) -> Env
 
 
 def cheetah_events() -> PredicateEvents:
-    """Table "fast", of steps above 2.5 m/s."""
+    """Return the events of the replay buffer: table "fast" holds the steps above 2.5 m/s."""
     return PredicateEvents({"fast": lambda steps: steps["next", STYLE_FEATURES][..., SPEED] > 2.5})
 
 
 def build(config: dict[str, Any]) -> Trainer:
-    """Compose the training, one box after the other."""
+    """Make the training from its parts, see recipe_boxes.py."""
     run = boxes.start_run(config)
     cfg = run.settings
 
-    # What can be coached, and how it is rewarded
+    # Styles and their reward
     space = cheetah_space()
     space = space.with_sampler(boxes.make(cfg.sampler)(space))
     style_reward = boxes.make_style_reward(run, cheetah_style_reward, space)
 
-    # The cheetah: styles are drawn at reset, the reward is that of the task plus that of the style
+    # Environment: styles are drawn at reset, the reward is the sum of the task's and the style's
     def make_env(seed: int, **settings: Any) -> EnvBase:
         cheetah = boxes.make(cfg.env)(seed=seed, **settings)
         env = CoachableEnv(cheetah, Compose(StyleSampler(space), StyleRewardTransform(style_reward), EpisodeSums()))
@@ -106,7 +117,7 @@ def build(config: dict[str, Any]) -> Trainer:
 
     example = make_env(cfg.seed, num_envs=1)
 
-    # Who acts, who judges, and what is minimised
+    # Actor, critics and loss
     network = boxes.network_settings(run, example)
     actor = boxes.make(network["actor"])(space=space).to(run.device)
     critics = [boxes.make(network["critic"])(space=space).to(run.device) for _ in range(cfg.network.num_critics)]
@@ -116,14 +127,14 @@ def build(config: dict[str, Any]) -> Trainer:
     learner = boxes.make(run.config["learner"])(loss)
     accelerate(learner, cfg.fast)
 
-    # What is remembered, summed over n steps, and seen again under other styles
+    # Replay buffer: sums over n steps, and relabelling with other styles
     relabelled = []
     if cfg.impersonation.n:
         relabelled.append(TaskImpersonation(style_reward, n=cfg.impersonation.n, seed=cfg.seed))
     replay = boxes.make_replay(run, example, *relabelled)
     boxes.open_run_dir(run, example, replay)
 
-    # Who collects, and the loop
+    # Collector, evaluation and training loop
     collector = boxes.make_collector(run, make_env, actor)
     evaluate = boxes.make_evaluation(run, make_env, actor)
     describe = boxes.make_description(run, space, actor, loss, network)

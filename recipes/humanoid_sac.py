@@ -1,6 +1,6 @@
 """Train the DMC humanoid to walk with a requested arm pose and step length (SAC).
 
-python recipes/humanoid_sac.py                            cpu or gpu, whatever this machine has
+python recipes/humanoid_sac.py                            on a CPU or a GPU
 python recipes/humanoid_sac.py preset=smoke               every part once, within a minute
 python recipes/humanoid_sac.py preset=paper               the paper's settings
 python recipes/humanoid_sac.py loss=qr_sac                another loss; see --help for all groups
@@ -25,16 +25,16 @@ from coachable.transforms import CoachableEnv, MirrorSymmetry, StyleRewardTransf
 
 
 def build(config: dict[str, Any]) -> Trainer:
-    """Compose the training, one box after the other."""
+    """Make the training from its parts, see recipe_boxes.py."""
     run = boxes.start_run(config)
     cfg = run.settings
 
-    # What can be coached, and how it is rewarded
+    # Styles and their reward
     space = humanoid_style_space()
     space = space.with_sampler(boxes.make(cfg.sampler)(space))
     style_reward = boxes.make_style_reward(run, humanoid_style_reward, space)
 
-    # The humanoid: styles are drawn at reset, the reward is that of the task plus that of the style
+    # Environment: styles are drawn at reset, the reward is the sum of the task's and the style's
     def make_env(seed: int, **settings: Any) -> EnvBase:
         humanoid = boxes.make(cfg.env)(seed=seed, num_threads=run.simulator_threads, **settings)
         env = CoachableEnv(humanoid, Compose(StyleSampler(space), StyleRewardTransform(style_reward), EpisodeSums()))
@@ -43,7 +43,7 @@ def build(config: dict[str, Any]) -> Trainer:
 
     example = make_env(cfg.seed, num_envs=1)
 
-    # Who acts, who judges, and what is minimised
+    # Actor, critics and loss
     network = boxes.network_settings(run, example)
     actor = boxes.make(network["actor"])(space=space).to(run.device)
     critics = [boxes.make(network["critic"])(space=space).to(run.device) for _ in range(cfg.network.num_critics)]
@@ -53,7 +53,7 @@ def build(config: dict[str, Any]) -> Trainer:
     learner = boxes.make(run.config["learner"])(loss)
     accelerate(learner, cfg.fast)
 
-    # What is remembered, summed over n steps, and seen again in a mirror and under other styles
+    # Replay buffer: sums over n steps, mirror images, and relabelling with other styles
     relabelled = []
     if cfg.mirror:
         relabelled.append(MirrorSymmetry(humanoid_mirror_maps(), cfg.mirror, seed=cfg.seed))
@@ -62,7 +62,7 @@ def build(config: dict[str, Any]) -> Trainer:
     replay = boxes.make_replay(run, example, *relabelled)
     boxes.open_run_dir(run, example, replay)
 
-    # Who collects, and the loop
+    # Collector, evaluation and training loop
     collector = boxes.make_collector(run, make_env, actor)
     evaluate = boxes.make_evaluation(run, make_env, actor)
     describe = boxes.make_description(run, space, actor, loss, network)

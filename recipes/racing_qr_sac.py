@@ -1,6 +1,6 @@
 """Train a racing driver whose style is chosen at run time (QR-SAC).
 
-python recipes/racing_qr_sac.py                                tyre and fuel saving, cpu or gpu
+python recipes/racing_qr_sac.py                                tyre and fuel saving, on a CPU or a GPU
 python recipes/racing_qr_sac.py preset=resources               the same, then overtaking and defending in traffic
 python recipes/racing_qr_sac.py preset=drift                   drifting on request
 python recipes/racing_qr_sac.py preset=aggressiveness          margins to two agents and two rivals, in four stages
@@ -25,16 +25,16 @@ from coachable.transforms import CoachableEnv, StyleRewardTransform, StyleSample
 
 
 def build(config: dict[str, Any]) -> Trainer:
-    """Compose the training, one box after the other."""
+    """Make the training from its parts, see recipe_boxes.py."""
     run = boxes.start_run(config)
     cfg = run.settings
 
-    # What can be coached, and how it is rewarded
+    # Styles and their reward
     space, family_reward = family_style(config["family"])
     space = space.with_sampler(boxes.make(cfg.sampler)(space))
     style_reward = boxes.make_style_reward(run, family_reward, space)
 
-    # The race: styles are drawn at reset, the reward is that of the task plus that of the style
+    # Environment: styles are drawn at reset, the reward is the sum of the task's and the style's
     def make_env(seed: int, **settings: Any) -> EnvBase:
         race = boxes.make(cfg.env)(seed=seed, **settings)
         env = CoachableEnv(race, Compose(StyleSampler(space), StyleRewardTransform(style_reward), EpisodeSums()))
@@ -43,7 +43,7 @@ def build(config: dict[str, Any]) -> Trainer:
 
     example = make_env(cfg.seed, num_envs=1)
 
-    # Who acts, who judges, and what is minimised
+    # Actor, critics and loss
     network = boxes.network_settings(run, example)
     actor = boxes.make(network["actor"])(space=space).to(run.device)
     critics = [boxes.make(network["critic"])(space=space).to(run.device) for _ in range(cfg.network.num_critics)]
@@ -53,14 +53,14 @@ def build(config: dict[str, Any]) -> Trainer:
     learner = boxes.make(run.config["learner"])(loss)
     accelerate(learner, cfg.fast)
 
-    # What is remembered, summed over n steps, and seen again under other styles
+    # Replay buffer: sums over n steps, and relabelling with other styles
     relabelled = []
     if cfg.impersonation.n:
         relabelled.append(TaskImpersonation(style_reward, n=cfg.impersonation.n, seed=cfg.seed))
     replay = boxes.make_replay(run, example, *relabelled)
     boxes.open_run_dir(run, example, replay)
 
-    # Who collects, and the loop
+    # Collector, evaluation and training loop
     collector = boxes.make_collector(run, make_env, actor)
     evaluate = boxes.make_evaluation(run, make_env, actor)
     describe = boxes.make_description(run, space, actor, loss, network)

@@ -1,11 +1,11 @@
-"""Reach the one of eight small targets that the style names: where event tables and task impersonation matter.
+"""Reach the one of eight small targets that the style names, which needs event tables and task impersonation.
 
 python recipes/rare_targets.py                            both on, a minute on one core
 python recipes/rare_targets.py replay=uniform impersonation.n=0
 python recipes/rare_targets.py preset=smoke
 
-Chance seldom leads to a target, and seldom to the right one. Event tables keep what led there; impersonation asks what
-each such path would have been worth to somebody who wanted that target.
+Random actions seldom lead to a target, and seldom to the right one. Event tables keep the transitions that lead to a
+target; impersonation relabels them with the style that asks for this target.
 """
 
 import math
@@ -37,7 +37,12 @@ STEPS = 60
 
 
 class RareTargets(EnvBase):
-    """N points in the plane, steered at bounded speed. An episode ends at any target, whoever wanted it."""
+    """Environment of N points in the plane, steered at bounded speed; an episode ends at any target.
+
+    Args:
+        num_envs: Number of points N.
+        seed: Seed of the initial positions.
+    """
 
     def __init__(self, num_envs: int = 64, seed: int = 0) -> None:
         super().__init__(batch_size=[num_envs])
@@ -93,44 +98,44 @@ class RareTargets(EnvBase):
         )
 
     def simulator_state(self) -> dict[str, Any]:
-        """Everything that the next step depends on, so that a resumed training goes on exactly."""
+        """Return the state that the next step depends on, so that a training can be resumed exactly."""
         tensors = {"position": self.position.clone(), "age": self.age.clone()}
         return {**tensors, "generator": self.generator.get_state()}
 
     def load_simulator_state(self, state: dict[str, Any]) -> None:
-        """Restores what `simulator_state` returned."""
+        """Restore the output of `simulator_state`."""
         self.position, self.age = state["position"].clone(), state["age"].clone()
         self.generator.set_state(state["generator"])
 
 
 def target_space() -> StyleSpace:
-    """What each target is worth; mostly one at a time."""
+    """Return the style space: a weight per target, of which mostly one at a time is drawn."""
     space = StyleSpace([Weight(name, 0.0, 1.0, help="worth of this target") for name in NAMES], name="targets")
     return space.with_sampler(style_mixture(space))
 
 
 def target_reward(space: StyleSpace, *, scale: float = 10.0) -> StyleReward:
-    """`scale` times the weight of the target that was reached."""
+    """Return a style reward of `scale` times the weight of the target that is reached."""
     terms = {name: WeightedFeature(name, i) for i, name in enumerate(NAMES)}
     return StyleReward(space, terms, scales=dict.fromkeys(terms, scale))
 
 
 def target_events() -> KeyEvents:
-    """One table per target."""
+    """Return the events of the replay buffer: one table per target."""
     return KeyEvents(NAMES)
 
 
 def build(config: dict[str, Any]) -> Trainer:
-    """Compose the training, one box after the other."""
+    """Make the training from its parts, see recipe_boxes.py."""
     run = boxes.start_run(config)
     cfg = run.settings
 
-    # What can be coached, and how it is rewarded
+    # Styles and their reward
     space = target_space()
     space = space.with_sampler(boxes.make(cfg.sampler)(space))
     style_reward = boxes.make_style_reward(run, target_reward, space)
 
-    # The targets: styles are drawn at reset, the reward is that of the task plus that of the style
+    # Environment: styles are drawn at reset, the reward is the sum of the task's and the style's
     def make_env(seed: int, **settings: Any) -> EnvBase:
         targets = boxes.make(cfg.env)(seed=seed, **settings)
         env = CoachableEnv(targets, Compose(StyleSampler(space), StyleRewardTransform(style_reward), EpisodeSums()))
@@ -139,7 +144,7 @@ def build(config: dict[str, Any]) -> Trainer:
 
     example = make_env(cfg.seed, num_envs=1)
 
-    # Who acts, who judges, and what is minimised
+    # Actor, critics and loss
     network = boxes.network_settings(run, example)
     actor = boxes.make(network["actor"])(space=space).to(run.device)
     critics = [boxes.make(network["critic"])(space=space).to(run.device) for _ in range(cfg.network.num_critics)]
@@ -149,14 +154,14 @@ def build(config: dict[str, Any]) -> Trainer:
     learner = boxes.make(run.config["learner"])(loss)
     accelerate(learner, cfg.fast)
 
-    # What is remembered, summed over n steps, and seen again under other styles
+    # Replay buffer: sums over n steps, and relabelling with other styles
     relabelled = []
     if cfg.impersonation.n:
         relabelled.append(TaskImpersonation(style_reward, n=cfg.impersonation.n, seed=cfg.seed))
     replay = boxes.make_replay(run, example, *relabelled)
     boxes.open_run_dir(run, example, replay)
 
-    # Who collects, and the loop
+    # Collector, evaluation and training loop
     collector = boxes.make_collector(run, make_env, actor)
     evaluate = boxes.make_evaluation(run, make_env, actor)
     describe = boxes.make_description(run, space, actor, loss, network)

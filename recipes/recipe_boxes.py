@@ -1,4 +1,4 @@
-"""Boxes that recipes share; each function makes one, and recipes/humanoid_sac.py shows how they fit together."""
+"""Parts of a training that all recipes share; recipes/humanoid_sac.py shows how they are combined."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -37,10 +37,10 @@ from coachable.transforms import MirrorSymmetry
 
 @dataclass(frozen=True)
 class Run:
-    """One training: what was asked for, and what this machine gives to it.
+    """One training: its configuration, and the resources of this machine that it uses.
 
     Attributes:
-        config: The configuration as plain containers, as checkpoints hold it.
+        config: The configuration as plain containers, as it is saved in checkpoints.
         settings: The same, typed.
         device: Device of the networks.
         simulator_threads: Threads of one simulator.
@@ -67,7 +67,7 @@ def start_run(config: dict[str, Any]) -> Run:
     if "events" in settings.replay and settings.replay["events"] is None:
         raise ValueError(f"replay=event_tables: {settings.domain} names no events; expected replay=uniform")
     threads = share_threads(**config["threads"])
-    # The learner's sums are rounded as their number of threads says: a resumed training takes as many.
+    # Rounding depends on the learner's number of threads, so that a resumed training has to use the same number.
     config = {**config, "threads": {**config["threads"], "learner": threads.learner}}
     torch.set_num_threads(threads.learner)
     seed_everything(settings.seed)
@@ -94,7 +94,7 @@ def make(target: dict[str, Any]) -> Callable[..., Any]:
 
 
 def _arguments_of(function: Callable[..., Any]) -> dict[str, Parameter]:
-    """Return the arguments of a function; of a class or its factory also those that `**options` pass on."""
+    """Return the arguments of a function, and for a class or its factory also those passed on by `**options`."""
     kind = function if isclass(function) else getattr(function, "__self__", None)
     known = {} if isclass(function) else dict(signature(function).parameters)
     for base in kind.__mro__ if isclass(kind) else ():
@@ -134,7 +134,7 @@ def network_settings(run: Run, env: EnvBase) -> dict[str, dict[str, Any]]:
     widths = {"obs_dim": env.observation_spec["observation"].shape[-1]}
     filled = {"actor": {**network.actor, **widths}, "critic": {**network.critic, **widths}}
     for part in filled.values():
-        if "heads" not in part:  # of a mixed action; they say how wide it is
+        if "heads" not in part:  # the heads of a mixed action define its width
             part["action_dim"] = env.action_spec.shape[-1]
     return filled
 
@@ -161,15 +161,16 @@ def make_loss(run: Run, actor: nn.Module, critics: list[nn.Module], env: EnvBase
 
 
 def make_replay(run: Run, env: EnvBase, *transforms: Transform) -> ReplayBuffer:
-    """Make the replay buffer; it sums rewards over `n_steps` and takes memory when it is first written to.
+    """Make the replay buffer, which sums rewards over `n_steps` and allocates memory at the first write.
 
     Args:
         run: The training.
         env: One environment; its scenarios are the tables of `replay=multi_tables`.
-        *transforms: What sampled batches go through, such as `MirrorSymmetry` and `TaskImpersonation`.
+        *transforms: Transforms of sampled batches, such as `MirrorSymmetry` and `TaskImpersonation`.
 
     Raises:
-        ValueError: If batches are too small for the tables, or mirror images are asked for and there are none.
+        ValueError: If batches are too small for the tables, or the domain has no mirror images or scenarios although
+            the settings need them.
     """
     settings = run.settings
     if settings.mirror and not any(isinstance(transform, MirrorSymmetry) for transform in transforms):
@@ -194,7 +195,7 @@ def make_replay(run: Run, env: EnvBase, *transforms: Transform) -> ReplayBuffer:
 
 
 def make_collector(run: Run, make_env: Callable[..., EnvBase], actor: nn.Module) -> BaseCollector:
-    """Make the collector, in this process, on this host or on many, as the group `collector` says."""
+    """Make the collector of the group `collector`: in this process, in several processes, or on several hosts."""
     settings = run.settings
     return make(settings.collector)(
         make_env,
@@ -222,7 +223,7 @@ def make_evaluation(run: Run, make_env: Callable[..., EnvBase], actor: nn.Module
 def make_description(
     run: Run, space: StyleSpace, actor: TensorDictModuleBase, loss: LossModule, network: dict[str, dict[str, Any]]
 ) -> Callable[[], dict[str, Any]]:
-    """Return a function that gathers what identifies the agent, for checkpoints; see `agent_state`."""
+    """Return a function that returns the agent's description for checkpoints; see `agent_state`."""
     return partial(
         agent_state,
         domain=run.settings.domain,
@@ -239,8 +240,8 @@ def open_run_dir(run: Run, env: EnvBase, replay: ReplayBuffer) -> None:
 
     Args:
         run: The training.
-        env: One environment; its transitions say how much room checkpoints need.
-        replay: The buffer that checkpoints hold.
+        env: One environment, from whose transitions the size of checkpoints is computed.
+        replay: The replay buffer that is saved in checkpoints.
 
     Raises:
         CheckpointError: If the folder holds another run, cannot be written to, or its disk is too small.
@@ -257,7 +258,7 @@ def open_run_dir(run: Run, env: EnvBase, replay: ReplayBuffer) -> None:
 
 
 def stored_keys(run: Run, env: EnvBase, replay: ReplayBuffer) -> tuple[NestedKey, ...]:
-    """Return which entries of a transition the replay buffer stores."""
+    """Return the entries of a transition that the replay buffer stores."""
     tables = isinstance(replay, EventTableBuffer)
     return replay_keys(env, tables=tables, scenarios=_has_scenario_tables(run.settings))
 
@@ -280,13 +281,13 @@ def make_trainer(
 
     Args:
         run: The training.
-        env: One environment, which is closed.
-        collector: What collects transitions.
-        replay: What stores them.
-        learner: What learns from them.
-        evaluate: Returns metrics of the current actor.
-        describe: Returns what identifies the agent in a checkpoint.
-        style_reward: Its terms are among the metrics.
+        env: One environment, which is closed here.
+        collector: Collector of transitions.
+        replay: Replay buffer that stores them.
+        learner: Learner that is trained on them.
+        evaluate: Function that returns metrics of the current actor.
+        describe: Function that returns the agent's description for checkpoints.
+        style_reward: Style reward, whose terms are logged as metrics.
     """
     settings, run_dir = run.settings, Path(run.settings.run_dir)
     trainer = Trainer(
@@ -302,7 +303,7 @@ def make_trainer(
         checkpoints=CheckpointStore(run_dir / "checkpoints", **run.config["checkpoint"]),
         replay_keys=stored_keys(run, env, replay),
     )
-    env.close()  # now, not whenever it is collected: TorchRL raises the number of threads when it closes a SerialEnv
+    env.close()  # here and not at garbage collection, because closing a SerialEnv changes the number of threads
     torch.set_num_threads(run.learner_threads)
     if settings.resume:
         print(f"resumed {trainer.resume(settings.resume)} at {trainer.frames} env-steps")

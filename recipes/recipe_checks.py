@@ -1,4 +1,4 @@
-"""What is wrong with a configuration, in one sentence that names the key and what is valid."""
+"""Checks of a configuration; the error messages name the key, the given value and the valid ones."""
 
 import difflib
 from collections.abc import Iterable
@@ -11,8 +11,8 @@ from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBase
 
 from coachable.ranges import AMOUNT, COUNT, FINITE, NOT_NEGATIVE, POSITIVE, SHARE, Range
 
-# Ranges of numbers in the groups that take what their target takes, by the end of the number's path; `*` is any entry
-# of a list or group. The schema declares the others; `replay.gamma` and `loss.alpha` have those of `gamma` and `alpha`.
+# Ranges of numbers in the groups with a `_target_`, by the end of the number's path; `*` is any entry of a list or
+# group. The schema declares the other ranges; `replay.gamma` and `loss.alpha` have those of `gamma` and `alpha`.
 RANGES: dict[str, Range] = {entry.name: entry.metadata["range"] for entry in fields(Settings) if entry.metadata} | {
     # losses
     "alpha_init": POSITIVE,
@@ -60,7 +60,7 @@ _KINDS = {bool: "true or false", str: "a name or path", str | None: "a name or p
 
 
 def choices(given: str, valid: Iterable[str]) -> str:
-    """Return the sentences that follow the name of something misspelt: the closest valid name, and all of them."""
+    """Return the end of a message about an unknown name: the closest valid name, and all valid ones."""
     valid = list(valid)
     close = difflib.get_close_matches(given, valid, n=1)
     guess = f" Did you mean {close[0]}?" if close else ""
@@ -68,7 +68,7 @@ def choices(given: str, valid: Iterable[str]) -> str:
 
 
 def mistake_in(error: OmegaConfBaseException) -> str:
-    """Say what OmegaConf refused: a key that there is not, or a value of another type."""
+    """Return a sentence for an error of OmegaConf: an unknown key, or a value of another type."""
     key = str(error.full_key)
     where, _, part = key.rpartition(".")
     parent = error.parent_node
@@ -100,7 +100,7 @@ def typed_settings(config: dict[str, Any]) -> Settings:
 
 
 def range_of(path: tuple[str, ...]) -> Range | None:
-    """Return the range of the number at a path, or None if any finite one makes sense."""
+    """Return the range of the number at a path, or None if any finite number is valid."""
     if entry := _declared(path):
         return entry.metadata.get("range")
     ends = [".".join(path[i:]) for i in range(len(path))] + [".".join((*path[-2:-1], "*"))]
@@ -114,10 +114,10 @@ def checked_values(config: dict[str, Any]) -> dict[str, Any]:
         config: Plain containers.
 
     Returns:
-        The same, with whole numbers that were written as `1e6` as integers.
+        The same configuration, in which whole numbers that are written as `1e6` are integers.
 
     Raises:
-        ValueError: Naming the key, what was given, and the valid range.
+        ValueError: If a value is not valid; the message names the key, the value and the valid range.
     """
     checked = _checked(config, ())
     for group in ("critic_support", "loss", "network.critic"):
@@ -150,7 +150,7 @@ def _checked(value: Any, path: tuple[str, ...]) -> Any:
 
 
 def _declared(path: tuple[str, ...]) -> Field[Any] | None:
-    """Return the field of the schema at a path; None in a group that takes whatever its target takes."""
+    """Return the field of the schema at a path, or None in a group with a `_target_`."""
     kind, entry = RacingSettings, None
     for part in path:
         entry = {field.name: field for field in fields(kind)}.get(part) if is_dataclass(kind) else None
@@ -171,7 +171,7 @@ def _typed(kind: Any, value: Any) -> Any:
 
 
 def _at(config: dict[str, Any], path: str) -> dict[str, Any]:
-    """Group of settings at a path, empty if there is none."""
+    """Return the group of settings at a path, or an empty dictionary if there is none."""
     for part in path.split("."):
         config = config.get(part) or {}
     return config

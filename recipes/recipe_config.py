@@ -1,4 +1,4 @@
-"""From a command line to a checked, plain configuration; shared by the recipes."""
+"""Composition of a checked, plain configuration from a command line, shared by the recipes."""
 
 import json
 import logging
@@ -33,7 +33,8 @@ from coachable.training.curriculum import Curriculum
 from coachable.training.hardware import choose_preset, detect, estimate_update_seconds, pick_device
 from coachable.training.trainer import Trainer
 
-# What a checkpoint decides: its weights, its replay buffer and its generators belong to these values.
+# Settings that a resumed run must not change, because the checkpoint's weights, replay buffer and generators depend on
+# them.
 _FIXED = (
     "domain",
     "seed",
@@ -55,7 +56,7 @@ register_schema()
 
 
 def config_groups(config_name: str) -> dict[str, list[str]]:
-    """Groups of a recipe and the choices of each; presets are the recipe's own, the other groups are shared."""
+    """Return the choices of each group of a recipe; presets are the recipe's own, the other groups are shared."""
     folders = {folder.name: folder for folder in sorted(CONFIGS.iterdir()) if folder.is_dir()}
     folders.pop("__pycache__", None)  # of schema.py
     folders["preset"] /= config_name
@@ -68,13 +69,13 @@ OmegaConf.register_new_resolver(  # for --help
 
 
 def run_recipe(config_name: str, build: Callable[[dict[str, Any]], Trainer]) -> None:
-    """Runs a recipe from the command line.
+    """Run a recipe from the command line.
 
     Args:
-        config_name: file in recipes/configs, without its suffix.
-        build: makes the training from the plain, resolved configuration.
+        config_name: File in recipes/configs, without its suffix.
+        build: Function that makes the training from the plain, resolved configuration.
     """
-    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces every buffer it allocates
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # TorchRL logs every buffer that it allocates
     sys.argv[1:] = checked_arguments(config_name, sys.argv[1:])
 
     @hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name=config_name)
@@ -85,7 +86,7 @@ def run_recipe(config_name: str, build: Callable[[dict[str, Any]], Trainer]) -> 
         except (CheckpointError, ValueError, ImportError) as error:
             if "HYDRA_FULL_ERROR" in os.environ:
                 raise
-            # The user's to solve: the sentence says how, a traceback would hide it. TorchRL appends that of a worker.
+            # You can fix these errors without a traceback, including the one that TorchRL appends from a worker.
             raise SystemExit(f"error: {error}".split("\n\nWorker traceback:\n")[0]) from None
         try:
             train.run()
@@ -96,31 +97,31 @@ def run_recipe(config_name: str, build: Callable[[dict[str, Any]], Trainer]) -> 
 
 
 def compose_config(config_name: str, arguments: list[str]) -> dict[str, Any]:
-    """Composes a recipe's configuration in-process, with the checks of the command line.
+    """Compose a recipe's configuration in this process, with the checks of the command line.
 
     Args:
-        config_name: file in recipes/configs, without its suffix.
-        arguments: overrides, such as `["preset=smoke", "seed=1"]`.
+        config_name: File in recipes/configs, without its suffix.
+        arguments: Overrides, such as `["preset=smoke", "seed=1"]`.
 
     Returns:
-        Plain containers.
+        The configuration as plain containers.
     """
     _, given, _ = _hydra_arguments(config_name, arguments)
     return plain_config(_composed(config_name, given), given, config_name)
 
 
 def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
-    """Compose what a command line asks for, so that a mistake is one sentence, and replace `preset=auto` by a preset.
+    """Check a command line by composing its configuration, and replace `preset=auto` by a preset.
 
     Args:
-        config_name: file in recipes/configs, without its suffix.
-        arguments: command line without the program; options such as `--help` pass through.
+        config_name: File in recipes/configs, without its suffix.
+        arguments: Command line without the program; options such as `--help` are passed on.
 
     Returns:
         Arguments for Hydra.
 
     Raises:
-        SystemExit: naming what is misspelt or of a wrong type, and the valid choices.
+        SystemExit: If a key, a choice or a type is wrong; the message lists the valid choices.
     """
     options, given, overrides = _hydra_arguments(config_name, arguments)
     jobs = [given]
@@ -131,11 +132,11 @@ def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
         for job in jobs:
             _composed(options.config_name or config_name, [*job, *folder])
     flags = [argument for argument in _quoted_paths(arguments) if argument not in options.overrides]
-    return [*flags, *given]  # Hydra's parser takes overrides in one piece only, not before and after its options
+    return [*flags, *given]  # Hydra's parser does not accept overrides both before and after its options
 
 
 def _hydra_arguments(config_name: str, arguments: list[str]) -> tuple[Namespace, list[str], list[Override]]:
-    """Return the options of Hydra, and the overrides with the preset that this machine or the user chose."""
+    """Return Hydra's options, and the overrides with the preset that was given or that fits this machine."""
     options = get_args_parser().parse_intermixed_args(_quoted_paths(arguments))
     parser = OverridesParser.create()
     try:
@@ -157,7 +158,7 @@ def _hydra_arguments(config_name: str, arguments: list[str]) -> tuple[Namespace,
 
 
 def _composed(config_name: str, overrides: list[str]) -> DictConfig:
-    """Compose a configuration; a mistake is one sentence."""
+    """Compose a configuration, and exit with a sentence if it is wrong."""
     try:
         with _configs():
             return hydra.compose(config_name, overrides)
@@ -177,7 +178,7 @@ def _composed(config_name: str, overrides: list[str]) -> DictConfig:
 
 
 def start_training(build: Callable[[dict[str, Any]], Trainer], config: dict[str, Any]) -> Trainer | Curriculum:
-    """Make a training, or one in stages where the configuration lists any, and say what was chosen."""
+    """Make a training, or a curriculum if the configuration has stages, and announce it."""
     if config.get("stages"):
         return Curriculum(config, lambda stage: build_checked(build, stage), announce)
     train = build_checked(build, config)
@@ -186,10 +187,10 @@ def start_training(build: Callable[[dict[str, Any]], Trainer], config: dict[str,
 
 
 def build_checked(build: Callable[[dict[str, Any]], Trainer], config: dict[str, Any]) -> Trainer:
-    """Builds a training; a saved configuration that makes none is refused with a sentence.
+    """Make a training from a configuration, which may come from a checkpoint.
 
     Raises:
-        CheckpointError: if a resumed run's configuration cannot be used.
+        CheckpointError: If a resumed run's configuration cannot be used.
     """
     if not config["resume"]:
         return build(config)
@@ -198,19 +199,20 @@ def build_checked(build: Callable[[dict[str, Any]], Trainer], config: dict[str, 
 
 
 def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dict[str, Any]:
-    """Resolves a composed configuration; a resumed run's starts from the one in its checkpoint.
+    """Resolve a composed configuration; that of a resumed run is based on the one in its checkpoint.
 
     Args:
-        cfg: composed by Hydra.
-        overrides: what the command line said.
-        config_name: file in recipes/configs, without its suffix; a checkpoint may name what it and its groups name.
+        cfg: Configuration composed by Hydra.
+        overrides: Overrides of the command line.
+        config_name: File in recipes/configs, without its suffix; a configuration in a checkpoint may only name the
+            functions of this file and its groups.
 
     Returns:
-        Plain containers, `run_dir` filled in.
+        The configuration as plain containers, with `run_dir` filled in.
 
     Raises:
-        CheckpointError: if the configuration in a checkpoint names other functions, or refers to anything outside.
-        ValueError: naming a number that lies outside its range.
+        CheckpointError: If the configuration in a checkpoint names other functions, or is not plain.
+        ValueError: If a number lies outside its range.
     """
     if cfg.resume:
         checkpoint = find_checkpoint(cfg.resume)
@@ -227,7 +229,7 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
         run = _run_of(checkpoint, staged=bool(saved.get("stages")))
         replaced = {"init_from": None, "run_dir": run, **said, "resume": str(checkpoint)}
         if run is not None and replaced["run_dir"] == run:
-            check_contained(Path(run))  # the run's own files are written to
+            check_contained(Path(run))  # the training writes into this folder
         with refusing(checkpoint, "a configuration"):
             for key, value in replaced.items():
                 OmegaConf.update(before, key, value, merge=False)
@@ -245,12 +247,12 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
     config = {str(key): value for key, value in config.items()}
     try:
         return checked_values(config)
-    except (AttributeError, KeyError, TypeError) as error:  # of a saved one: what is composed here has the right kinds
+    except (AttributeError, KeyError, TypeError) as error:  # only a saved configuration can have wrong types
         raise CheckpointError(f"{config['resume']} holds a configuration of another kind: {error}") from error
 
 
 def _chosen_stage(cfg: DictConfig, stages: list[dict[str, Any]]) -> DictConfig:
-    """The one stage that `stage=NAME` asks for, as a training of its own, or the first with the list of all."""
+    """Return the stage of `stage=NAME` as a training of its own, or else the first one with the list of all."""
     names = [stage["stage"] for stage in stages]
     if cfg.stage is not None and cfg.stage not in names:
         raise ValueError(f"stage={cfg.stage} does not exist.{choices(cfg.stage, names)}")
@@ -259,7 +261,7 @@ def _chosen_stage(cfg: DictConfig, stages: list[dict[str, Any]]) -> DictConfig:
 
 
 def announce(config: dict[str, Any], train: Trainer) -> None:
-    """Says what was chosen and about how long it will take."""
+    """Print the chosen settings and about how long the training will take."""
     parameters = sum(p.numel() for p in train.learner.loss_module.actor_network_params.parameters())
     bf16 = train.learner.precision == "bf16"
     seconds = estimate_update_seconds(parameters, config["train"]["batch_size"], bf16, pick_device(config["device"]))
@@ -272,12 +274,12 @@ def announce(config: dict[str, Any], train: Trainer) -> None:
 
 
 def save_config(config: dict[str, Any], run_dir: Path) -> None:
-    """Writes the resolved configuration beside the run's metrics."""
+    """Write the resolved configuration into the run's folder."""
     (run_dir / "config.json").write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")
 
 
 def _quoted_paths(arguments: list[str]) -> list[str]:
-    """Puts paths into quotes, so that Hydra takes them as they are: a folder may be called `a=b` or `a, b`."""
+    """Quote paths, so that Hydra does not parse them: a folder may be called `a=b` or `a, b`."""
     if {"-m", "--multirun"} & set(arguments):
         return arguments
     quoted = []
@@ -312,7 +314,7 @@ def _new_run_dir(domain: str) -> Path:
 
 @contextmanager
 def _configs() -> Iterator[None]:
-    """Makes `hydra.compose` work, inside and outside of a running recipe."""
+    """Initialise Hydra with the recipes' configurations, unless a running recipe has done so."""
     if GlobalHydra.instance().is_initialized():
         yield
         return

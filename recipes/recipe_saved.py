@@ -1,4 +1,4 @@
-"""Configurations from checkpoints, which may come from anybody: they name nothing that the local YAML files do not."""
+"""Checks of configurations from checkpoints, which are not trusted: they may only name what local YAML files name."""
 
 from collections.abc import Collection, Iterable, Iterator
 from functools import cache
@@ -15,21 +15,21 @@ CONFIGS = Path(__file__).resolve().parent / "configs"
 def check_saved_config(
     saved: Any, checkpoint: Path, config_name: str, said: Collection[str] = (), composed: Any = None
 ) -> None:
-    """Refuses a configuration from a checkpoint that could run something else than this recipe.
+    """Refuse a configuration from a checkpoint that could run other code than this recipe.
 
-    Hydra calls whatever a configuration names as a `_target_`, and OmegaConf fills in `${...}` from the environment and
-    other places. A checkpoint may come from anybody: each `_target_` has to be one that the YAML files of the recipe
-    name at the same place, and nothing is filled in.
+    Hydra calls every `_target_` of a configuration, and OmegaConf replaces `${...}` by values from the environment and
+    other places. Checkpoints are not trusted: each `_target_` has to be one that the YAML files of the recipe have at
+    the same place, and `${...}` is not allowed.
 
     Args:
-        saved: from the checkpoint.
-        checkpoint: for the message.
-        config_name: file in recipes/configs, without its suffix.
-        said: keys that the command line replaces.
-        composed: the configuration as composed here, with what the command line says.
+        saved: Configuration in the checkpoint.
+        checkpoint: Path of the checkpoint, for the message.
+        config_name: File in recipes/configs, without its suffix.
+        said: Keys that the command line replaces.
+        composed: Configuration as composed here, with the overrides of the command line.
 
     Raises:
-        CheckpointError: naming the place.
+        CheckpointError: If the configuration is refused; the message names the place.
     """
     if not isinstance(saved, dict) or not str(saved.get("domain")).isidentifier():
         raise CheckpointError(f"{checkpoint} holds no configuration of a training: it cannot be resumed")
@@ -52,7 +52,7 @@ def check_saved_config(
 
 @cache
 def known_targets(config_name: str) -> set[tuple[tuple[str, ...], str]]:
-    """Where the YAML files of a recipe, its groups and its presets name which `_target_`: (place, target)."""
+    """Return every `_target_` in the YAML files of a recipe, its groups and its presets, as (place, target)."""
     presets = CONFIGS / "preset" / config_name
     groups = (folder for folder in CONFIGS.iterdir() if folder.is_dir() and folder.name != "preset")
     files = [CONFIGS / f"{config_name}.yaml", CONFIGS / "training.yaml", *presets.glob("*.yaml")]
@@ -63,7 +63,7 @@ def known_targets(config_name: str) -> set[tuple[tuple[str, ...], str]]:
         shared = file.parent in (CONFIGS, presets) or "# @package _global_" in file.read_text(encoding="utf-8")
         leaves += _leaves(content if shared else {file.parent.name: content})
     known = _targets(leaves)
-    for place, value in leaves:  # what is filled in from elsewhere, such as replay.events
+    for place, value in leaves:  # values that refer to other places, such as replay.events
         source = tuple(str(value)[2:-1].split(".")) if str(value).startswith("${") else ()
         known |= {(place + where[len(source) :], t) for where, t in known if source and where[: len(source)] == source}
     return known
@@ -76,7 +76,7 @@ def _targets(leaves: Iterable[tuple[tuple[str, ...], Any]]) -> set[tuple[tuple[s
 def _leaves(value: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
     if isinstance(value, dict | list | tuple):
         for key, entry in value.items() if isinstance(value, dict) else enumerate(value):
-            # A stage may name what the recipe may name.
+            # A stage may name the same targets as the recipe.
             yield from _leaves(entry, () if place == ("stages",) else (*place, str(key)))
     else:
         yield place, value

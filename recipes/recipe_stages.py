@@ -1,4 +1,4 @@
-"""Configurations of the stages of a training: the recipe's own, with what each stage changes."""
+"""Configurations of the stages of a training: the recipe's own, with the changes of each stage."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,21 +11,21 @@ _OF_THE_RUN = ("run_dir", "resume", "init_from", "init_new_observations", "stage
 
 
 def composed_stages(cfg: DictConfig, said: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the complete configuration of every stage; each stage keeps what the stages before it changed.
+    """Return the complete configuration of every stage; each stage keeps the changes of the stages before it.
 
     Args:
-        cfg: The recipe's configuration. `cfg.stages` lists what each stage changes, its `name` and its `total_frames`,
-            which stands for `train.total_frames`.
-        said: What the command line says, by key; it holds in all stages.
+        cfg: The recipe's configuration. `cfg.stages` lists the changes of each stage, its `name` and its
+            `total_frames`, which stands for `train.total_frames`.
+        said: Overrides of the command line by key, which apply to all stages.
 
     Raises:
-        ValueError: If a stage has no name, changes what there is not, or a number lies outside its range.
+        ValueError: If a stage has no name, changes an unknown setting, or a number lies outside its range.
     """
     stages = []
     changes: list[dict[str, Any]] = OmegaConf.to_container(cfg.stages, resolve=False)  # pyright: ignore
     current = cfg.copy()
     current.stages = []
-    OmegaConf.set_struct(current, None)  # a stage may add to what a target takes, not to what the schema declares
+    OmegaConf.set_struct(current, None)  # a stage may add arguments of a target, but no entries of the schema
     for change in changes:
         name = change.pop("name", None)
         if name is None:
@@ -50,5 +50,5 @@ def composed_stages(cfg: DictConfig, said: Mapping[str, Any]) -> list[dict[str, 
         stage = checked_values({**config, "stage": name})
         typed_settings(stage)
         stages.append(stage)
-        OmegaConf.update(current, "init_new_observations", 0)  # those of one stage are known to the next
+        OmegaConf.update(current, "init_new_observations", 0)  # the next stage starts with these observations
     return stages

@@ -1,1 +1,1 @@
-"""Does the agent do what was asked, and its task as well? Measured over a grid of styles."""
+"""Evaluation of agents over a grid of styles: compliance with the request, and success at the task."""

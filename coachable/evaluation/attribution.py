@@ -1,4 +1,4 @@
-"""How much each group of inputs moves a policy's action, by saliency and SHAP."""
+"""Attribution of a policy's actions to groups of its inputs, by saliency and SHAP."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class Group:
     """Inputs that are ranked together.
 
     Attributes:
-        name: "joint_angles", or "style: pose".
-        columns: of the network's input, `cat(observation, encode(theta))`.
-        is_style: whether the coach sets them.
+        name: Name of the group, such as "joint_angles" or "style: pose".
+        columns: Columns of the network's input, `cat(observation, encode(theta))`.
+        is_style: Whether the group is a style parameter rather than a part of the observation.
     """
 
     name: str
@@ -43,10 +43,10 @@ class Ranking:
     """Importance of each group by one method.
 
     Attributes:
-        method: "SHAP" or "saliency".
-        groups: the most important first.
-        means: (G,) mean over trajectories.
-        deviations: (G,) standard deviation over trajectories.
+        method: The method, "SHAP" or "saliency".
+        groups: The groups, the most important first.
+        means: Mean importance over trajectories (G,).
+        deviations: Standard deviation over trajectories (G,).
     """
 
     method: str
@@ -55,27 +55,25 @@ class Ranking:
     deviations: np.ndarray
 
     def rows(self) -> list[dict[str, Any]]:
-        """One row per group."""
-        return [
-            {
-                "method": self.method,
-                "rank": rank,
-                "group": group.name,
-                "kind": "style" if group.is_style else "observation",
-                "mean": float(mean),
-                "std": float(deviation),
-            }
-            for rank, (group, mean, deviation) in enumerate(
-                zip(self.groups, self.means, self.deviations, strict=True), start=1
-            )
-        ]
+        """Return one table row per group."""
+        rows = []
+        for rank, group in enumerate(self.groups, start=1):
+            row = {"method": self.method, "rank": rank, "group": group.name}
+            row["kind"] = "style" if group.is_style else "observation"
+            rows.append(row | {"mean": float(self.means[rank - 1]), "std": float(self.deviations[rank - 1])})
+        return rows
 
 
 def input_groups(domain: Domain, space: StyleSpace, observation_dim: int) -> list[Group]:
-    """The domain's observation groups, or every entry on its own, and the style parameters.
+    """List the domain's observation groups, or every entry as a group of its own, followed by the style parameters.
+
+    Args:
+        domain: Domain that declares the groups.
+        space: Style space of the policy.
+        observation_dim: Width of the observation.
 
     Raises:
-        ValueError: if the widths do not add up to the observation's.
+        ValueError: If the widths of the groups do not add up to that of the observation.
     """
     named = list(domain.observation_groups) or [(f"observation {i}", 1) for i in range(observation_dim)]
     covered = sum(width for _, width in named)
@@ -101,23 +99,23 @@ def rank_groups(
     seed: int = 0,
     progress: bool = True,
 ) -> list[Ranking]:
-    """Importance of each group for the outputs, by SHAP and by saliency.
+    """Rank the groups by their importance for the outputs, by SHAP and by saliency.
 
-    Saliency (Simonyan et al. 2014): mean of |d output / d input| over a group's entries and over the outputs; how much
-    a small change of an input changes the action. SHAP (Lundberg and Lee 2017), estimated by expected gradients with
-    the recorded states as baselines: a group's contribution is the sum over its entries of how far they moved the
-    output from its mean, absolute, averaged over the outputs. Both are averaged along each trajectory first; the paper
-    does not say how it pools entries and outputs.
+    Saliency (Simonyan et al. 2014) is the mean of |d output / d input| over a group's entries and over the outputs:
+    how much a small change of an input changes the action. SHAP (Lundberg and Lee 2017) is estimated by expected
+    gradients with the recorded states as baselines: a group's contribution is the sum over its entries of how far they
+    move an output from its mean, as an absolute value, averaged over the outputs. Both are first averaged along each
+    trajectory; the paper does not say how it pools entries and outputs.
 
     Args:
-        outputs: (B, D) to (B, outputs), differentiable.
-        trajectories: (S, D) each.
-        groups: of the D columns.
-        seed: of the baselines.
-        progress: show a bar.
+        outputs: Differentiable function from inputs (B, D) to outputs (B, outputs).
+        trajectories: Recorded inputs (S, D) of each trajectory.
+        groups: Groups of the D columns.
+        seed: Seed of the baselines.
+        progress: Whether to show a progress bar.
 
     Returns:
-        A ranking per method, in the order of `METHODS`.
+        One ranking per method, in the order of `METHODS`.
     """
     attr = import_captum()
     states = torch.cat(list(trajectories))
@@ -152,7 +150,11 @@ def _per_group(values: Tensor, groups: Sequence[Group], pool: Callable[..., Tens
 
 
 def import_captum() -> Any:
-    """`captum.attr`, or an ImportError that names the extra to install."""
+    """Return `captum.attr`.
+
+    Raises:
+        ImportError: If captum is not installed; the message names the extra to install.
+    """
     try:
         import captum.attr
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""`coachable curves`: learning curves of several runs, grouped, with intervals over seeds."""
+"""`coachable curves`: draw learning curves of groups of runs, with intervals over seeds."""
 
 from __future__ import annotations
 
@@ -9,22 +9,26 @@ from pathlib import Path
 
 import numpy as np
 
-from coachable.evaluation.figures import drawing, readable
+from coachable.evaluation.figures import drawing
 from coachable.evaluation.statistics import bootstrap_interval
+from coachable.evaluation.wording import readable
 
 _POINTS = 100
 
 
 def read_metric(run: Path, x: str, y: str) -> tuple[np.ndarray, np.ndarray]:
-    """Two columns of a run's `metrics.csv`, of the rows that have both.
+    """Read two columns of a run's `metrics.csv`, from the rows that have both.
 
     Args:
-        run: the run's folder.
-        x: column of the horizontal axis.
-        y: column to draw.
+        run: The run's folder.
+        x: Column of the horizontal axis.
+        y: Column to draw.
+
+    Returns:
+        The values (n,) of both columns.
 
     Raises:
-        ValueError: if the file is damaged, there is no such column, or no row has both; lists the columns that exist.
+        ValueError: If the file is damaged, there is no such column, or no row has both values.
     """
     table = run / "metrics.csv"
     try:
@@ -49,16 +53,16 @@ def read_metric(run: Path, x: str, y: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def summarise_runs(runs: Sequence[Path], x: str, y: str, smooth: int = 5) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean curve of several runs and its 95 % bootstrap interval.
+    """Compute the mean curve of several runs and its 95 % bootstrap interval.
 
     Args:
-        runs: the runs' folders, one per seed.
-        x: column of the horizontal axis.
-        y: column to draw.
-        smooth: rows of the moving average that each run gets first.
+        runs: The runs' folders, one per seed.
+        x: Column of the horizontal axis.
+        y: Column to draw.
+        smooth: Number of rows of the moving average over each run.
 
     Returns:
-        Horizontal positions (P,) up to where the shortest run ends, means (P,), and intervals (2, P).
+        Horizontal positions (P,) that all runs cover, means (P,), and intervals (2, P).
     """
     curves = []
     for run in runs:
@@ -77,14 +81,14 @@ def draw_learning_curves(
     """Draw one curve per group of runs.
 
     Args:
-        groups: label to the folders of its runs.
+        groups: Folders of the runs of each group, by label.
         out: PNG file to write.
-        x: column of the horizontal axis.
-        y: column to draw.
-        smooth: rows of the moving average.
+        x: Column of the horizontal axis.
+        y: Column to draw.
+        smooth: Number of rows of the moving average over each run.
 
     Returns:
-        Label to the mean at the last common position.
+        Mean at the last common position, by label.
     """
     last = {}
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -26,16 +26,16 @@ def evaluate(source: str | Path, out: Path, **settings: Any) -> str:
     """Evaluate an agent and write `grid.csv`, `response.csv`, `report.md`, `grid.png` and `summary.json` into a folder.
 
     Args:
-        source: checkpoint, run folder, weights file, or the name of a domain that ships with weights.
-        out: folder for the results, created if missing.
-        **settings: those of `EvaluationSettings`; styles switch every 100 steps.
+        source: Checkpoint, run folder, weights file, or the name of a domain that ships with weights.
+        out: Folder for the results, created if missing.
+        **settings: Arguments of `EvaluationSettings`; styles switch every 100 steps.
 
     Returns:
-        The report, Markdown.
+        The report as Markdown.
 
     Raises:
-        ValueError: if `episodes` is below 1.
-        CheckpointError: if the source does not hold a usable policy of its domain.
+        ValueError: If `episodes` is below 1.
+        CheckpointError: If the source does not hold a usable policy of its domain.
     """
     agent = load_policy(source)
     domain = domain_of(agent)
@@ -54,7 +54,7 @@ def evaluate(source: str | Path, out: Path, **settings: Any) -> str:
 
 
 def _summary(grid: StyleGrid, rows: list[dict[str, Any]], switching: SwitchReport) -> dict[str, Any]:
-    """The worst and the mean cell of each metric, and the switching test."""
+    """Return the lowest, mean and highest cell of each metric, and the results of the switching test."""
     spans = {}
     for name, values in grid.episodes.items():
         means = [mean for mean in map(mean_of, values) if not math.isnan(mean)]

@@ -1,4 +1,4 @@
-"""What an evaluation was asked for."""
+"""Settings of an evaluation."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ class EvaluationSettings:
     """Settings of `coachable evaluate`; the evaluation of a domain uses those that apply to it.
 
     Attributes:
-        episodes: per style.
-        switch_episodes: with styles that switch; 0 for none.
-        steps: length of an episode in control steps; None for the domain's own.
-        seed: of initial states, styles and sampled actions. The same seed gives the same files.
-        num_threads: physics threads, where the simulator has its own.
-        progress: show progress bars.
-        sweeps: episodes along each weight, where a report has made them already (`sweep_weights`); else None.
+        episodes: Number of episodes per style.
+        switch_episodes: Number of episodes in which the style switches; 0 for none.
+        steps: Length of an episode in control steps, or None for the domain's own.
+        seed: Seed of initial states, styles and sampled actions. The same seed gives the same files.
+        num_threads: Number of physics threads, if the simulator has its own.
+        progress: Whether to show progress bars.
+        sweeps: Episodes along each weight, if a report has already recorded them (`sweep_weights`); otherwise None.
 
     Raises:
-        ValueError: if `episodes` is below 1.
+        ValueError: If `episodes` is below 1.
     """
 
     episodes: int = 20
@@ -37,16 +37,11 @@ class EvaluationSettings:
     sweeps: Sequence[WeightSweep] | None = None
 
     def __post_init__(self) -> None:
-        """Refuses what cannot be evaluated."""
+        """Check the number of episodes."""
         if self.episodes < 1:
             raise ValueError(f"episodes per style must be at least 1, got {self.episodes}")
 
     @property
     def rollout(self) -> RolloutOptions:
-        """The settings of every rollout, as keyword arguments."""
-        return {
-            "steps": self.steps,
-            "seed": self.seed,
-            "num_threads": self.num_threads,
-            "progress": self.progress,
-        }
+        """Settings of every rollout, as keyword arguments."""
+        return {"steps": self.steps, "seed": self.seed, "num_threads": self.num_threads, "progress": self.progress}

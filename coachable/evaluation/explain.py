@@ -1,4 +1,4 @@
-"""`coachable explain`: which inputs the policy listens to, as the paper's tables (Appendix D)."""
+"""`coachable explain`: rank the inputs of a policy, as in the paper's tables (Appendix D)."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from torch import Tensor
 
 from coachable.domain import Domain
 from coachable.evaluation.attribution import Ranking, import_captum, input_groups, rank_groups
-from coachable.evaluation.figures import drawing, readable
+from coachable.evaluation.figures import drawing
 from coachable.evaluation.rollouts import RolloutOptions, record_styles
 from coachable.evaluation.style_grid import markdown_table, write_csv
+from coachable.evaluation.wording import readable
 from coachable.networks.plain import ActionOutputs
 from coachable.styles import StyleSpace
 from coachable.training.weights import domain_of, load_policy
@@ -29,28 +30,23 @@ _RECORDED = 250  # states kept of an episode, from which `states` are chosen
 
 
 def explain(
-    source: str | Path,
-    out: Path,
-    *,
-    episodes: int = 100,
-    states: int = 16,
-    **options: Unpack[RolloutOptions],
+    source: str | Path, out: Path, *, episodes: int = 100, states: int = 16, **options: Unpack[RolloutOptions]
 ) -> str:
     """Rank the inputs of a policy over states of its own episodes; write `explain.csv`, `explain.md`, `explain.png`.
 
     Args:
-        source: checkpoint, run folder, weights file, or the name of a domain that ships with weights.
-        out: folder for the results, created if missing.
-        episodes: trajectories, each under a style drawn from the training distribution (the paper has 100).
-        states: per trajectory, evenly spaced.
-        **options: see `RolloutOptions`; the baselines are seeded, too.
+        source: Checkpoint, run folder, weights file, or the name of a domain that ships with weights.
+        out: Folder for the results, created if missing.
+        episodes: Number of trajectories, each with a style from the training distribution (100 in the paper).
+        states: Number of evenly spaced states per trajectory.
+        **options: See `RolloutOptions`; the seed is also that of the baselines.
 
     Returns:
-        The two tables side by side, Markdown.
+        The tables of both methods side by side, as Markdown.
 
     Raises:
-        ImportError: without the extra `explain`.
-        ValueError: if the domain's groups do not fit its observation.
+        ImportError: If the extra `explain` is not installed.
+        ValueError: If the domain's groups do not fit its observation.
     """
     import_captum()
     agent = load_policy(source)
@@ -79,18 +75,21 @@ def record_states(
     states: int = 16,
     **options: Unpack[RolloutOptions],
 ) -> list[Tensor]:
-    """Inputs of the network along episodes of its own, each with a style from the training distribution.
+    """Record inputs of the network along episodes of the policy, each with a style from the training distribution.
 
     Args:
-        domain: what to run in.
-        policy: reads `observation` and `style`.
-        space: its styles.
-        episodes: number of trajectories.
-        states: at most so many per trajectory, evenly spaced.
-        **options: see `RolloutOptions`.
+        domain: Domain in which the policy acts.
+        policy: Policy that reads `observation` and `style`.
+        space: Its style space.
+        episodes: Number of trajectories, at least 2.
+        states: Largest number of evenly spaced states per trajectory.
+        **options: See `RolloutOptions`.
 
     Returns:
-        Per trajectory (S, observation + theta), the observation and the encoded style.
+        Observation and encoded style (S, observation + theta) of each trajectory.
+
+    Raises:
+        ValueError: If there are fewer than 2 episodes or no states.
     """
     if episodes < 2 or states < 1:
         raise ValueError(f"expected at least 2 episodes and 1 state of each, got {episodes=}, {states=}")
@@ -108,7 +107,7 @@ def record_states(
 
 
 class _Observations:
-    """Takes the place of a domain's measures while recording: keeps the observations of every `every`-th step."""
+    """Stand-in for a domain's measures that keeps the observation of every `every`-th step."""
 
     def __init__(self, every: int) -> None:
         self.every = every

@@ -16,6 +16,7 @@ from matplotlib import pyplot as plt
 from coachable.domain import Domain
 from coachable.evaluation.runs import describe
 from coachable.evaluation.style_grid import StyleGrid, mean_of, measured_column, published
+from coachable.evaluation.wording import readable
 from coachable.styles import Choice, StyleSpace
 
 _PANELS_PER_ROW = 4
@@ -26,40 +27,40 @@ MARKERS = "osD^vP*X"  # distinguishable without colour as well
 def drawing(
     path: Path, rows: int = 1, columns: int = 1, *, size: tuple[float, float], grid: bool = True, **options: Any
 ) -> Iterator[np.ndarray]:
-    """Give the panels (rows, columns) of a figure, which is written to a file at the end of the block.
+    """Provide the panels (rows, columns) of a figure that is written to a file at the end of the block.
 
     Args:
-        path: PNG, SVG or PDF file; its folder exists.
-        rows: of panels.
-        columns: of panels.
-        size: width and height [inch].
-        grid: whether the panels have grid lines.
-        **options: further arguments of `matplotlib.pyplot.subplots`.
+        path: PNG, SVG or PDF file in an existing folder.
+        rows: Number of rows of panels.
+        columns: Number of columns of panels.
+        size: Width and height [inch].
+        grid: Whether the panels have grid lines.
+        **options: Further arguments of `matplotlib.pyplot.subplots`.
     """
     with plt.rc_context({"axes.grid": grid, "grid.alpha": 0.3 if grid else 1.0}):
         figure, panels = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained", **options)
     try:
         yield panels
-        # Without the version of matplotlib, the same numbers give the same file.
+        # The version of matplotlib is left out, so that the same numbers give the same file.
         figure.savefig(path, dpi=130, metadata={"Software": None} if path.suffix == ".png" else None)
     finally:
         plt.close(figure)
 
 
 def shade(index: int, count: int) -> Any:
-    """Return the colour of the line `index` of `count` whose order has a meaning, such as rising weights."""
+    """Return the colour of line `index` of `count` ordered lines, for example of rising weights."""
     return plt.get_cmap("viridis")(0.9 * index / max(count - 1, 1))
 
 
 def draw_style_grid(grid: StyleGrid, domain: Domain, space: StyleSpace, path: Path, title: str) -> None:
-    """Draw measured against requested style, and the domain's published metrics over the same axis.
+    """Draw measured over requested style, and the domain's published metrics over the same axis.
 
     Args:
-        grid: the evaluation.
-        domain: its columns and units.
-        space: its style space.
+        grid: The evaluation.
+        domain: Domain with the columns and units.
+        space: Its style space.
         path: PNG file to write.
-        title: above the figure.
+        title: Title of the figure.
     """
     axis, lines = grid_lines(grid.cells, space)
     rows, formats = grid.rows(), published(domain, grid.episodes)
@@ -84,29 +85,27 @@ def draw_style_grid(grid: StyleGrid, domain: Domain, space: StyleSpace, path: Pa
             if name == axis:
                 bounds = [space[name].low, space[name].high]
                 panel.plot(bounds, bounds, color="0.6", ls="--", lw=1, label="as requested")
-                panel.set_ylabel(f"measured {_with_unit(name, space[name].unit)}")
+                panel.set_ylabel(f"measured {with_unit(name, space[name].unit)}")
             else:
-                panel.set_ylabel(_with_unit(name, domain.units.get(name, "")))
+                panel.set_ylabel(with_unit(name, domain.units.get(name, "")))
                 if formats.get(column, "").endswith("%"):
                     panel.set_ylim(-0.03, 1.05)
-            panel.set_xlabel(
-                f"requested {_with_unit(axis, space[axis].unit)}" if axis else "style, by row of the table"
-            )
+            panel.set_xlabel(f"requested {with_unit(axis, space[axis].unit)}" if axis else "style, by row of the table")
         if axes[0, 0].get_legend_handles_labels()[1]:
             axes[0, 0].legend(fontsize=8)
         axes[0, 0].figure.suptitle(title, fontsize=10)
 
 
 def grid_lines(cells: Sequence[dict[str, Any]], space: StyleSpace) -> tuple[str | None, dict[str, list[int]]]:
-    """Choose what a figure of a style grid shows over its horizontal axis.
+    """Choose the horizontal axis and the lines of a figure of a style grid.
 
     Args:
-        cells: styles by parameter name.
-        space: their style space.
+        cells: Styles by parameter name.
+        space: Their style space.
 
     Returns:
-        The numeric parameter with most values, and the cells of each combination of the others, two or more, by label;
-        None and nothing where there is no such parameter or there are too many combinations.
+        The numeric parameter with most values, and the cells of each combination of the others, by label. None and an
+        empty dictionary if there is no such parameter, or too many combinations, or a line of a single cell.
     """
     counts = {name: len({c[name] for c in cells}) for name in cells[0] if not isinstance(space[name], Choice)}
     axis = max(counts, key=lambda name: counts[name], default=None)
@@ -120,10 +119,6 @@ def grid_lines(cells: Sequence[dict[str, Any]], space: StyleSpace) -> tuple[str 
     return (axis, lines) if drawable else (None, {})
 
 
-def _with_unit(name: str, unit: str) -> str:
+def with_unit(name: str, unit: str) -> str:
+    """Return a readable name with its unit in brackets."""
     return f"{readable(name)} [{unit}]" if unit else readable(name)
-
-
-def readable(name: Any) -> str:
-    """A name as people write it."""
-    return str(name).replace("_", " ")

@@ -1,4 +1,4 @@
-"""Results on disk that are either complete or not there."""
+"""Atomic output: files and folders that are either complete or not written at all."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ __all__ = ["complete_file", "complete_folder"]
 
 @contextlib.contextmanager
 def complete_folder(out: Path) -> Iterator[Path]:
-    """Give a folder to write into, whose files appear in `out` when the block ends without an error or interruption.
+    """Provide a temporary folder whose files are moved to `out` if the block ends without an error or interruption.
 
     Args:
-        out: created if missing; files of the same names in it are replaced, others stay.
+        out: Folder for the results, created if missing; existing files are kept unless they have the same names.
 
     Raises:
-        NotADirectoryError: if `out` is a file.
-        OSError: if nothing can be written there.
+        NotADirectoryError: If `out` is a file.
+        OSError: If nothing can be written there.
     """
     if out.exists() and not out.is_dir():
         raise NotADirectoryError(f"{out} is a file: expected a folder, or a name that is free")
@@ -38,20 +38,20 @@ def complete_folder(out: Path) -> Iterator[Path]:
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
         if made:
-            with contextlib.suppress(OSError):  # it is not empty: all went well
+            with contextlib.suppress(OSError):  # it is not empty if the block succeeded
                 out.rmdir()
 
 
 @contextlib.contextmanager
 def complete_file(out: Path) -> Iterator[Path]:
-    """Give a file to write, which takes its place at `out` when the block ends without an error or interruption.
+    """Provide a temporary file that is moved to `out` if the block ends without an error or interruption.
 
     Args:
-        out: replaced if it exists; its folder is created if missing.
+        out: File to write, replaced if it exists; its folder is created if missing.
 
     Raises:
-        IsADirectoryError: if `out` is a folder.
-        OSError: if nothing can be written there.
+        IsADirectoryError: If `out` is a folder.
+        OSError: If nothing can be written there.
     """
     if out.is_dir():
         raise IsADirectoryError(f"{out} is a folder: expected the name of a file")

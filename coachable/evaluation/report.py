@@ -1,4 +1,4 @@
-"""`coachable report`: everything that was measured of an agent on one page, with intervals over seeds."""
+"""`coachable report`: all measurements of an agent on one page, with intervals over seeds."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from tqdm import tqdm
 from coachable import __version__
 from coachable.domain import Domain
 from coachable.evaluation.evaluation_settings import EvaluationSettings
-from coachable.evaluation.figures import readable
 from coachable.evaluation.outputs import complete_folder
 from coachable.evaluation.report_figures import draw_metrics, draw_requests, draw_switches, draw_tradeoffs
 from coachable.evaluation.report_page import Page, paragraph, picture, shown, table
@@ -26,8 +25,10 @@ from coachable.evaluation.runs import (
     evaluate_run,
     flat_row,
     response_rows,
+    sweep_estimate,
 )
-from coachable.evaluation.style_grid import acting, mean_of, training_counts, write_csv
+from coachable.evaluation.style_grid import acting, training_counts, write_csv
+from coachable.evaluation.wording import readable
 from coachable.styles import Setpoint
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy, widths_of
 
@@ -40,15 +41,15 @@ def report(sources: Sequence[str | Path], out: Path, **settings: Any) -> str:
     """Evaluate an agent, or several trained with different seeds, and write the report.
 
     Args:
-        sources: checkpoints, run folders, weights files, or names of domains that ship with weights.
-        out: folder for `report.html`, its figures (PNG) and tables (CSV), created if missing.
-        **settings: see `write_report`.
+        sources: Checkpoints, run folders, weights files, or names of domains that ship with weights.
+        out: Folder for `report.html`, its figures (PNG) and tables (CSV), created if missing.
+        **settings: Keyword arguments of `write_report`.
 
     Returns:
-        A short summary, text.
+        A short summary as text.
 
     Raises:
-        ValueError: if the agents belong to different domains or styles.
+        ValueError: If the agents belong to different domains or have different styles.
     """
     agents = [load_policy(source) for source in sources]
     first = agents[0]
@@ -77,22 +78,25 @@ def write_report(
 ) -> str:
     """Evaluate the agents and write `report.html` with its figures and tables.
 
-    A *run* is one evaluation of everything. One agent is evaluated with several seeds of the initial states; several
-    agents once each. Values are interquartile means over the runs' mean values, intervals stratified bootstrap over the
-    runs.
+    A *run* is one complete evaluation. A single agent is evaluated with several seeds of the initial states, several
+    agents once each. Values are interquartile means over the mean values of the runs; intervals are from a stratified
+    bootstrap over the runs.
 
     Args:
-        domain: what to run in.
-        agents: policies by name, of one style space.
-        out: folder, created if missing.
-        seeds: runs of a single agent.
-        episodes: per run and style, and per run and value of a weight.
-        switch_episodes: per run, with styles that switch.
-        sweep_points: values of each weight.
-        **options: see `RolloutOptions`; the seed is that of the first run, and the next ones follow.
+        domain: Domain in which the agents act.
+        agents: Policies by name, all of the same style space.
+        out: Folder to write into, created if missing.
+        seeds: Number of runs of a single agent.
+        episodes: Number of episodes per run and style, and per run and value of a weight.
+        switch_episodes: Number of episodes per run in which the style switches.
+        sweep_points: Number of values of each weight.
+        **options: See `RolloutOptions`; the seed is that of the first run, and later runs count up from it.
 
     Returns:
-        A short summary, text.
+        A short summary as text.
+
+    Raises:
+        ValueError: If there are no runs.
     """
     seed, steps, progress = options.get("seed", 0), options.get("steps"), options.get("progress", True)
     if len(agents) == 1:
@@ -118,24 +122,20 @@ def write_report(
         if domain.evaluation is not None:
             settings = EvaluationSettings(episodes, switch_episodes, sweeps=runs[0].sweeps, **options)
             _own(page, domain, agent, folder, settings)
-        command = [f"coachable report {' '.join(agents)} --seed {seed} --episodes {episodes}"]
-        command += [f"--switch-episodes {switch_episodes} --sweep-points {sweep_points}"]
-        command += [f"--seeds {seeds}"] if len(agents) == 1 else []
-        command += [f"--steps {steps}"] if steps else []
-        footer = f"coachable {__version__}; made by: {' '.join(command)}"
-        (folder / "report.html").write_text(page.text(footer), encoding="utf-8")
+        command = f"coachable report {' '.join(agents)} --seed {seed} --episodes {episodes}"
+        command += f" --switch-episodes {switch_episodes} --sweep-points {sweep_points}"
+        command += f" --seeds {seeds}" if len(agents) == 1 else ""
+        command += f" --steps {steps}" if steps else ""
+        html = page.text(f"coachable {__version__}; made by: {command}")
+        (folder / "report.html").write_text(html, encoding="utf-8")
     return _text(styles, runs, formats, out)
 
 
 def _formats(styles: StyleTable, domain: Domain) -> dict[str, str]:
-    """Metrics to show, with the format of their values: the domain's published columns, or everything measured."""
-    published = {
-        name: domain.columns[styles.column(name)] for name in styles.scores if styles.column(name) in domain.columns
-    }
-    order = list(domain.columns)
-    if published:
-        return dict(sorted(published.items(), key=lambda item: order.index(styles.column(item[0]))))
-    return {name: ".0%" if name == "survived" else ".3g" for name in styles.scores}
+    """Return the format of each metric to show: of the domain's published columns, or else of all metrics."""
+    names = {styles.column(name): name for name in styles.scores}
+    published = {names[column]: form for column, form in domain.columns.items() if column in names}
+    return published or {name: ".0%" if name == "survived" else ".3g" for name in styles.scores}
 
 
 def _lead(agents: Mapping[str, LoadedPolicy], runs: Sequence[Run], episodes: int) -> str:
@@ -162,11 +162,8 @@ def _styles(page: Page, styles: StyleTable, formats: Mapping[str, str], agent: L
     free = [name for name in metrics if name not in styles.cells[0]] or metrics
     draw_metrics(styles, agent.space, free, by_column, out / "styles.png")
     page.section("Summary", table(summary, by_column))
-    page.section(
-        "Every style",
-        picture(out / "styles.png", "metrics per style, with intervals"),
-        table(rows, by_column, colour=True),
-    )
+    figure = picture(out / "styles.png", "metrics per style, with intervals")
+    page.section("Every style", figure, table(rows, by_column, colour=True))
 
 
 def _requests(page: Page, styles: StyleTable, agent: LoadedPolicy, runs: Sequence[Run], out: Path) -> None:
@@ -191,11 +188,10 @@ def _switches(
     draw_switches(runs, period, out / "switches.png")
     waits = [run.switching.comply_seconds for run in runs]
     row: dict[str, Any] = {
-        "complied": estimate(np.array([run.switching.complied for run in runs])),
-        "median_seconds": estimate(np.array([wait.median().item() if len(wait) else np.nan for wait in waits])),
+        "complied": estimate([run.switching.complied for run in runs]),
+        "median_seconds": estimate([wait.median().item() if len(wait) else np.nan for wait in waits]),
+        **{name: estimate([run.switching.metrics[name] for run in runs]) for name in runs[0].switching.metrics},
     }
-    for name in runs[0].switching.metrics:
-        row[name] = estimate(np.array([run.switching.metrics[name] for run in runs]))
     switches = sum(run.switching.switches for run in runs)
     write_csv([flat_row(row | {"switches": switches})], out / "switches.csv")
     page.section(
@@ -215,15 +211,8 @@ def _tradeoffs(page: Page, styles: StyleTable, runs: Sequence[Run], formats: Map
     success = _success(runs, formats)
     draw_tradeoffs(runs, success, formats.get(success, ""), out / "tradeoffs.png")
     rows = [
-        {
-            "weight": sweeps[0].weight,
-            "value": float(value),
-            "style": estimate(np.array([mean_of(sweep.episodes[sweep.score][i]) for sweep in sweeps])),
-            **{
-                name: estimate(np.array([mean_of(sweep.episodes[name][i]) for sweep in sweeps]))
-                for name in sweeps[0].episodes
-            },
-        }
+        {"weight": sweeps[0].weight, "value": float(value), "style": sweep_estimate(sweeps, sweeps[0].score, i)}
+        | {name: sweep_estimate(sweeps, name, i) for name in sweeps[0].episodes}
         for sweeps in zip(*(run.sweeps for run in runs), strict=True)
         for i, value in enumerate(sweeps[0].values)
     ]
@@ -242,7 +231,7 @@ def _tradeoffs(page: Page, styles: StyleTable, runs: Sequence[Run], formats: Map
 
 
 def _own(page: Page, domain: Domain, agent: LoadedPolicy, out: Path, settings: EvaluationSettings) -> None:
-    """What a domain measures in its own way, of the first agent: each table that it writes, with its figure."""
+    """Add the tables and figures that the domain's own evaluation writes for the first agent."""
     assert domain.evaluation is not None
     folder = out / domain.name
     domain.evaluation(domain, agent, folder, settings)
@@ -269,7 +258,7 @@ def _number(text: str) -> float | str:
 
 
 def _success(runs: Sequence[Run], formats: Mapping[str, str]) -> str:
-    """The first published metric says whether the task was done."""
+    """Return the first published metric, which measures success at the task."""
     return next((name for name in formats if name in runs[0].sweeps[0].episodes), "survived")
 
 
@@ -278,6 +267,6 @@ def _text(styles: StyleTable, runs: Sequence[Run], formats: Mapping[str, str], o
     for row, form in zip(styles.summary(list(formats)), formats.values(), strict=True):
         extremes = "; ".join(f"{t} {shown(row[t], form)} at {row[f'{t} at']}" for t in ("lowest", "highest"))
         lines.append(f"{readable(row['metric'])}: {shown(row['all styles'], form)}; {extremes}")
-    complied = estimate(np.array([run.switching.complied for run in runs]))
+    complied = estimate([run.switching.complied for run in runs])
     lines.append(f"switches complied with: {shown(complied, '.0%')}")
     return "\n".join([*lines, f"wrote {out / 'report.html'}"])

@@ -1,4 +1,4 @@
-"""Figures of a report: metrics per style, requested against measured, switches, Pareto curves."""
+"""Figures of a report: metrics per style, requested and measured values, switches, Pareto curves."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import PercentFormatter
 
-from coachable.evaluation.figures import MARKERS, drawing, grid_lines, readable
-from coachable.evaluation.runs import Estimate, Run, StyleTable, estimate
-from coachable.evaluation.style_grid import mean_of
+from coachable.evaluation.figures import MARKERS, drawing, grid_lines, with_unit
+from coachable.evaluation.runs import Estimate, Run, StyleTable, estimate, sweep_estimate
 from coachable.evaluation.sweep import UNIT_REWARD
+from coachable.evaluation.wording import readable
 from coachable.styles import Choice, StyleSpace
 
 __all__ = ["draw_metrics", "draw_requests", "draw_switches", "draw_tradeoffs"]
@@ -26,7 +26,15 @@ _GROWTH_POINTS = 200
 def draw_metrics(
     table: StyleTable, space: StyleSpace, metrics: Sequence[str], formats: Mapping[str, str], path: Path
 ) -> None:
-    """Each metric in every style: lines over a numeric parameter where the grid has one, else one point per style."""
+    """Draw each metric in every style: as lines over a numeric parameter if there is one, else as one point each.
+
+    Args:
+        table: The metrics.
+        space: The style space.
+        metrics: Metrics to draw.
+        formats: Format specification by column; shares end in "%".
+        path: PNG file to write.
+    """
     axis, lines = grid_lines(table.cells, space)
     if axis is None:
         _draw_points(table, metrics, formats, path)
@@ -36,14 +44,14 @@ def draw_metrics(
             for index, (label, cells) in enumerate(lines.items()):
                 estimates = [table.of(metric, [i]) for i in cells]
                 _line(panel, [table.cells[i][axis] for i in cells], estimates, index, label, len(lines))
-            panel.set_xlabel(_named(space, axis, "requested "))
+            panel.set_xlabel(f"requested {with_unit(axis, space[axis].unit)}")
             panel.set_ylabel(readable(metric))
             _as_share(panel, formats.get(table.column(metric), ""))
         _legend(panels[0], len(lines))
 
 
 def draw_requests(table: StyleTable, space: StyleSpace, parameters: Sequence[str], path: Path) -> None:
-    """Requested against measured value of each measured parameter, one line per option of the first choice."""
+    """Draw measured over requested values of some parameters, one line per option of the first choice."""
     choice = next((p for p in space.parameters if isinstance(p, Choice) and p.name in table.cells[0]), None)
     options: Sequence[Any] = choice.options if choice else (None,)
     with _panels(path, len(parameters)) as panels:
@@ -56,24 +64,19 @@ def draw_requests(table: StyleTable, space: StyleSpace, parameters: Sequence[str
                 shown = [(value, table.of(name, cells)) for value, cells in zip(values, members, strict=True) if cells]
                 label = readable(option) if choice else "measured"
                 _line(panel, [x for x, _ in shown], [y for _, y in shown], index, label, len(options))
-            panel.set_xlabel(_named(space, name, "requested "))
-            panel.set_ylabel(_named(space, name, "measured "))
+            panel.set_xlabel(f"requested {with_unit(name, space[name].unit)}")
+            panel.set_ylabel(f"measured {with_unit(name, space[name].unit)}")
         _legend(panels[0], len(options) + 1)
 
 
 def draw_switches(runs: Sequence[Run], period_seconds: float, path: Path) -> None:
-    """Share of the switches that were complied with, over the time since the switch."""
+    """Draw the share of the switches that the agent complied with over the time since the switch."""
     with _panels(path, 1) as (panel,):
         times = np.linspace(0.0, period_seconds, _GROWTH_POINTS)
-        shares = np.array(
-            [
-                (run.switching.comply_seconds.double().numpy()[:, None] <= times + 1e-9).sum(0) / run.switching.switches
-                if run.switching.switches
-                else np.full(len(times), np.nan)
-                for run in runs
-            ]
-        )
-        estimates = [estimate(column) for column in shares.T]
+        counts = np.array([run.switching.switches or np.nan for run in runs])
+        waits = [run.switching.comply_seconds.double().numpy() for run in runs]
+        complied = np.array([(wait[:, None] <= times + 1e-9).sum(0) for wait in waits])  # (runs, times)
+        estimates = [estimate(shares) for shares in complied.T / counts]
         panel.plot(times, [e.value for e in estimates])
         panel.fill_between(times, [e.low for e in estimates], [e.high for e in estimates], alpha=0.25, lw=0)
         panel.set_xlabel("time since the switch [s]")
@@ -83,27 +86,23 @@ def draw_switches(runs: Sequence[Run], period_seconds: float, path: Path) -> Non
 
 
 def draw_tradeoffs(runs: Sequence[Run], success: str, form: str, path: Path) -> None:
-    """Task success against the amount of style along each weight, neutral to maximum (paper, Pareto curves)."""
+    """Draw task success over the amount of style along each weight, from neutral to maximum (Pareto curves)."""
     with _panels(path, len(runs[0].sweeps)) as panels:
         for panel, sweeps in zip(panels, zip(*(run.sweeps for run in runs), strict=True), strict=False):
             score = sweeps[0].score
-            x, y = ([_point(sweeps, metric, i) for i in range(len(sweeps[0].values))] for metric in (score, success))
-            panel.errorbar(
-                [e.value for e in x], [e.value for e in y], _reach(y), _reach(x), marker="o", ms=5, capsize=2, lw=1
-            )
+            positions = range(len(sweeps[0].values))
+            x, y = ([sweep_estimate(sweeps, metric, i) for i in positions] for metric in (score, success))
+            points = [e.value for e in x], [e.value for e in y]
+            panel.errorbar(*points, _reach(y), _reach(x), marker="o", ms=5, capsize=2, lw=1)
             for position, (value, at, height) in enumerate(zip(sweeps[0].values, x, y, strict=True)):
                 if position in (0, len(x) - 1) and not np.isnan(at.value + height.value):
                     point = at.value, height.value
                     panel.annotate(f"{value:g}", point, (5, 5), textcoords="offset points", fontsize=8)
             panel.set_title(readable(sweeps[0].weight), fontsize=10)
-            amount = "style reward per step at weight 1" if score == UNIT_REWARD else f"measured {readable(score)}"
-            panel.set_xlabel(amount)
+            unit_reward = "style reward per step at weight 1"
+            panel.set_xlabel(unit_reward if score == UNIT_REWARD else f"measured {readable(score)}")
             panel.set_ylabel(readable(success))
             _as_share(panel, form)
-
-
-def _point(sweeps: Sequence[Any], metric: str, position: int) -> Estimate:
-    return estimate(np.array([mean_of(sweep.episodes[metric][position]) for sweep in sweeps]))
 
 
 def _draw_points(table: StyleTable, metrics: Sequence[str], formats: Mapping[str, str], path: Path) -> None:
@@ -125,27 +124,18 @@ def _line(panel: Axes, x: Sequence[float], estimates: Sequence[Estimate], index:
     span = max(x) - min(x) if len(x) > 1 else 1.0
     offset = (index - (lines - 1) / 2) * 0.012 * span  # so that intervals do not cover each other
     y = [e.value for e in estimates]
-    panel.errorbar(
-        np.array(x) + offset,
-        y,
-        _reach(estimates),
-        marker=MARKERS[index % len(MARKERS)],
-        color=f"C{index}",
-        label=label,
-        capsize=2,
-        ms=5,
-        lw=1.2,
-    )
+    style: dict[str, Any] = {"marker": MARKERS[index % len(MARKERS)], "color": f"C{index}", "label": label}
+    panel.errorbar(np.array(x) + offset, y, _reach(estimates), capsize=2, ms=5, lw=1.2, **style)
 
 
 def _reach(estimates: Sequence[Estimate]) -> np.ndarray:
-    """(2, n) lengths of the error bars; at least 0, because an interquartile mean may leave its percentile interval."""
+    """Return lengths of error bars (2, n), at least 0 because an interquartile mean may lie outside its interval."""
     return np.array([[e.value - e.low for e in estimates], [e.high - e.value for e in estimates]]).clip(min=0)
 
 
 @contextlib.contextmanager
 def _panels(path: Path, count: int) -> Iterator[list[Axes]]:
-    """Give so many panels of a figure, see `drawing`."""
+    """Provide `count` panels of a figure, see `drawing`."""
     columns = 2 if count == 4 else min(count, _COLUMNS)
     rows = -(-count // columns)
     size = (4.0 * columns if count > 1 else 5.4, 3.2 * rows)
@@ -166,8 +156,3 @@ def _as_share(panel: Axes, form: str) -> None:
     if form.endswith("%"):
         panel.set_ylim(-0.03, 1.05)
         panel.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-
-
-def _named(space: StyleSpace, name: str, prefix: str) -> str:
-    unit = space[name].unit
-    return f"{prefix}{readable(name)}{f' [{unit}]' if unit else ''}"

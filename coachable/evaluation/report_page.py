@@ -1,4 +1,4 @@
-"""A report as one HTML file without references to others: tables, pictures inline, no scripts."""
+"""HTML page of a report: a single file with tables and inline pictures, without scripts."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from coachable.evaluation.figures import readable
 from coachable.evaluation.runs import Estimate
+from coachable.evaluation.wording import readable
 
 __all__ = ["Page", "paragraph", "picture", "shown", "table"]
 
@@ -39,24 +39,23 @@ footer { color: #5b6675; font-size: 13px; margin-top: 3rem; }
 
 
 class Page:
-    """Collects sections and gives the file's text.
+    """HTML page that is made of sections.
 
     Args:
-        title: of the page.
-        lead: paragraph below it.
+        title: Title of the page.
+        lead: Paragraph below the title.
     """
 
     def __init__(self, title: str, lead: str) -> None:
-        self.title = title
-        self.lead = lead
+        self.title, self.lead = title, lead
         self._sections: list[tuple[str, str]] = []
 
     def section(self, title: str, *parts: str) -> None:
-        """Add a section of parts made by `paragraph`, `picture` and `table`."""
+        """Add a section of parts from `paragraph`, `picture` and `table`."""
         self._sections.append((title, "\n".join(parts)))
 
     def text(self, footer: str) -> str:
-        """The whole file."""
+        """Return the HTML text of the page."""
         name = html.escape(self.title)
         links = " ".join(f'<a href="#s{i}">{html.escape(t)}</a>' for i, (t, _) in enumerate(self._sections))
         body = "\n".join(
@@ -72,14 +71,14 @@ class Page:
 
 
 def paragraph(text: str) -> str:
-    """Plain text."""
+    """Return a paragraph of plain text as HTML."""
     return f"<p>{html.escape(text)}</p>"
 
 
 def picture(path: Path, description: str) -> str:
-    """A PNG, inline, with letters as large as in the other pictures."""
+    """Return a PNG file as inline HTML, at the scale that all pictures share."""
     content = path.read_bytes()
-    width = int.from_bytes(content[16:20], "big")  # of the header (PNG specification, IHDR)
+    width = int.from_bytes(content[16:20], "big")  # from the header (PNG specification, IHDR)
     data = base64.b64encode(content).decode()
     return (
         f'<figure><img width="{round(width / _DENSITY)}" alt="{html.escape(description)}" '
@@ -88,12 +87,12 @@ def picture(path: Path, description: str) -> str:
 
 
 def table(rows: Sequence[Mapping[str, Any]], formats: Mapping[str, str], colour: bool = False) -> str:
-    """Rows as a table.
+    """Return rows as an HTML table.
 
     Args:
-        rows: values by column name; an `Estimate` is shown with its interval.
-        formats: format specification of a column's numbers; ".3g" where none is given.
-        colour: shade each column's estimates from its lowest (white) to its highest value.
+        rows: Values by column name; an `Estimate` is shown with its interval.
+        formats: Format specification of numbers by column or metric; by default ".3g".
+        colour: Whether to shade the estimates of a column from the lowest (white) to the highest value.
     """
     columns = list(rows[0])
     numeric = {c for c in columns if any(isinstance(row[c], Estimate | float | int) for row in rows)}
@@ -112,7 +111,7 @@ def table(rows: Sequence[Mapping[str, Any]], formats: Mapping[str, str], colour:
 
 
 def shown(value: Any, form: str) -> str:
-    """A value as text: numbers by their format, an estimate with its interval, "n/a" for NaN."""
+    """Return a value as text: a number in a format, an estimate with its interval, "n/a" for NaN."""
     if isinstance(value, Estimate):
         if math.isnan(value.value):
             return _NOTHING
@@ -142,5 +141,4 @@ def _shade(value: Estimate, bounds: tuple[float, float]) -> str:
     low, high = bounds
     if math.isnan(value.value) or high <= low:
         return ""
-    share = (value.value - low) / (high - low)
-    return f' style="background: rgba(29, 95, 168, {0.30 * share:.3f})"'
+    return f' style="background: rgba(29, 95, 168, {0.30 * ((value.value - low) / (high - low)):.3f})"'

@@ -1,4 +1,4 @@
-"""Episodes under given styles, recorded step by step."""
+"""Rollouts with given styles, recorded step by step."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ StyleSchedule = Callable[[int], Tensor]
 
 
 class RolloutOptions(TypedDict, total=False):
-    """How episodes are run, whatever is measured in them: keyword arguments that all evaluations share.
+    """Keyword arguments of all evaluations.
 
     Attributes:
-        steps: length of an episode; default: the domain's.
-        seed: of the initial states, of styles that are drawn, and of sampled actions; default 0. The same seed gives
-            the same results.
-        num_threads: physics threads, where the simulator has its own; default: all free cores.
-        progress: whether to show a progress bar; default: yes.
+        steps: Length of an episode; by default the domain's.
+        seed: Seed of the initial states, of drawn styles and of sampled actions; by default 0. The same seed gives the
+            same results.
+        num_threads: Number of physics threads, if the simulator has its own; by default all free cores.
+        progress: Whether to show a progress bar; by default true.
     """
 
     steps: int | None
@@ -40,13 +40,13 @@ class RolloutOptions(TypedDict, total=False):
 
 
 class Rollout:
-    """Let a policy act in a batch of environments, step by step, under styles that may change at any step.
+    """Step-by-step rollout of a policy in a batch of environments, with styles that may change at any step.
 
-    Every loop in this package that acts does it through this class, so that seeds mean the same everywhere.
+    All evaluations, films and sessions use this class, so that a seed has the same meaning everywhere.
 
     Args:
         env: N environments with style transforms.
-        seed: of the initial states, and of the actions where they are sampled.
+        seed: Seed of the initial states and of sampled actions.
     """
 
     def __init__(self, env: EnvBase, seed: int = 0) -> None:
@@ -54,7 +54,7 @@ class Rollout:
         self.seed(seed)
 
     def seed(self, seed: int) -> None:
-        """Seed initial states and actions; `begin` must follow."""
+        """Seed initial states and actions; call `begin` afterwards."""
         self.env.set_seed(seed)
         self._chance = RandomStream(seed)
 
@@ -64,12 +64,12 @@ class Rollout:
 
     @property
     def observation(self) -> Tensor:
-        """What the policy will see next, (N, F)."""
+        """Next observation of the policy (N, F)."""
         return self._current.get("observation")
 
     @torch.no_grad()
     def step(self, policy: TensorDictModuleBase, style: Tensor) -> TensorDictBase:
-        """Make one step under styles (N, d); return the transition, batch shape (N,)."""
+        """Make one step with styles (N, d) and return the transition, batch shape (N,)."""
         with self._chance.drawn():
             transition = self.env.step(policy(self._current.set(STYLE, style)))
         self._current = step_mdp(transition)
@@ -85,11 +85,11 @@ class EpisodeRecord:
     """N episodes of up to T steps.
 
     Attributes:
-        measures: name to (T, N), what the domain measures in each step.
-        style: (T, N, d) theta that the policy saw.
-        alive: (T, N) bool, steps before and including the end of the episode.
-        survived: (N,) bool, the episode did not terminate (it may have been truncated).
-        task_return: (N,) sum of task rewards.
+        measures: The domain's measures of each step (T, N), by name.
+        style: Theta that the policy observed (T, N, d).
+        alive: Steps up to and including the end of the episode (T, N) bool.
+        survived: Whether the episode did not terminate (N,) bool; it may have been truncated.
+        task_return: Sum of task rewards (N,).
     """
 
     measures: dict[str, Tensor]
@@ -109,16 +109,16 @@ def record_episodes(
     seed: int,
     progress: str | None = None,
 ) -> EpisodeRecord:
-    """Run one episode in each env; the policy acts as it does by default (`default_interaction_type`).
+    """Run one episode in each env, with the policy's `default_interaction_type`.
 
     Args:
-        env: N envs with style transforms. It is closed at the end.
-        policy: reads `observation` and `style`.
-        style: theta (N, d) for whole episodes, or a function from the step to theta, for styles that change.
-        measures: the domain's measured style.
-        steps: length of the episodes; an env that ended earlier is stepped on but no longer recorded.
-        seed: of the initial states, and of the actions where they are sampled.
-        progress: label of a progress bar; None shows none.
+        env: N envs with style transforms; they are closed at the end.
+        policy: Policy that reads `observation` and `style`.
+        style: Theta (N, d) for whole episodes, or a function from the step to theta, for styles that change.
+        measures: The domain's measured style.
+        steps: Length of the episodes. Steps after the end of an episode are not counted as alive.
+        seed: Seed of the initial states and of sampled actions.
+        progress: Label of the progress bar, or None for no bar.
     """
     schedule: StyleSchedule = style if callable(style) else lambda _: style
     rollout = Rollout(env, seed)
@@ -166,17 +166,17 @@ def record_styles(
     """Run one episode per style in a domain, all of them in one batch.
 
     Args:
-        domain: what to run in.
-        policy: reads `observation` and `style`.
-        space: its styles.
-        style: theta (N, d) for whole episodes, or a function from the step to theta, for styles that change.
-        label: of the progress bar.
-        measures: what is measured; default: the domain's measured style.
-        steps: see `RolloutOptions`.
-        seed: see `RolloutOptions`.
-        num_threads: see `RolloutOptions`.
-        progress: see `RolloutOptions`.
-        **env_options: further arguments of `Domain.styled_env`.
+        domain: Domain in which the policy acts.
+        policy: Policy that reads `observation` and `style`.
+        space: Its style space.
+        style: Theta (N, d) for whole episodes, or a function from the step to theta, for styles that change.
+        label: Label of the progress bar.
+        measures: Measures to record; by default the domain's measured style.
+        steps: See `RolloutOptions`.
+        seed: See `RolloutOptions`.
+        num_threads: See `RolloutOptions`.
+        progress: See `RolloutOptions`.
+        **env_options: Further arguments of `Domain.styled_env`.
     """
     count = len(style(0) if callable(style) else style)
     return record_episodes(

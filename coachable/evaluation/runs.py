@@ -1,4 +1,4 @@
-"""Several evaluations of the same styles, one per seed or per trained agent, and what they say together."""
+"""Several evaluations of the same styles, one per seed or per trained agent, and their joint estimates."""
 
 from __future__ import annotations
 
@@ -26,10 +26,11 @@ __all__ = [
     "evaluate_run",
     "flat_row",
     "response_rows",
+    "sweep_estimate",
 ]
 
 SWITCH_PERIOD = 100
-"""Env steps between switches of the style."""
+"""Number of env steps between switches of the style."""
 
 _MOST_COLUMNS = 3  # of style parameters in a table
 
@@ -44,13 +45,13 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True)
 class Run:
-    """One evaluation.
+    """One complete evaluation.
 
     Attributes:
-        label: "seed 3", or the agent's name.
-        grid: episodes in every style of the grid.
-        switching: episodes with changing styles.
-        sweeps: episodes along each weight.
+        label: Label of the run, such as "seed 3" or the agent's name.
+        grid: Episodes in every style of the grid.
+        switching: Episodes in which the style switches.
+        sweeps: Episodes along each weight.
     """
 
     label: str
@@ -72,13 +73,13 @@ def evaluate_run(
     """Evaluate one agent with one seed.
 
     Args:
-        label: of the run.
-        domain: what to run in.
-        agent: its policy and styles.
-        episodes: per style and per value of a weight.
-        switch_episodes: episodes with a style that switches every `SWITCH_PERIOD` steps.
-        sweep_points: values of each weight.
-        **options: `steps`, `seed`, `num_threads` and `progress`, see `evaluate_grid`.
+        label: Label of the run.
+        domain: Domain in which the agent acts.
+        agent: The agent's policy and styles.
+        episodes: Number of episodes per style and per value of a weight.
+        switch_episodes: Number of episodes in which the style switches every `SWITCH_PERIOD` steps.
+        sweep_points: Number of values of each weight.
+        **options: See `RolloutOptions`.
     """
     return Run(
         label,
@@ -88,19 +89,25 @@ def evaluate_run(
     )
 
 
-def estimate(scores: np.ndarray) -> Estimate:
-    """Aggregate (runs, tasks), or (runs,) of one task."""
-    table = scores[:, None] if scores.ndim == 1 else scores
+def estimate(scores: np.ndarray | Sequence[float]) -> Estimate:
+    """Aggregate scores (runs, tasks), or scores (runs,) of one task."""
+    table = np.asarray(scores)
+    table = table[:, None] if table.ndim == 1 else table
     return Estimate(float(interquartile_mean(table.ravel())), *stratified_interval(table))
 
 
+def sweep_estimate(sweeps: Sequence[WeightSweep], metric: str, position: int) -> Estimate:
+    """Aggregate a metric over the runs' sweeps of one weight, at one of its values."""
+    return estimate([mean_of(sweep.episodes[metric][position]) for sweep in sweeps])
+
+
 class StyleTable:
-    """What the runs measured in each style.
+    """Metrics of several runs in each style.
 
     Attributes:
-        cells: the styles, by parameter name.
-        labels: the styles in words; of many parameters only those that differ from the default.
-        scores: metric to (runs, cells), each the mean of a run's episodes.
+        cells: The styles, by parameter name.
+        labels: The styles in words; of more than three parameters only those that differ from the default.
+        scores: Mean over each run's episodes (runs, cells), by metric.
     """
 
     def __init__(self, runs: Sequence[Run], space: StyleSpace) -> None:
@@ -113,15 +120,15 @@ class StyleTable:
         }
 
     def column(self, metric: str) -> str:
-        """Name of a metric in tables, see `measured_column`."""
+        """Return the name of a metric in tables, see `measured_column`."""
         return measured_column(metric, self.cells[0])
 
     def of(self, metric: str, cells: Sequence[int]) -> Estimate:
-        """A metric over some of the cells."""
+        """Estimate a metric over some of the cells."""
         return estimate(self.scores[metric][:, list(cells)])
 
     def rows(self, metrics: Sequence[str]) -> list[dict[str, Any]]:
-        """One row per style: its values, and an `Estimate` of each metric."""
+        """Return one row per style: its values, and an `Estimate` of each metric."""
         return [
             {
                 **({"style": self.labels[i]} if self._wide else cell),
@@ -131,7 +138,7 @@ class StyleTable:
         ]
 
     def summary(self, metrics: Sequence[str]) -> list[dict[str, Any]]:
-        """One row per metric: all styles together, the plain mean, and the styles where it is lowest and highest."""
+        """Return one row per metric: all styles together, the plain mean, and the lowest and highest style."""
         rows = []
         everywhere = range(len(self.cells))
         for metric in metrics:
@@ -142,31 +149,29 @@ class StyleTable:
                 "all styles": self.of(metric, everywhere),
                 "mean": mean_of(self.scores[metric]),
             }
-            if not np.isnan(values).all():
-                for title, i in (("lowest", int(np.nanargmin(values))), ("highest", int(np.nanargmax(values)))):
-                    row |= {title: per_cell[i], f"{title} at": self.labels[i]}
-            else:
-                nothing = Estimate(float("nan"), float("nan"), float("nan"))
-                row |= {"lowest": nothing, "lowest at": "", "highest": nothing, "highest at": ""}
+            known = not np.isnan(values).all()
+            for title, extreme in (("lowest", np.nanargmin), ("highest", np.nanargmax)):
+                i = int(extreme(values)) if known else 0
+                row |= {title: per_cell[i], f"{title} at": self.labels[i] if known else ""}
             rows.append(row)
         return rows
 
 
 def response_rows(runs: Sequence[Run], space: StyleSpace) -> list[dict[str, Any]]:
-    """How measured set-points follow their requests (`StyleGrid.response`), over the runs."""
+    """Estimate over the runs how measured set-points follow their requests (`StyleGrid.response`)."""
     per_run = [run.grid.response(space) for run in runs]
     rows = []
     for entries in zip(*per_run, strict=True):
         row: dict[str, Any] = {}
         for name, value in entries[0].items():
             numeric = name in ("slope", "rank_correlation", "mean_error")
-            row[name] = estimate(np.array([entry[name] for entry in entries])) if numeric else value
+            row[name] = estimate([entry[name] for entry in entries]) if numeric else value
         rows.append(row)
     return rows
 
 
 def describe(cell: dict[str, Any]) -> str:
-    """A style as people write it."""
+    """Return a style as text, such as "t pose, step length 0.4"."""
     if not cell:
         return "default"
     return ", ".join(f"{k} {v:g}" if isinstance(v, float | int) else f"{v}" for k, v in cell.items()).replace("_", " ")
@@ -177,7 +182,7 @@ def _requested(cell: dict[str, Any], space: StyleSpace) -> dict[str, Any]:
 
 
 def flat_row(row: dict[str, Any]) -> dict[str, Any]:
-    """A row with every `Estimate` spread over three columns, for CSV."""
+    """Return a row for CSV, with every `Estimate` in three columns."""
     flat: dict[str, Any] = {}
     for name, value in row.items():
         if isinstance(value, Estimate):

@@ -1,4 +1,4 @@
-"""Aggregates with intervals: interquartile mean, bootstrap, rank correlation."""
+"""Statistics: interquartile mean, bootstrap and Wilson intervals, rank correlation."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 
 
 def interquartile_mean(values: np.ndarray, axis: int = -1) -> np.ndarray:
-    """Mean of the middle half of the values (Agarwal et al. 2021, arXiv 2108.13264).
+    """Compute the mean of the middle half of the values (Agarwal et al. 2021, arXiv 2108.13264).
 
     Args:
-        values: numbers; NaN are left out. Of the rest a quarter, rounded down, is cut at each end of `axis`.
-        axis: axis to aggregate.
+        values: Numbers; NaN are left out. A quarter of the others, rounded down, is cut at each end of `axis`.
+        axis: Axis to aggregate.
 
     Returns:
         The means, without `axis`; NaN where there are no values.
@@ -30,18 +30,19 @@ def interquartile_mean(values: np.ndarray, axis: int = -1) -> np.ndarray:
 def stratified_interval(
     scores: np.ndarray, *, confidence: float = 0.95, resamples: int = 2000, seed: int = 0
 ) -> tuple[float, float]:
-    """Percentile bootstrap interval of the interquartile mean of several runs on several tasks.
+    """Compute the percentile bootstrap interval of the interquartile mean of several runs on several tasks.
 
-    Runs are drawn with replacement for each task separately, so every resample has every task (Agarwal et al. 2021).
+    Runs are drawn with replacement for each task separately, so every resample has every task (Agarwal et al. 2021,
+    arXiv 2108.13264).
 
     Args:
-        scores: (runs, tasks); NaN are left out.
-        confidence: probability content of the interval.
-        resamples: number of bootstrap samples.
-        seed: of the resampling.
+        scores: Scores (runs, tasks); NaN are left out.
+        confidence: Confidence level of the interval.
+        resamples: Number of bootstrap samples.
+        seed: Seed of the resampling.
 
     Returns:
-        Lower and upper bound; NaN where there are no values.
+        Lower and upper bound; NaN if there are no values.
     """
     if np.isnan(scores).all():
         return float("nan"), float("nan")
@@ -61,17 +62,17 @@ def bootstrap_interval(
     resamples: int = 2000,
     seed: int = 0,
 ) -> tuple[float, float]:
-    """Percentile bootstrap interval of a statistic of independent values.
+    """Compute the percentile bootstrap interval of a statistic of independent values.
 
     Args:
-        values: (n,) numbers; NaN are left out.
-        statistic: called as `statistic(samples, axis=-1)`.
-        confidence: probability content of the interval.
-        resamples: number of bootstrap samples.
-        seed: of the resampling.
+        values: Numbers (n,); NaN are left out.
+        statistic: Function that is called as `statistic(samples, axis=-1)`.
+        confidence: Confidence level of the interval.
+        resamples: Number of bootstrap samples.
+        seed: Seed of the resampling.
 
     Returns:
-        Lower and upper bound; NaN where there are no values.
+        Lower and upper bound; NaN if there are no values.
     """
     values = values[~np.isnan(values)]
     if len(values) == 0:
@@ -84,10 +85,10 @@ def bootstrap_interval(
 
 
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
-    """Wilson's 95 % interval of a probability, from a number of successes in a number of trials.
+    """Compute Wilson's 95 % interval of a probability from the number of successes and trials.
 
     Raises:
-        ValueError: if there are no trials, or more successes than trials.
+        ValueError: If there are no trials, or more successes than trials.
     """
     if not 0 <= successes <= trials or trials < 1:
         raise ValueError(f"{successes} successes in {trials} trials: expected 0 to trials, and at least one trial")
@@ -99,7 +100,7 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
 
 
 def rank_correlation(x: np.ndarray, y: np.ndarray) -> float:
-    """Spearman's rank correlation of two (n,) arrays; ties share their mean rank. NaN pairs are left out."""
+    """Compute Spearman's rank correlation of two arrays (n,); ties share their mean rank, NaN pairs are left out."""
     keep = ~(np.isnan(x) | np.isnan(y))
     ranks = [_ranks(values[keep]) for values in (x, y)]
     if len(ranks[0]) < 2 or min(np.ptp(r) for r in ranks) == 0:

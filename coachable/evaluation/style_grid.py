@@ -1,4 +1,4 @@
-"""The style grid: every combination of style values, several episodes each."""
+"""Style grid: several episodes for every combination of style values."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class StyleGrid:
     """Metrics of each cell of the grid.
 
     Attributes:
-        cells: the style of each cell, by parameter name.
-        episodes: name to (cells, episodes), one value per episode; NaN where an episode gives none.
-        seed: of the initial states.
-        steps: length of a full episode.
+        cells: The style of each cell, by parameter name.
+        episodes: Values of all episodes (cells, episodes), by metric; NaN where an episode has no value.
+        seed: Seed of the initial states.
+        steps: Length of a full episode.
     """
 
     cells: list[dict[str, Any]]
@@ -37,7 +37,7 @@ class StyleGrid:
     steps: int
 
     def rows(self) -> list[dict[str, Any]]:
-        """One row per cell: style, mean of each metric, and its 95 % bootstrap interval over episodes."""
+        """Return one row per cell: style, mean of each metric, and its 95 % bootstrap interval over episodes."""
         rows = []
         for index, cell in enumerate(self.cells):
             row: dict[str, Any] = {**cell, "episodes": self.episodes["survived"].shape[1]}
@@ -49,34 +49,24 @@ class StyleGrid:
         return rows
 
     def response(self, space: StyleSpace) -> list[dict[str, Any]]:
-        """How each measured set-point follows its request, for every combination of the other parameters.
+        """Measure how each set-point follows its request, for every combination of the other parameters.
 
         Returns:
             Rows with the other parameters' values, `slope` of the realised over the requested value (least squares over
             episodes), `rank_correlation`, and `mean_error`.
         """
         rows = []
-        for parameter in space.parameters:
-            if not isinstance(parameter, Setpoint) or parameter.name not in self.episodes:
-                continue
-            others = [{k: v for k, v in cell.items() if k != parameter.name} for cell in self.cells]
-            for group in _distinct(others):
+        for name in (p.name for p in space.parameters if isinstance(p, Setpoint) and p.name in self.episodes):
+            others = [{k: v for k, v in cell.items() if k != name} for cell in self.cells]
+            for group in (other for i, other in enumerate(others) if other not in others[:i]):
                 members = [i for i, other in enumerate(others) if other == group]
-                realised = self.episodes[parameter.name][members]
-                requested = np.array([self.cells[i][parameter.name] for i in members])
-                requested = np.broadcast_to(requested[:, None], realised.shape).ravel()
-                realised = realised.ravel()
+                realised = self.episodes[name][members].ravel()
+                requested = np.repeat([self.cells[i][name] for i in members], len(realised) // len(members))
                 valid = ~np.isnan(realised)
                 slope = np.polyfit(requested[valid], realised[valid], 1)[0] if valid.sum() > 1 else float("nan")
-                rows.append(
-                    {
-                        **group,
-                        "parameter": parameter.name,
-                        "slope": float(slope),
-                        "rank_correlation": rank_correlation(requested, realised),
-                        "mean_error": float(np.nanmean(np.abs(realised - requested))),
-                    }
-                )
+                row = {**group, "parameter": name, "slope": float(slope)}
+                row["rank_correlation"] = rank_correlation(requested, realised)
+                rows.append(row | {"mean_error": float(np.nanmean(np.abs(realised - requested)))})
         return rows
 
 
@@ -93,16 +83,16 @@ def evaluate_grid(
     """Run `episodes` episodes in every cell, all of them in one batch.
 
     Args:
-        domain: what to run in.
-        policy: deterministic where asked; reads `observation` and `style`.
-        space: the policy's style space.
-        episodes: per cell.
-        cells: styles by parameter name; default: the domain's grid.
-        env_options: further arguments of the domain's `make_env`.
-        **options: see `RolloutOptions`.
+        domain: Domain in which the policy acts.
+        policy: Policy that reads `observation` and `style`.
+        space: Its style space.
+        episodes: Number of episodes per cell.
+        cells: Styles by parameter name; by default the domain's grid.
+        env_options: Further arguments of the domain's `make_env`.
+        **options: See `RolloutOptions`.
 
     Raises:
-        ValueError: if there are no episodes.
+        ValueError: If there are no episodes.
     """
     if episodes < 1:
         raise ValueError(f"episodes per cell must be at least 1, got {episodes}")
@@ -117,17 +107,17 @@ def evaluate_grid(
 
 
 def measured_column(name: str, cell: Mapping[str, Any]) -> str:
-    """Column of a metric; a measured style parameter would otherwise share its name with the request."""
+    """Return the column of a metric; a measured style parameter gets a prefix to tell it from the request."""
     return f"measured_{name}" if name in cell else name
 
 
 def mean_of(values: np.ndarray) -> float:
-    """Mean of the numbers that are not NaN; NaN if there are none."""
+    """Return the mean of the numbers that are not NaN, or NaN if there are none."""
     return float(np.nanmean(values)) if not np.isnan(values).all() else float("nan")
 
 
 def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Write rows of equal keys as CSV."""
+    """Write rows with the same keys as CSV."""
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
@@ -137,13 +127,13 @@ def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 def write_results(
     out: Path, report: str, summary: Mapping[str, Any], tables: Mapping[str, Sequence[Mapping[str, Any]]]
 ) -> str:
-    """Write what an evaluation found into a folder, and return the report.
+    """Write the results of an evaluation into a folder, and return the report.
 
     Args:
-        out: the folder.
-        report: Markdown, for `report.md`.
-        summary: numbers for `summary.json`.
-        tables: rows by file name without `.csv`; a table without rows is left out.
+        out: The folder.
+        report: Markdown for `report.md`.
+        summary: Numbers for `summary.json`.
+        tables: Rows by file name without `.csv`; a table without rows is left out.
     """
     for name, rows in tables.items():
         if rows:
@@ -154,11 +144,11 @@ def write_results(
 
 
 def markdown_table(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> str:
-    """Rows as a Markdown table.
+    """Return rows as a Markdown table.
 
     Args:
-        rows: values by column name.
-        columns: column name to format specification ("" prints as is).
+        rows: Values by column name.
+        columns: Format specification by column name; "" prints the value as it is.
     """
     lines = ["| " + " | ".join(columns) + " |", "|" + "--|" * len(columns)]
     lines += ["| " + " | ".join(format(row[c], spec) for c, spec in columns.items()) + " |" for row in rows]
@@ -166,17 +156,17 @@ def markdown_table(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str]
 
 
 def training_counts(agent: LoadedPolicy) -> str:
-    """How long it was trained, such as "800,000 frames, 36,798 updates"; empty where that is not known."""
+    """Return how long an agent was trained, such as "800,000 frames, 36,798 updates", or "" if that is unknown."""
     counts = {name: agent.metadata.get(name) for name in ("frames", "updates")}
     return ", ".join(f"{count:,} {name}" for name, count in counts.items() if count)
 
 
 def published(domain: Domain, episodes: Mapping[str, Any]) -> dict[str, str]:
-    """Return the columns of a domain's table with their formats: those that it declares, otherwise every metric.
+    """Return the format of each column of a domain's table: of those that it declares, otherwise of every metric.
 
     Args:
-        domain: whose table it is.
-        episodes: metrics by name, as in `StyleGrid.episodes`.
+        domain: The domain.
+        episodes: Metrics by name, as in `StyleGrid.episodes`.
     """
     parameters = domain.make_space().names
     everything = {f"measured_{name}" if name in parameters else name: ".3g" for name in episodes}
@@ -193,7 +183,3 @@ def acting(agent: LoadedPolicy) -> str:
     """Return how the policy acts by default: with the mean, or with a sample."""
     samples = getattr(agent.actor, "default_interaction_type", None) is InteractionType.RANDOM
     return "Policy that samples its actions" if samples else "Deterministic policy"
-
-
-def _distinct(items: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [item for i, item in enumerate(items) if item not in items[:i]]

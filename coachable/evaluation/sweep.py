@@ -1,4 +1,4 @@
-"""One style weight from neutral to its maximum: what the style gains and what the task pays (paper, Pareto curves)."""
+"""Sweeps of one style weight from neutral to its maximum, for Pareto curves of style and task success."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from coachable.styles import StyleReward, StyleSpace, Weight
 __all__ = ["UNIT_REWARD", "WeightSweep", "sweep_weights"]
 
 UNIT_REWARD = "unit_style_reward"
-"""What a weight's terms pay per step at weight 1, whatever weight was requested."""
+"""Reward per step of a weight's terms at weight 1, independent of the requested weight."""
 
 
 @dataclass(frozen=True)
 class WeightSweep:
-    """Episodes along one weight, the other parameters at their defaults.
+    """Episodes at several values of one weight, with the other parameters at their defaults.
 
     Attributes:
-        weight: name of the parameter.
-        values: (P,) requested.
-        episodes: name to (P, episodes): what the domain measures, and `UNIT_REWARD`.
+        weight: Name of the weight.
+        values: Requested values (P,).
+        episodes: The domain's measures and `UNIT_REWARD` of each episode (P, episodes), by name.
     """
 
     weight: str
@@ -39,7 +39,7 @@ class WeightSweep:
 
     @property
     def score(self) -> str:
-        """Which of the episodes' values says how much of the style there was: the domain's measure of that name."""
+        """Name of the metric for the amount of style: the measure named like the weight, or else `UNIT_REWARD`."""
         return self.weight if self.weight in self.episodes else UNIT_REWARD
 
 
@@ -55,20 +55,22 @@ def sweep_weights(
     """Run `episodes` episodes at `points` values of every `Weight` of the space, all of them in one batch.
 
     Args:
-        domain: what to run in.
-        policy: reads `observation` and `style`.
-        space: the policy's style space.
-        points: values from neutral to the upper end of the range that reports sweep (the lower one if that is 0).
-        episodes: per value.
-        **options: see `RolloutOptions`.
+        domain: Domain in which the policy acts.
+        policy: Policy that reads `observation` and `style`.
+        space: Its style space.
+        points: Number of values from 0 to the upper end of the weight's evaluation range, or the lower end if the
+            upper one is 0.
+        episodes: Number of episodes per value.
+        **options: See `RolloutOptions`.
 
     Returns:
-        One sweep per weight; empty without weights.
+        One sweep per weight; an empty list if there are no weights or fewer than 2 points.
     """
     weights = [p for p in space.parameters if isinstance(p, Weight)]
     if not weights or points < 2:
         return []
-    requests = [np.linspace(0.0, _far_end(weight), points) for weight in weights]
+    ends = [weight.evaluation_range for weight in weights]
+    requests = [np.linspace(0.0, high if high > 0 else low, points) for low, high in ends]
     rows = [(weight.name, value) for weight, values in zip(weights, requests, strict=True) for value in values]
     theta = torch.stack([space.make(strict=True, **{name: value}) for name, value in rows])
     theta = theta.repeat_interleave(episodes, 0)
@@ -90,7 +92,7 @@ def sweep_weights(
 
 
 class _WithUnitReward:
-    """A domain's measures, and `UNIT_REWARD`."""
+    """Measures of a domain, and `UNIT_REWARD`."""
 
     def __init__(self, measures: StyleMeasures, reward: StyleReward, unit: Tensor) -> None:
         self._measures = measures
@@ -110,8 +112,3 @@ class _WithUnitReward:
 
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
         return self._measures.complies(record)
-
-
-def _far_end(weight: Weight) -> float:
-    low, high = weight.evaluation_range
-    return high if high > 0 else low

@@ -1,4 +1,4 @@
-"""Styles that change while the agent acts: does its episode go on, and how soon does it comply?"""
+"""Switching test: the style changes while the agent acts."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from coachable.styles import StyleSpace
 
 @dataclass(frozen=True)
 class SwitchReport:
-    """Episodes whose style switched at random every `period` steps.
+    """Results of episodes whose style switched at random every `period` steps.
 
     Attributes:
-        metrics: mean over episodes of survival and of the domain's measures.
-        comply_seconds: time from each switch until the agent did what was asked, of the switches where it did [s].
-        complied: share of the switches after which it did before the next one.
-        switches: number of switches that count, i.e. those of agents still in the episode.
+        metrics: Mean over episodes of survival and of the domain's measures.
+        comply_seconds: Time from a switch until the agent complied (S,) [s], for the switches after which it did.
+        complied: Share of the switches after which the agent complied before the next one.
+        switches: Number of switches in episodes that had not ended.
     """
 
     metrics: dict[str, float]
@@ -40,18 +40,18 @@ def evaluate_switching(
     period: int = 100,
     **options: Unpack[RolloutOptions],
 ) -> SwitchReport:
-    """Draw a new style from the training distribution every `period` steps.
+    """Evaluate a policy with a new style from the training distribution every `period` steps.
 
     Args:
-        domain: what to run in.
-        policy: reads `observation` and `style`.
-        space: the policy's style space.
-        episodes: number of episodes.
-        period: env steps between switches.
-        **options: see `RolloutOptions`.
+        domain: Domain in which the policy acts.
+        policy: Policy that reads `observation` and `style`.
+        space: Its style space.
+        episodes: Number of episodes.
+        period: Number of env steps between switches.
+        **options: See `RolloutOptions`.
 
     Raises:
-        ValueError: if the period is below 1.
+        ValueError: If the period is below 1.
     """
     if period < 1:
         raise ValueError(f"period must be at least 1 step, got {period}")

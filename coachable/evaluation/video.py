@@ -1,4 +1,4 @@
-"""`coachable render`: a film of an agent whose style is switched while it acts."""
+"""`coachable render`: film an agent whose style is switched while it acts."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from tqdm import tqdm
 from coachable.domain import Domain
 from coachable.evaluation.outputs import complete_file
 from coachable.evaluation.rollouts import Rollout
+from coachable.evaluation.wording import readable, readable_number
 from coachable.extras import how_to_install
 from coachable.styles import Choice, StyleRangeWarning, StyleSpace, Weight
 from coachable.training.weights import domain_of, load_policy
@@ -40,24 +41,24 @@ def render(
     seed: int = 0,
     progress: bool = True,
 ) -> Path:
-    """Film one agent, its request and what it measures written into the picture.
+    """Film one agent, with the requested and the measured style in the picture.
 
     Args:
-        source: checkpoint, run folder, weights file, or the name of a domain that ships with weights.
-        out: file to write: `.mp4`, `.gif`, or `.png` for a sheet with one picture per style.
-        styles: requests by parameter name, in order; default: every option of a choice, with the lower, middle and
-            upper value of the other parameters. Numbers outside the trained range are clamped, and the film says so.
-        seconds_per_style: time between switches [s], above 0 and at most 3600.
-        size: width and height [px], at least 64 x 60 and at most 4096 x 4096; even for mp4.
-        seed: of the initial state, and of the actions where they are sampled.
-        progress: show a bar.
+        source: Checkpoint, run folder, weights file, or the name of a domain that ships with weights.
+        out: File to write: `.mp4`, `.gif`, or `.png` for a sheet with one picture per style.
+        styles: Requests by parameter name, in order; by default those of `default_tour`. Numbers outside the trained
+            range are clamped, which the caption says.
+        seconds_per_style: Time between switches [s], above 0 and at most 3600.
+        size: Width and height [px], at least 64 x 60 and at most 4096 x 4096; even for mp4.
+        seed: Seed of the initial state and of sampled actions.
+        progress: Whether to show a progress bar.
 
     Returns:
         `out`.
 
     Raises:
-        ValueError: if the suffix of `out` is none of the above, or a number lies outside its range.
-        ImportError: for mp4 without PyAV; names the extra to install.
+        ValueError: If the suffix of `out` is none of the above, or a number lies outside its range.
+        ImportError: For mp4 without PyAV; the message names the extra to install.
     """
     if out.suffix not in VIDEO_SUFFIXES:
         raise ValueError(f"cannot write {out.name}: expected a file ending in one of {VIDEO_SUFFIXES}")
@@ -75,7 +76,7 @@ def render(
     requests = default_tour(domain, agent.space) if styles is None else list(styles)
     period = max(1, round(seconds_per_style / domain.control_step))
     sheet = out.suffix == ".png"
-    # A sheet shows the end of each style's time, when the agent has had the chance to comply.
+    # A sheet shows the last step of each style, so that the agent has had time to comply.
     frames = _film(domain, agent.actor, agent.space, requests, period, size, seed, every=period if sheet else 1)
     total = len(requests) * (1 if sheet else period)
     bar = tqdm(frames, total=total, desc="drawing", unit="frame", disable=None if progress else True, leave=False)
@@ -88,21 +89,26 @@ def render(
 
 
 def default_tour(domain: Domain, space: StyleSpace) -> list[dict[str, Any]]:
-    """Each option of each choice with low, middle and high set-points; with weights, the cells of the domain's grid."""
+    """Return every option of each choice with low, middle and high set-points, or the domain's grid for weights."""
     if any(isinstance(p, Weight) for p in space.parameters):
         return domain.cells()
     choices = [p for p in space.parameters if isinstance(p, Choice)]
     others = [p for p in space.parameters if not isinstance(p, Choice)]
-    tour = []
-    for options in itertools.product(*(p.options for p in choices)):
-        for level in (0.0, 0.5, 1.0):
-            values = {p.name: p.low + level * (p.high - p.low) for p in others}
-            tour.append({p.name: option for p, option in zip(choices, options, strict=True)} | values)
-    return tour
+    levels = [{p.name: p.low + level * (p.high - p.low) for p in others} for level in (0.0, 0.5, 1.0)]
+    options = itertools.product(*(p.options for p in choices))
+    return [
+        dict(zip((p.name for p in choices), chosen, strict=True)) | values for chosen in options for values in levels
+    ]
 
 
 def write_video(frames: Iterable[np.ndarray], out: Path, fps: int) -> None:
-    """Write frames (height, width, 3) uint8 as mp4 (H.264) or gif."""
+    """Write frames (height, width, 3) uint8 as mp4 (H.264) or gif.
+
+    Args:
+        frames: The frames.
+        out: File to write, `.mp4` or `.gif`.
+        fps: Frames per second; a gif leaves some out to have about 20.
+    """
     if out.suffix == ".gif":
         stride = max(1, fps // _GIF_FPS)
         images = [Image.fromarray(frame) for frame in itertools.islice(frames, 0, None, stride)]
@@ -129,9 +135,9 @@ def _film(
     seed: int,
     every: int,
 ) -> Iterator[np.ndarray]:
-    """Frames of each request's `period` steps, of every `every`-th step."""
+    """Yield every `every`-th frame of the `period` steps of each request."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", StyleRangeWarning)  # the caption says it
+        warnings.simplefilter("ignore", StyleRangeWarning)  # the caption mentions clamped values
         thetas = [space.make(**request) for request in requests]
     env = domain.styled_env(space, 1, seed=seed, num_threads=1, **domain.coached)
     renderer = domain.make_renderer(size[0], size[1] - CAPTION)
@@ -155,12 +161,12 @@ def _film(
 
 
 def asked_line(space: StyleSpace, request: Mapping[str, Any], theta: Tensor) -> str:
-    """Return what the agent is asked, for a caption; what was clamped names the value that had been requested.
+    """Return the requested style for a caption, with the requested value of numbers that were clamped.
 
     Args:
-        space: the agent's styles.
-        request: values by parameter name; others have their default.
-        theta: what was made of it, (D,).
+        space: The agent's style space.
+        request: Values by parameter name; other parameters have their default.
+        theta: The style (d,) that was made from the request.
     """
     parts = []
     for name, value in space.describe(theta).items():
@@ -170,12 +176,9 @@ def asked_line(space: StyleSpace, request: Mapping[str, Any], theta: Tensor) -> 
         wanted = float(request.get(name, value))
         clamped = abs(wanted - value) > 1e-6 * max(abs(wanted), abs(value))
         if value or clamped or not isinstance(space[name], Weight):
-            parts.append(f"{name} {_short(value)}" + (f" (clamped from {_short(wanted)})" if clamped else ""))
-    return f"asked: {', '.join(parts) or 'every weight 0'}".replace("_", " ")
-
-
-def _short(value: float) -> str:
-    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+            note = f" (clamped from {readable_number(wanted)})" if clamped else ""
+            parts.append(f"{name} {readable_number(value)}{note}")
+    return readable(f"asked: {', '.join(parts) or 'every weight 0'}")
 
 
 def _measured_line(domain: Domain, recent: list[dict[str, Tensor]], failures: int) -> str:
@@ -190,7 +193,15 @@ def _measured_line(domain: Domain, recent: list[dict[str, Tensor]], failures: in
 
 
 def caption(frame: np.ndarray, lines: tuple[str, str]) -> np.ndarray:
-    """Writes two lines, the first one larger, below a frame (height, width, 3) uint8; it is `CAPTION` higher then."""
+    """Add two lines of text below a frame.
+
+    Args:
+        frame: Frame (height, width, 3) uint8.
+        lines: The lines; the first one is larger.
+
+    Returns:
+        Frame (height + `CAPTION`, width, 3) uint8.
+    """
     image = Image.new("RGB", (frame.shape[1], CAPTION), (20, 20, 30))
     draw = ImageDraw.Draw(image)
     large, small = ImageFont.load_default(16), ImageFont.load_default(12)
@@ -214,7 +225,5 @@ def _import_av() -> Any:
     try:
         import av
     except ImportError as error:
-        raise ImportError(
-            f"writing mp4 needs PyAV: {how_to_install('video')}, or choose a .gif or .png file"
-        ) from error
+        raise ImportError(f"mp4 needs PyAV: {how_to_install('video')}, or choose a .gif or .png file") from error
     return av

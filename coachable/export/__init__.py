@@ -1,1 +1,1 @@
-"""Agents that run without this library."""
+"""Export of agents to formats that run without this library."""

@@ -1,4 +1,4 @@
-"""`coachable export`: a trained policy as one ONNX file that runs without torch."""
+"""`coachable export`: write a trained policy as one ONNX file that runs without torch."""
 
 from __future__ import annotations
 
@@ -34,24 +34,24 @@ TOLERANCE = 1e-5
 def export(source: str | Path, out: Path) -> float:
     """Write the deterministic policy as ONNX and compare it with torch.
 
-    Inputs are `observation` (batch, obs_dim) and `style` (batch, d), raw theta in natural units: the encoding is part
-    of the graph. The output is `action` (batch, A) in [-1, 1]; for mixed actions `axes` (batch, axes) in [-1, 1],
-    `choices` (batch, heads), the index of the likeliest value of each head, and `probabilities` (batch, all values),
-    to draw the choices from. The batch is dynamic.
+    The inputs are `observation` (batch, obs_dim) and `style` (batch, d), which is raw theta in natural units, because
+    the encoding is part of the graph. The output is `action` (batch, A) in [-1, 1]. The outputs of mixed actions are
+    `axes` (batch, axes) in [-1, 1], `choices` (batch, heads), the index of the likeliest value of each head, and
+    `probabilities` (batch, all values), from which choices can be sampled. The batch size is dynamic.
 
     Args:
-        source: checkpoint, run folder, weights file, or the name of a domain that ships with weights.
-        out: the file, for example `policy.onnx`.
+        source: Checkpoint, run folder, weights file, or the name of a domain that ships with weights.
+        out: File to write, for example `policy.onnx`.
 
     Returns:
         Largest difference between the file's actions and torch's, over random inputs.
 
     Raises:
-        ImportError: without the extra `export`.
-        ValueError: if the policy is of a kind that cannot be exported.
-        CheckpointError: if the source does not hold a usable policy, or file and torch differ by more than
-            `TOLERANCE`; nothing is left behind.
-        OSError: if writing fails, saying how much space is needed.
+        ImportError: If the extra `export` is not installed.
+        ValueError: If the policy is of a kind that cannot be exported.
+        CheckpointError: If the source does not hold a usable policy, or file and torch differ by more than
+            `TOLERANCE`; no file is written then.
+        OSError: If writing fails; the message says how much space is needed.
     """
     onnx = _import_onnx()
     agent = load_policy(source)
@@ -78,11 +78,11 @@ def export(source: str | Path, out: Path) -> float:
 
 
 def metadata_of(agent: LoadedPolicy, plain: DeterministicAction) -> dict[str, str]:
-    """What a program needs to know to use the file, as strings; `style_space` is JSON (`StyleSpace.from_json`).
+    """Return the metadata of the file as strings; `style_space` is JSON (`StyleSpace.from_json`).
 
     Args:
-        agent: from `load_policy`.
-        plain: its policy.
+        agent: Agent from `load_policy`.
+        plain: Its deterministic policy.
     """
     domain = agent.metadata["domain"]
     known: dict[str, Any] = {
@@ -106,14 +106,14 @@ def largest_difference(file: Path, plain: DeterministicAction, space: StyleSpace
     """Compare the file, run by onnxruntime, with torch on random inputs, in batches of 1 and of all.
 
     Args:
-        file: the ONNX file.
-        plain: the policy that it was made from.
-        space: styles are drawn from its training distribution.
-        samples: number of inputs.
+        file: The ONNX file.
+        plain: The policy that it was made from.
+        space: Style space from whose training distribution styles are drawn.
+        samples: Number of inputs.
 
     Returns:
-        Largest absolute difference of actions, axes and probabilities; for choices, how much less likely than the best
-        one the file's is. Infinite where one of them is not finite.
+        Largest absolute difference of actions, axes and probabilities; for choices, by how much the file's choice is
+        less likely than the best one. Infinite if a value is not finite.
     """
     import onnxruntime
 
@@ -137,30 +137,23 @@ def largest_difference(file: Path, plain: DeterministicAction, space: StyleSpace
 
 
 def _shortfall(probabilities: Sequence[Tensor], choices: Tensor) -> float:
-    """Probability by which the given choices fall short of the likeliest ones: rounding may break exact ties."""
+    """Return by how much the choices are less likely than the best ones; rounding may break ties differently."""
     chosen = [p.gather(-1, choices[:, i : i + 1]).squeeze(-1) for i, p in enumerate(probabilities)]
     return max((p.amax(-1) - c).max().item() for p, c in zip(probabilities, chosen, strict=True))
 
 
 def _trace(plain: DeterministicAction) -> Any:
-    # Two rows: torch.export would take a batch of one for a constant.
+    # The example has two rows, because torch.export would treat a batch of one as a constant.
     example = (torch.zeros(2, plain.observation_dim), torch.zeros(2, plain.style_dim))
     batch = torch.export.Dim("batch")
     before = logging.root.manager.disable
-    logging.disable(logging.WARNING)  # the exporter lists packages that it could also serve
+    logging.disable(logging.WARNING)  # the exporter lists optional packages
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the exporter's own deprecations
-            return torch.onnx.export(
-                plain,
-                example,
-                input_names=["observation", "style"],
-                output_names=list(plain.output_names),
-                dynamic_shapes=({0: batch}, {0: batch}),
-                dynamo=True,
-                external_data=False,
-                verbose=False,
-            )
+            names = {"input_names": ["observation", "style"], "output_names": list(plain.output_names)}
+            options = {"dynamic_shapes": ({0: batch}, {0: batch}), "external_data": False, "verbose": False}
+            return torch.onnx.export(plain, example, dynamo=True, **names, **options)
     finally:
         logging.disable(before)
 

@@ -1,4 +1,4 @@
-"""Gymnasium both ways: `StyleWrapper` makes its environments coachable, `GymnasiumEnv` trains them here."""
+"""Gymnasium: `StyleWrapper` makes its environments coachable, `GymnasiumEnv` makes them TorchRL environments."""
 
 from importlib.util import find_spec
 

@@ -1,4 +1,4 @@
-"""Gymnasium action spaces as the components of our action tensor: categorical heads, then axes."""
+"""Conversion between Gymnasium action spaces and the action tensor: categorical heads, then axes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ __all__ = ["action_components", "native_action"]
 
 
 def action_components(space: spaces.Space) -> tuple[list[int], int]:
-    """Sizes of the categorical components of an action space, and its number of continuous entries."""
+    """Return the sizes of an action space's categorical components and its number of continuous entries.
+
+    Raises:
+        ValueError: If the space has a component of another kind, or a `Box` without finite bounds.
+    """
     match space:
         case spaces.Discrete():
             return [int(space.n)], 0
@@ -32,7 +36,7 @@ def action_components(space: spaces.Space) -> tuple[list[int], int]:
 
 
 def native_action(space: spaces.Space, choices: Iterator[int], axes: Iterator[float]) -> Any:
-    """An action of the space from the next choices and axes (in [-1, 1])."""
+    """Make an action of a space from the next choices (indices) and axes (in [-1, 1])."""
     match space:
         case spaces.Discrete():
             return space.start + next(choices)
@@ -49,4 +53,4 @@ def native_action(space: spaces.Space, choices: Iterator[int], axes: Iterator[fl
             return tuple(native_action(part, choices, axes) for part in space)
         case spaces.Dict():
             return {name: native_action(part, choices, axes) for name, part in space.items()}
-    raise AssertionError(space)  # action_components saw to it
+    raise AssertionError(space)  # action_components has refused it before

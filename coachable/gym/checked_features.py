@@ -1,4 +1,4 @@
-"""What a user's function says about one step of a Gymnasium environment."""
+"""Style features and flat observations of one step of a Gymnasium environment."""
 
 from __future__ import annotations
 
@@ -12,28 +12,26 @@ from numpy.typing import ArrayLike
 __all__ = ["Features", "checked_features", "flat_observation"]
 
 Features: TypeAlias = Callable[[Any, Any, dict[str, Any]], ArrayLike]
-"""`(observation, action, info) -> (F,)`: what one step of one environment says about its style, free of theta.
+"""Function `(observation, action, info) -> (F,)` that computes the style features of one step, independent of theta.
 
-Arguments are the environment's own: the observation after the step, the action that led there, the step's info.
+The arguments are the environment's own: the observation after the step, the action of the step, and its info.
 """
 
 
 def checked_features(features: ArrayLike) -> np.ndarray:
-    """The function's result as (F,) float32.
+    """Return the features of a step as float32 (F,).
 
     Raises:
-        ValueError: If it has another shape.
+        ValueError: If they have another shape.
     """
     array = np.array(features, dtype=np.float32)
     if array.ndim != 1:
-        raise ValueError(
-            f"features returned shape {array.shape}: expected (F,), the numbers of one environment's step."
-        )
+        raise ValueError(f"features returned shape {array.shape}: expected (F,), the numbers of a single step")
     return array
 
 
 def flat_observation(space: spaces.Space, observation: Any) -> np.ndarray:
-    """An observation as (D,), D being `flatdim(space)`."""
+    """Return an observation as a vector (D,), where D is `flatdim(space)`."""
     flat = spaces.flatten(space, observation)
-    assert isinstance(flat, np.ndarray)  # flatdim raises before for spaces without a fixed size
+    assert isinstance(flat, np.ndarray)  # flatdim has raised for spaces without a fixed size
     return flat

@@ -1,4 +1,4 @@
-"""`GymnasiumEnv`: copies of a Gymnasium environment as one TorchRL environment."""
+"""`GymnasiumEnv`: a TorchRL environment of several copies of a Gymnasium environment."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ __all__ = ["GymnasiumEnv"]
 
 
 class GymnasiumEnv(EnvBase):
-    """N copies of a Gymnasium environment as one TorchRL environment `[N]`, to be wrapped by `coachable_env`.
+    """TorchRL environment `[N]` of N copies of a Gymnasium environment, for `coachable_env`.
 
-    Observations are flattened to float32. Actions are what our policies emit: every `Box` mapped to [-1, 1] per entry,
-    every `Discrete`, `MultiDiscrete` and `MultiBinary` a one-hot per component, `Tuple` and `Dict` spaces of these in
-    one tensor (`ActionHeads`). The environments are stepped one after the other; for more processes take
-    `collector=process`.
+    Observations are flattened to float32. Actions are those of `ActionHeads`: a `Box` is scaled to [-1, 1] per entry,
+    `Discrete`, `MultiDiscrete` and `MultiBinary` have a one-hot vector per component, and the parts of `Tuple` and
+    `Dict` spaces are concatenated. The copies are stepped one after the other; use `collector=process` for several
+    processes.
 
     Args:
         make: Name of a registered environment, or a function that makes one.
-        features: Becomes `style_features`, see `Features`.
-        num_envs: N.
+        features: Function that computes `style_features`, see `Features`.
+        num_envs: Number of copies N.
         seed: Seed of the first resets.
 
     Keys written: `observation` (N, obs_dim), `task_reward` (N, 1), the environment's reward, `style_features` (N, F),
@@ -50,12 +50,7 @@ class GymnasiumEnv(EnvBase):
     """
 
     def __init__(
-        self,
-        make: str | Callable[[], gymnasium.Env],
-        features: Features,
-        num_envs: int = 1,
-        *,
-        seed: int | None = None,
+        self, make: str | Callable[[], gymnasium.Env], features: Features, num_envs: int = 1, *, seed: int | None = None
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
@@ -75,26 +70,17 @@ class GymnasiumEnv(EnvBase):
         self._set_seed(seed)
 
     def _make_specs(self) -> None:
-        def rows(width: int) -> torch.Size:
-            return torch.Size((*self.batch_size, width))
-
-        self.action_spec = self.heads.spec(self.batch_size)
-        self.observation_spec = Composite(
-            {
-                "observation": Unbounded(shape=rows(self._observation.shape[1]), dtype=torch.float32),
-                TASK_REWARD: Unbounded(shape=rows(1), dtype=torch.float32),
-                STYLE_FEATURES: Unbounded(shape=rows(self._num_features), dtype=torch.float32),
-            },
-            shape=self.batch_size,
-        )
-        self.reward_spec = Unbounded(shape=rows(1), dtype=torch.float32)
-        self.done_spec = Composite(
-            {name: Binary(n=1, shape=rows(1), dtype=torch.bool) for name in ("done", "terminated", "truncated")},
-            shape=self.batch_size,
-        )
+        shape, column = self.batch_size, torch.Size((*self.batch_size, 1))
+        widths = {"observation": self._observation.shape[1], TASK_REWARD: 1, STYLE_FEATURES: self._num_features}
+        floats = {name: Unbounded(torch.Size((*shape, width)), dtype=torch.float32) for name, width in widths.items()}
+        flags = {name: Binary(1, column, dtype=torch.bool) for name in ("done", "terminated", "truncated")}
+        self.action_spec = self.heads.spec(shape)
+        self.observation_spec = Composite(floats, shape=shape)
+        self.reward_spec = Unbounded(column, dtype=torch.float32)
+        self.done_spec = Composite(flags, shape=shape)
 
     def _set_seed(self, seed: int | None) -> None:
-        """Seeds are handed to the environments when they are next reset."""
+        """Derive the seeds that the environments get at their next reset."""
         self._seeds: list[int | None] = [None] * len(self.envs)
         if seed is not None:
             self._seeds[:] = np.random.SeedSequence(seed).generate_state(len(self.envs)).tolist()
@@ -117,7 +103,7 @@ class GymnasiumEnv(EnvBase):
         terminated, truncated = np.zeros((2, len(self.envs)), dtype=bool)
         features = np.zeros((len(self.envs), self._num_features))
         for row, env in enumerate(self.envs):
-            if self._finished[row]:  # stepped on without a reset, as evaluation does with episodes it no longer counts
+            if self._finished[row]:  # evaluations step finished episodes on without a reset
                 self._start(row)
             action = native_action(env.action_space, iter(choices[row]), iter(axes[row]))
             observation, reward, terminated[row], truncated[row], info = env.step(action)
@@ -151,10 +137,10 @@ class GymnasiumEnv(EnvBase):
         )
 
     def simulator_state(self) -> dict[str, Any]:
-        """Attributes of all environments and their wrappers, for exact resumption.
+        """Return the attributes of all environments and their wrappers, for exact resumption.
 
         Raises:
-            UnsavableError: If one of them is neither plain nor of MuJoCo; names it.
+            UnsavableError: If an attribute cannot be saved; the message names it.
         """
         return {
             "environments": [save_object(env) for env in self.envs],
@@ -164,10 +150,10 @@ class GymnasiumEnv(EnvBase):
         }
 
     def load_simulator_state(self, state: dict[str, Any]) -> None:
-        """Restores what `simulator_state` returned.
+        """Restore the output of `simulator_state`.
 
         Raises:
-            UnsavableError: If it does not fit.
+            UnsavableError: If it does not fit the environments.
         """
         for env, saved in zip(self.envs, state["environments"], strict=True):
             load_object(env, saved)

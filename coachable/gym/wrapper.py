@@ -22,24 +22,24 @@ __all__ = ["StyleWrapper"]
 
 
 class StyleWrapper(gymnasium.Wrapper, RecordConstructorArgs):
-    """Makes a Gymnasium environment coachable: it shows a style, drawn anew for each episode, and rewards following it.
+    """Coachable Gymnasium environment, which shows a style, drawn anew for each episode, and rewards following it.
 
-    The reward of a step is the environment's plus the style's, for the style that the step's observation showed. The
-    info holds `style` (the one in the returned observation), and after a step `task_reward` and `style_reward`.
+    The reward of a step is the sum of the environment's reward and the reward of the style in the observation before
+    the step. The info contains `style` (the one in the returned observation), and after a step `task_reward` and
+    `style_reward`. The style is raw theta; you may have to normalise it for networks that do not encode it.
 
     Args:
-        env: A Gymnasium environment. Where its observation is a Dict or a Tuple, `flat` has to be set: few agents read
-            a Dict inside a Dict.
-        style_reward: What following a style is rewarded with; brings the `StyleSpace`.
-        features: What the reward's terms read, see `Features`.
+        env: A Gymnasium environment. If its observation is a Dict or a Tuple, `flat` has to be set, because few agents
+            read a Dict inside a Dict.
+        style_reward: Reward for following a style, with its `StyleSpace`.
+        features: Function that computes the inputs of the reward's terms, see `Features`.
         sampler: Distribution of styles; the space's own if None.
-        flat: Observe one vector, `cat(flattened observation, style)`, instead of the Dict `{observation, style}`.
+        flat: Whether to observe one vector, `cat(flattened observation, style)`, instead of the Dict
+            `{observation, style}`.
 
     Raises:
         ValueError: If the observation is a Dict or a Tuple and `flat` is not set, or if it has no fixed size and `flat`
             is set.
-
-    The style shown is raw theta. Networks that do not encode it themselves may want their inputs normalised.
 
     Example:
         >>> from coachable.styles import StyleSpace, Weight, WeightedFeature
@@ -75,11 +75,9 @@ class StyleWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         if flat:
             inner = spaces.flatten_space(env.observation_space)
             assert isinstance(inner, spaces.Box)
-            self._flat_dtype = np.result_type(inner.dtype, np.float32)
+            dtype = self._flat_dtype = np.result_type(inner.dtype, np.float32)
             low, high = np.append(inner.low, style.low), np.append(inner.high, style.high)
-            self.observation_space = spaces.Box(
-                low.astype(self._flat_dtype), high.astype(self._flat_dtype), dtype=self._flat_dtype.type
-            )
+            self.observation_space = spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype.type)
         else:
             self.observation_space = spaces.Dict({"observation": env.observation_space, STYLE: style})
         self._generator = torch.Generator()
@@ -88,12 +86,12 @@ class StyleWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         self._style = self.space.default  # of the last observation
 
     def set_style(self, style: Mapping[str, float | str] | ArrayLike | None, strict: bool = False) -> None:
-        """Ask for a style: shown from the next observation on, also in later episodes.
+        """Request a style from the next observation on, also in later episodes.
 
         Args:
-            style: Values by name (others take their default), or raw theta `(dim,)`; None draws styles again from the
-                next episode on.
-            strict: Raise instead of clamping to the trained range with a warning.
+            style: Values by name (other parameters have their default), or raw theta `(dim,)`; None draws styles again
+                from the next episode on.
+            strict: Whether to raise instead of clamping to the trained range with a warning.
 
         Raises:
             ValueError: If a name is unknown, a shape wrong, a value NaN, or `strict` and out of range.
@@ -109,7 +107,7 @@ class StyleWrapper(gymnasium.Wrapper, RecordConstructorArgs):
             self._held = self.space.clamp(theta, strict=strict)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode under a style that was set, or else a newly drawn one; `seed` also seeds the draws."""
+        """Start an episode with the style that was set, or else a newly drawn one; `seed` also seeds the draws."""
         observation, info = self.env.reset(seed=seed, options=options)
         if seed is not None:
             self._generator.manual_seed(derive_seed(seed, STYLE))
@@ -118,7 +116,7 @@ class StyleWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         return self._shown(observation), {**info, STYLE: self._style.numpy().copy()}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Step, and add the style's reward for the style that the previous observation showed."""
+        """Make a step and add the reward of the style in the observation before it."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         features = checked_features(self.features(observation, action, info))
         task_reward = float(reward)  # pyright: ignore[reportArgumentType]  # SupportsFloat

@@ -1,1 +1,1 @@
-"""Configurations of the recipes: YAML files, and what they may contain."""
+"""Configurations of the recipes as YAML files, and their schema."""

@@ -1,9 +1,9 @@
-"""What a configuration contains: the types that Hydra composes against, and the ranges of the numbers.
+"""Schema of the configurations: the types that Hydra composes against, and the ranges of the numbers.
 
-`register_schema` makes them known to Hydra; the YAML file of a recipe names its class first in its list of defaults. A
-key that is not declared, or a value of another type, is then an error wherever it comes from. Groups whose YAML names a
-`_target_` (loss, replay, sampler, collector, environment) have whatever entries the target takes: recipe_checks.py
-lists the ranges of those, and `make` in recipe_boxes.py compares the names with the target's arguments.
+`register_schema` registers them with Hydra; the YAML file of a recipe names its class first in its list of defaults.
+Unknown keys and values of another type are then errors. Groups with a `_target_` (loss, replay, sampler, collector,
+environment) have the arguments of the target as entries: recipe_checks.py lists their ranges, and `make` in
+recipe_boxes.py compares their names with the target's arguments.
 """
 
 from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass
@@ -16,11 +16,11 @@ from coachable.ranges import AMOUNT, COUNT, NOT_NEGATIVE, POSITIVE, SHARE, Range
 from coachable.training.train_settings import TrainSettings
 
 Target = dict[str, Any]
-"""A function or class under `_target_`, and its arguments."""
+"""Function or class under `_target_`, and its arguments."""
 
 
 def within(expected: Range) -> Any:
-    """Return a field that holds a number of a range."""
+    """Return a dataclass field for a number in a range."""
     return field(metadata={"range": expected})
 
 
@@ -33,7 +33,7 @@ class Impersonation:
 
 @dataclass
 class Support:
-    """Range of the returns that categorical critics tell apart."""
+    """Support of categorical critics: the range of returns."""
 
     v_min: float
     v_max: float
@@ -65,7 +65,7 @@ class Learner:
 
 @dataclass(frozen=True)
 class Loop(TrainSettings):
-    """When the training does what: `TrainSettings`, with its ranges."""
+    """Training loop: `TrainSettings` with its ranges."""
 
     _target_: str = ""
 
@@ -80,7 +80,7 @@ class Evaluation:
 
 @dataclass
 class Checkpoints:
-    """How many to keep, and whether the newest one holds the replay buffer."""
+    """Checkpoints: how many to keep, and whether the newest one contains the replay buffer."""
 
     replay: bool
     keep: int = within(COUNT)
@@ -88,7 +88,7 @@ class Checkpoints:
 
 @dataclass
 class Wandb:
-    """Weights & Biases."""
+    """Settings of Weights & Biases."""
 
     mode: str
     project: str
@@ -96,7 +96,7 @@ class Wandb:
 
 @dataclass
 class Threads:
-    """Numbers of threads; None takes what is free."""
+    """Numbers of threads; None uses the free cores."""
 
     simulator: int | None = within(Range("[1, inf)", whole=True, optional=True))
     learner: int | None = within(Range("[1, inf)", whole=True, optional=True))
@@ -154,16 +154,17 @@ class RacingSettings(Settings):
 
 
 def register_schema() -> None:
-    """Make the classes known to Hydra under the names that the lists of defaults give."""
+    """Register the classes with Hydra under their names in the lists of defaults."""
     store = ConfigStore.instance()
     store.store("settings", composed_type(Settings))
     store.store("racing_settings", composed_type(RacingSettings))
 
 
 def composed_type(kind: Any) -> Any:
-    """Return the type of values while they are composed: each field is missing at first.
+    """Return the type of values during composition, in which each field is missing at first.
 
-    OmegaConf takes 1e6 for no `int`, and 2 for a `bool`: `checked_values` in recipe_checks.py decides on those.
+    The types are wider than declared, because OmegaConf rejects 1e6 as an `int` and accepts 2 as a `bool`;
+    `checked_values` in recipe_checks.py checks these values.
     """
     if not is_dataclass(kind):
         return {int: int | float, int | None: int | float | None, bool: Any}.get(kind, kind)

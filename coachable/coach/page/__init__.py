@@ -1,1 +1,1 @@
-"""The live page in a browser: scene, sliders, charts, films."""
+"""Coaching page in the browser: the scene, sliders, charts and films."""

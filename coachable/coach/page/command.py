@@ -1,4 +1,4 @@
-"""`coachable coach`: opens the page and keeps it running."""
+"""`coachable coach`: serve the coaching page of an agent."""
 
 from __future__ import annotations
 
@@ -12,7 +12,13 @@ from typing import Any
 
 
 def add_parser(commands: Any, source_help: str, run: Callable[[argparse.Namespace], int]) -> None:
-    """Adds the sub-command to the command line."""
+    """Add the sub-command `coach` to the command line.
+
+    Args:
+        commands: Sub-parsers of the command line.
+        source_help: Help text of the argument that names the agent.
+        run: Function that runs the sub-command and returns its exit status.
+    """
     parser = commands.add_parser("coach", help="coach an agent while it acts, on a page in the browser")
     parser.add_argument("source", help=source_help)
     parser.add_argument("--port", type=_port, default=8080, help="first port to try (default: %(default)s)")
@@ -25,18 +31,18 @@ def add_parser(commands: Any, source_help: str, run: Callable[[argparse.Namespac
 
 
 def serve(source: str, *, say: Callable[[str], None], **settings: Any) -> None:
-    """Serves the page of an agent until interrupted.
+    """Serve the page of an agent until you interrupt it.
 
     Args:
-        source: as for `CoachSession.open`.
-        say: where the page's address is announced.
-        **settings: `port`, first to try, where one that is in use gives way to the next; `host`, address to listen on;
-            `seed` of the first session; `open_browser`, whether to open the page in the user's browser.
+        source: The agent, see `CoachSession.open`.
+        say: Called with the address of the page.
+        **settings: `port`, the first port to try; `host`, the address to listen on; `seed`, the seed of the session;
+            `open_browser`, whether to open the page in your browser.
 
     Raises:
-        CheckpointError: if there is no such agent.
-        ImportError: without the extra `ui`.
-        OSError: if one cannot listen there.
+        CheckpointError: If there is no such agent.
+        ImportError: If the extra `ui` is not installed.
+        OSError: If the server cannot listen at that address.
     """
     try:
         _serve(source, say, **settings)
@@ -55,7 +61,7 @@ def _serve(
     from coachable.coach.page.server import make_server, page_address
 
     with ExitStack() as closing:
-        # First of all, so that the page is there while the agent is still being loaded.
+        # The server starts first, so that you can open the page while the agent is being loaded.
         server = make_server(host, port)
         closing.callback(_quietly, server.stop)
         loading = server.gui.add_markdown("Loading the agent ...")
@@ -79,12 +85,12 @@ def _serve(
 
 
 def wait() -> None:
-    """Until interrupted."""
+    """Wait until interrupted."""
     threading.Event().wait()
 
 
 def _quietly(stop: Callable[[], None]) -> None:
-    with redirect_stdout(io.StringIO()):  # viser says that it ends
+    with redirect_stdout(io.StringIO()):  # viser prints that it stops
         stop()
 
 

@@ -1,4 +1,4 @@
-"""A recorded session as a film: it is run again, and drawn."""
+"""Films of recorded sessions, which are replayed and drawn."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from coachable.coach.session.recording import Recording
 from coachable.coach.session.session import CoachSession
 from coachable.evaluation.video import CAPTION, caption, write_video
 
-_LONGEST_SESSION = 600.0  # [s]; all of it is run again for its last seconds
+_LONGEST_SESSION = 600.0  # [s]; the whole session is replayed to film its last seconds
 
 
 class FilmStudio:
-    """Films sessions beside the thread that steps them, one at a time.
+    """Maker of films in a thread of its own, one at a time.
 
     Args:
-        session: whose policy and domain to use; it is not touched.
-        note: called with what there is to say.
+        session: Session whose policy and domain are used; it is not changed.
+        note: Called with messages on the progress.
     """
 
     def __init__(self, session: CoachSession, note: Callable[[str], None]) -> None:
@@ -30,30 +30,30 @@ class FilmStudio:
         self._thread: threading.Thread | None = None
 
     def shoot(self, recording: Recording, last: float, deliver: Callable[[bytes], None]) -> None:
-        """Begins to draw the last seconds of a recording; returns at once.
+        """Start to film the last seconds of a recording and return at once.
 
         Args:
-            recording: what to show.
-            last: seconds.
-            deliver: called with the mp4 file's content when it is finished.
+            recording: The recording.
+            last: Length of the film [s].
+            deliver: Called with the content of the finished mp4 file.
 
         Raises:
-            ValueError: while another film is drawn, or if the recording is too long.
+            ValueError: If another film is being drawn, or the recording is too long.
         """
         if self._thread is not None and self._thread.is_alive():
             raise ValueError("a film is being drawn already: wait until it is finished")
         seconds = recording.steps * self._session.domain.control_step
         if seconds > _LONGEST_SESSION:
             raise ValueError(
-                f"the session has lasted {seconds:.0f} s, and a film runs it again from the start: at most "
-                f"{_LONGEST_SESSION:.0f} s are filmed here. Start over with a seed, or film the downloaded recording "
-                "with coachable.coach.page.film"
+                f"the session has lasted {seconds:.0f} s, and a film replays all of it: expected at most "
+                f"{_LONGEST_SESSION:.0f} s. Start over with a seed, or film the downloaded recording with "
+                "coachable.coach.page.film"
             )
         self._thread = threading.Thread(target=self._draw, args=(recording, last, deliver), name="filming", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Ends the film that is being drawn, if any."""
+        """Cancel the film that is being drawn, if any."""
         self._closing.set()
         if self._thread is not None:
             self._thread.join()
@@ -64,14 +64,14 @@ class FilmStudio:
                 out = Path(folder) / "film.mp4"
                 deliver(film(recording, self._session, out, last=last, on_progress=self._progress).read_bytes())
             self._note("drawn")
-        except Exception as error:  # this thread has nobody else to tell
+        except Exception as error:  # nothing above this thread reports it
             if not self._closing.is_set():
                 self._note(f"Problem: {error}")
 
     def _progress(self, share: float) -> None:
         if self._closing.is_set():
             raise RuntimeError("the page is closing")
-        self._note(f"drawing: {share:.0%}, the agent goes on meanwhile")
+        self._note(f"drawing: {share:.0%}; the agent continues meanwhile")
 
 
 def film(
@@ -83,22 +83,22 @@ def film(
     size: tuple[int, int] = (640, 480),
     on_progress: Callable[[float], None] = lambda share: None,
 ) -> Path:
-    """Replays a recording beside its session, which may go on meanwhile, and writes what it looked like.
+    """Film a recording by replaying it in another session; the given one may be stepped at the same time.
 
     Args:
-        recording: what to show.
-        session: whose policy and domain to use; it is not touched.
-        out: `.mp4` or `.gif`.
-        last: only the last so many seconds.
-        size: width and height [px].
-        on_progress: called with the share that is done, from 0 to 1.
+        recording: The recording.
+        session: Session whose policy and domain are used; it is not changed.
+        out: File to write, `.mp4` or `.gif`.
+        last: Length of the end of the recording to film [s]; all of it if None.
+        size: Width and height [px].
+        on_progress: Called with the share of the steps that are done, from 0 to 1.
 
     Returns:
         `out`.
 
     Raises:
-        ValueError: if nothing was recorded, or for another suffix.
-        ImportError: for mp4 without PyAV; names the extra to install.
+        ValueError: If nothing was recorded, or for another suffix.
+        ImportError: For mp4 without PyAV; the message names the extra to install.
     """
     if out.suffix not in (".mp4", ".gif"):
         raise ValueError(f"cannot write {out.name}: expected a file ending in .mp4 or .gif")

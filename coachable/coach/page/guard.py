@@ -1,7 +1,8 @@
-"""Who may talk to the page's web server, and what the server takes from them.
+"""Guard that restricts which requests and messages the page's web server accepts.
 
-viser serves any host name and any origin, and hands on whatever a connection sends. The guard stands between it and
-`websockets`, which it is built on: it judges each request by its headers and each message by its content.
+viser accepts requests for any host name and from any origin, and processes every message of a connection. The guard
+sits between viser and the `websockets` library that it uses: it checks the headers of each request and the content of
+each message.
 """
 
 from __future__ import annotations
@@ -28,27 +29,27 @@ _THIS_MACHINE = ("localhost", "127.0.0.1", "::1")
 _EVERYWHERE = ("", "*", "0.0.0.0", "::")
 _HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([^\[\]:@/\s]+))(?::\d{1,5})?", re.IGNORECASE)
 _PROTOCOL = re.compile(r"viser-v[\w.+-]{1,32}")
-_CONNECTIONS = 64  # at a time
-_LONGEST_MESSAGE = 1 << 20  # [byte]; viser's browsers send files in pieces of half of it
-_UPLOADED = 16 << 20  # [byte], by one connection
+_CONNECTIONS = 64  # at the same time
+_LONGEST_MESSAGE = 1 << 20  # [byte]; viser's page uploads files in pieces of half this size
+_UPLOADED = 16 << 20  # [byte], per connection
 _PIECES = 64  # of an uploaded file
-_MESSAGES_PER_SECOND = 300.0  # of one connection; the rest waits
+_MESSAGES_PER_SECOND = 300.0  # per connection; further messages wait
 _LONGEST_TEXT = 20_000  # [characters] in a text box
 _LARGEST_WINDOW = 1 << 16  # [px]
-_QUESTIONS_OF_A_PAGE = ("websocket", "playbackPath")  # ask the page to show what another server sends
+_FOREIGN_SOURCES = ("websocket", "playbackPath")  # query parameters that make the page show another server's content
 
 _log = logging.getLogger("coachable.page")
-_log.addHandler(logging.NullHandler())  # what a stranger sends belongs into no terminal
+_log.addHandler(logging.NullHandler())  # refused content must not be printed to the terminal
 
 
 class Guard:
-    """Serves viser's page to its own origin and host names only.
+    """Guard that serves viser's page to its own origin and host names only.
 
     Args:
-        host: address that the server listens on.
+        host: Address that the server listens on.
 
     Attributes:
-        active: whether a server was started under the guard.
+        active: Whether a guarded server was started.
     """
 
     def __init__(self, host: str) -> None:
@@ -60,9 +61,9 @@ class Guard:
 
     @contextlib.contextmanager
     def around(self) -> Iterator[None]:
-        """The server that is started meanwhile is guarded. viser itself has no setting for this."""
+        """Guard the server that is started in this block; viser has no setting for this."""
         serve = server.serve
-        setattr(server, "serve", self._serve(serve))  # noqa: B010, a class stands there
+        setattr(server, "serve", self._serve(serve))  # noqa: B010, `serve` is a class
         try:
             yield
         finally:
@@ -97,7 +98,7 @@ class Guard:
         return judge
 
     def refusal(self, request: Request) -> str:
-        """Why a request is refused, empty if it is not."""
+        """Return why a request is refused, or an empty text if it is accepted."""
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
         if len(hosts) != 1 or not self._is_mine(hosts[0]):
             return "this host name is not the page's own: open the page under the address that it was announced with"
@@ -107,33 +108,33 @@ class Guard:
             return "only the page itself may talk to this server"
         if upgrade and not _PROTOCOL.fullmatch(request.headers.get("Sec-WebSocket-Protocol", "")):
             return "this is no connection of the page"
-        if set(parse_qs(urlsplit(request.path).query, keep_blank_values=True)) & set(_QUESTIONS_OF_A_PAGE):
+        if set(parse_qs(urlsplit(request.path).query, keep_blank_values=True)) & set(_FOREIGN_SOURCES):
             return "the page shows this server only"
         return ""
 
     def _is_mine(self, host: str) -> bool:
-        """Whether a `Host` header names this server; any port, because it may be forwarded."""
+        """Return whether a `Host` header names this server, at any port, because ports may be forwarded."""
         match = _HOST.fullmatch(host)
         name = (match[1] or match[2]).lower() if match else ""
         return name in self._names or (self._everywhere and _is_address(name))
 
 
 class GuardedConnection(server.ServerConnection):
-    """A browser's connection, of which viser sees only the messages that the page needs."""
+    """Connection of a browser that passes on only the messages that the page needs."""
 
     def __init__(self, *arguments: Any, **settings: Any) -> None:
         super().__init__(*arguments, **settings)
         self._uploaded = 0
-        self._free_at = 0.0  # moment at which the next message may be taken
+        self._free_at = 0.0  # time from which on the next message may be received
 
     async def recv(self, decode: bool | None = None) -> Any:
-        """The next message that is acceptable; one that is no message of a browser ends the connection."""
+        """Return the next accepted message; a malformed message closes the connection."""
         while True:
             message = await super().recv(decode)
             await self._keep_pace()
             try:
                 wanted = is_wanted(message)
-            except Exception as error:  # random bytes can fail in any way
+            except Exception as error:  # random bytes can raise anything
                 _log.info("a message was refused: %s", error)
                 await self.close(1007, "this is no message of the page")
                 continue
@@ -153,16 +154,19 @@ class GuardedConnection(server.ServerConnection):
 
 
 def is_wanted(raw: bytes | str) -> str:
-    """Type of a browser's message if the page needs it, otherwise an empty text.
+    """Return the type of a browser's message if the page needs it, otherwise an empty text.
+
+    Args:
+        raw: The message as received.
 
     Raises:
-        ValueError: if it is no message of a browser.
+        ValueError: If it is not a message of the page.
     """
     if isinstance(raw, str):
-        raise ValueError("a text, where browsers send bytes")
+        raise ValueError("got a text: expected bytes")
     message = msgspec.msgpack.decode(raw)
     if not isinstance(message, dict) or not isinstance(message.get("type"), str):
-        raise ValueError("a message without a type")
+        raise ValueError("got a message without a type: expected a mapping with the entry 'type'")
     kind = message["type"]
     if kind == "GuiUpdateMessage":
         return kind if _is_value(message.get("updates")) else ""
@@ -178,7 +182,7 @@ def is_wanted(raw: bytes | str) -> str:
 
 
 def _is_value(updates: Any) -> bool:
-    """Whether a widget's value is set, and nothing else of it."""
+    """Return whether an update sets the value of a widget and nothing else."""
     if not isinstance(updates, dict) or set(updates) != {"value"}:
         return False
     value = updates["value"]
@@ -196,11 +200,10 @@ def _is_upgrade(headers: Headers) -> bool:
 
 
 def _is_address(name: str) -> bool:
-    try:
+    with contextlib.suppress(ValueError):
         ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
+        return True
+    return False
 
 
 def _refused(status: http.HTTPStatus, reason: str) -> Response:
@@ -210,7 +213,7 @@ def _refused(status: http.HTTPStatus, reason: str) -> Response:
 
 
 def _protection(host: str) -> dict[str, str]:
-    """Headers by which a browser shows the page in no other page's frame, and lets it talk to this server only."""
+    """Return headers that forbid frames of other pages, and connections of the page to other servers."""
     policy = (
         "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; "
         f"connect-src 'self' ws://{host} data: blob:; frame-ancestors 'none'"
@@ -224,5 +227,5 @@ def _protection(host: str) -> dict[str, str]:
 
 
 def _note(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """An error in a handler of viser's, which a message may cause: noted, and no traceback."""
+    """Log an error in one of viser's handlers without a traceback, because any message may cause one."""
     _log.warning("a message was not carried out: %s", context.get("exception") or context["message"])

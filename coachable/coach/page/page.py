@@ -1,4 +1,4 @@
-"""The coaching page: a thin client of `CoachSession` in the browser."""
+"""`CoachPage`: the coaching page in the browser, a client of `CoachSession`."""
 
 from __future__ import annotations
 
@@ -6,18 +6,20 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from coachable.coach.page.film import FilmStudio
 from coachable.coach.page.views import View, make_view
 from coachable.coach.page.widgets import Chart, MeasuredText, ParameterWidget, write
-from coachable.coach.phrases.grammar import Understanding, readable_number
+from coachable.coach.phrases.grammar import Understanding
 from coachable.coach.session.loop import LiveLoop
 from coachable.coach.session.plan import read_plan
 from coachable.coach.session.readout import StyleReport, measures_by_parameter
 from coachable.coach.session.recording import Recording
 from coachable.coach.session.session import CoachSession
+from coachable.evaluation.wording import readable, readable_number
 from coachable.styles import Parameter
 
 if TYPE_CHECKING:
@@ -38,16 +40,16 @@ _PAUSE, _RESUME, _STEP, _RESET = "Pause", "Resume", "Step", "Reset"
 class CoachPage:
     """Widgets, view and read-outs of one session.
 
-    Every browser that opens the page shows and steers the same session. Widgets hand their requests to the loop, which
-    carries them out before the next step; everything shown is read from the session.
+    Every browser that opens the page shows and steers the same session. Widgets submit their requests to the loop,
+    which makes them before the next step.
 
     Args:
-        server: an empty page.
-        session: what is coached; from `start` on it belongs to the loop's thread.
+        server: Server with an empty page.
+        session: The session; after `start`, only the loop's thread may use it.
 
     Attributes:
-        loop: runs the session.
-        widgets: by parameter name, live controls included.
+        loop: Loop that steps the session.
+        widgets: Widgets by parameter name, including the live controls.
     """
 
     def __init__(self, server: viser.ViserServer, session: CoachSession) -> None:
@@ -71,17 +73,15 @@ class CoachPage:
             self._add_session()
 
     def start(self) -> None:
-        """Begins to act."""
+        """Start the loop."""
         self.loop.start()
 
     def stop(self) -> None:
-        """Ends the loop; the session stays open."""
+        """End the loop; the session stays open."""
         self.loop.stop()
         self._studio.close()
         if self._view is not None:
             self._view.close()
-
-    # -- widgets ---------------------------------------------------------------------------------------------------
 
     def _add_style(self) -> None:
         with self.server.gui.add_folder("Style"):
@@ -102,26 +102,24 @@ class CoachPage:
         self.widgets[name] = ParameterWidget(self.server, parameter, value, lambda: request(self.widgets[name]))
 
     def _set(self, widget: ParameterWidget) -> None:
-        self.loop.submit(lambda session: self._carry_out(session, widget))
+        def change(session: CoachSession) -> None:
+            self.chart.follow(widget.parameter.name)
+            session.set(**widget.take())
 
-    def _carry_out(self, session: CoachSession, widget: ParameterWidget) -> None:
-        self.chart.follow(widget.parameter.name)
-        session.set(**widget.take())
+        self.loop.submit(change)
 
     def _steer(self, widget: ParameterWidget) -> None:
         self.loop.submit(lambda session: session.steer(**widget.take()))  # pyright: ignore[reportArgumentType]
 
     def _add_phrase_box(self) -> None:
-        gui, examples = self.server.gui, self.session.grammar.examples
+        gui, understand = self.server.gui, self.session.understand
         with gui.add_form("In words") as form:
-            self.phrase = gui.add_text("phrase", "", hint=f"such as: {'; '.join(examples)}; a bit more")
+            examples = "; ".join(self.session.grammar.examples)
+            self.phrase = gui.add_text("phrase", "", hint=f"such as: {examples}; a bit more")
             self.say = gui.add_button("Apply")
             self.answer = gui.add_markdown("")
         self.say.on_click(lambda _: form.submit())
-        form.on_submit(lambda _: self._aside("phrase", self.phrase.value, _LONGEST_PHRASE, self._understand, self._say))
-
-    def _understand(self, phrase: str) -> Understanding:
-        return self.session.understand(phrase)
+        form.on_submit(lambda _: self._aside("phrase", self.phrase.value, _LONGEST_PHRASE, understand, self._say))
 
     def _say(self, session: CoachSession, understood: Understanding) -> None:
         session.follow(understood)
@@ -133,17 +131,17 @@ class CoachPage:
     def _aside(
         self, what: str, given: _S, longest: int, read: Callable[[_S], _T], then: Callable[[CoachSession, _T], None]
     ) -> None:
-        """Reads what somebody gave in viser's thread, so that the agent does not wait; the loop gets what it means."""
+        """Read a user's input in viser's thread, so that the agent does not wait, and submit the result to the loop."""
         if len(given) > longest:
             unit = "characters" if isinstance(given, str) else "bytes"
             self.loop.refuse(f"the {what} has {len(given):,} {unit}: at most {longest:,} are read")
         elif not self._reading.acquire(blocking=False):
-            self.loop.refuse("what was given before is still being read")
+            self.loop.refuse("the input before is still being read")
         else:
             try:
                 meant = read(given)
                 self.loop.submit(lambda session: then(session, meant))
-            except Exception as error:  # this thread has nobody else to tell
+            except Exception as error:  # nothing above this thread reports it
                 self.loop.refuse(str(error))
             finally:
                 self._reading.release()
@@ -188,22 +186,16 @@ class CoachPage:
 
         apply.on_click(lambda _: self.loop.submit(lambda session: session.apply(self.preset.value)))
         keep.on_click(lambda _: self.loop.submit(self._save_preset))
-        self.run_plan.on_click(
-            lambda _: self._aside("plan", self.plan.value, _LONGEST_PLAN, self._read_plan, CoachSession.schedule)
-        )
+        read, schedule = partial(read_plan, session=self.session), CoachSession.schedule
+        self.run_plan.on_click(lambda _: self._aside("plan", self.plan.value, _LONGEST_PLAN, read, schedule))
         cancel.on_click(lambda _: self.loop.submit(lambda session: session.cancel()))
-
-    def _read_plan(self, text: str) -> dict[float, dict[str, Any]]:
-        return read_plan(text, self.session)
 
     def _save_preset(self, session: CoachSession) -> None:
         name = self.preset_name.value.strip()
         if not name:
             raise ValueError("give the preset a name first")
         if len(name) > _LONGEST_NAME or len(session.presets) >= _PRESETS:
-            raise ValueError(
-                f"a preset's name has at most {_LONGEST_NAME} characters, and there are at most {_PRESETS}"
-            )
+            raise ValueError(f"expected at most {_PRESETS} presets, each name of at most {_LONGEST_NAME} characters")
         session.presets[name] = session.style
         self.preset.options = tuple(session.presets)
         self.preset.value = name
@@ -211,9 +203,7 @@ class CoachPage:
     def _add_session(self) -> None:
         gui = self.server.gui
         with gui.add_folder("Episodes"):
-            self.hold = gui.add_checkbox(
-                "hold the style", True, hint="otherwise each episode draws one, as in training"
-            )
+            self.hold = gui.add_checkbox("hold the style", True, hint="if off, each episode draws one, as in training")
             self.seed = gui.add_number("seed", self.session.recording().seed, min=0, step=1)
             reseed = gui.add_button("Start over with seed", hint="also begins a new recording")
         with gui.add_folder("Recording"):
@@ -228,38 +218,30 @@ class CoachPage:
         reseed.on_click(lambda _: self.loop.submit(lambda session: session.reset(int(self.seed.value))))
         save.on_click(lambda event: self.loop.submit(lambda session: self._send_recording(session, event.client)))
         again.on_click(lambda _: self.loop.submit(lambda session: session.replay(session.recording())))
-        self.upload.on_upload(
-            lambda _: self._aside(
-                "file", self.upload.value.content, _LARGEST_FILE, _read_recording, CoachSession.replay
-            )
-        )
+        limit, read, replay = _LARGEST_FILE, _read_recording, CoachSession.replay
+        self.upload.on_upload(lambda _: self._aside("file", self.upload.value.content, limit, read, replay))
         stop.on_click(lambda _: self.loop.submit(lambda session: session.cancel()))
         shoot.on_click(lambda event: self.loop.submit(lambda session: self._shoot(session, event.client)))
 
     def _send_recording(self, session: CoachSession, client: viser.ClientHandle | None) -> None:
-        """To the browser that asks for it, without the path by which this machine knows the agent."""
+        """Send the recording to the browser that asked for it, without the path of the agent on this machine."""
         recording = session.recording()
         recording = replace(recording, source=Path(recording.source).name)
         (client or self.server).send_file_download(f"{recording.domain}.json", recording.to_json().encode())
 
     def _shoot(self, session: CoachSession, client: viser.ClientHandle | None) -> None:
-        name = f"{session.domain.name}.mp4"
-        self._studio.shoot(
-            session.recording(),
-            _FILM_SECONDS,
-            lambda content: (client or self.server).send_file_download(name, content),
-        )
-
-    # -- read-outs, in the loop's thread ---------------------------------------------------------------------------
+        name, receiver = f"{session.domain.name}.mp4", client or self.server
+        self._studio.shoot(session.recording(), _FILM_SECONDS, lambda film: receiver.send_file_download(name, film))
 
     def _on_step(self) -> None:
+        """Show the state of the session; the loop calls this in its thread."""
         now = time.perf_counter()
         for name, value in (self.session.style | self.session.controls).items():
             self.widgets[name].follow(value)
         if now >= self._report_due or self.loop.paused or self.session.ended is not None:
             self._report_due = now + 1.0 / _REPORTS_PER_SECOND
             self._show(self.session.report())
-        # Last, so that a view that fails leaves the read-outs, which say so.
+        # The view comes last: if it fails, the read-outs still show the problem.
         if self._view is None:
             self._view = make_view(self.server, self.session)
         if now >= self._frame_due or self.loop.paused:
@@ -276,7 +258,7 @@ class CoachPage:
             for name, text in self.measured.items():
                 text.update(report, groups[name])
             rest = [m for m in groups[""] if m in report.measured]
-            others = ", ".join(f"{m.replace('_', ' ')} **{readable_number(report.measured[m])}**" for m in rest)
+            others = ", ".join(f"{readable(m)} **{readable_number(report.measured[m])}**" for m in rest)
             write(self.others, f"also measured: {others}" if others else "")
             self.chart.add(self.session.step_count * self.session.domain.control_step, report)
 
@@ -305,7 +287,7 @@ def _read_recording(content: bytes) -> Recording:
 
 
 def verdict(report: StyleReport) -> str:
-    """Whether the agent does what was asked, as far as that can be told from what was measured."""
+    """Return a sentence that says whether the agent complies with the request, as far as it was measured."""
     if not report.asks:
         return "Nothing is asked for: every weight is 0."
     if report.complied_after is None:
@@ -320,5 +302,5 @@ def verdict(report: StyleReport) -> str:
 
 
 def escaped(text: str) -> str:
-    """Without what Markdown would take for markup."""
+    """Escape the characters that are markup in Markdown."""
     return "".join(f"\\{c}" if c in "\\`*_{}[]<>#|~" else c for c in text)

@@ -1,4 +1,4 @@
-"""The page's web server: on this machine only, and nothing leaves it."""
+"""Web server of the page, which by default is reachable from this machine only."""
 
 from __future__ import annotations
 
@@ -18,19 +18,22 @@ _TRIED = 100  # ports, before giving up
 
 
 def make_server(host: str = "127.0.0.1", port: int = 8080) -> viser.ViserServer:
-    """Starts an empty page; a port that is in use gives way to the next free one.
+    """Start a server with an empty page.
 
-    Only browsers that were sent to one of the page's own names, and scripts of the page itself, are answered: see
+    It answers only browsers that open one of the page's own host names, and scripts of the page itself; see
     `coachable.coach.page.guard`.
 
     Args:
-        host: address to listen on. Whoever reaches it can steer, so leave it at this machine's own.
-        port: first port to try; 0 takes any that is free.
+        host: Address to listen on. Everyone who can reach it can steer the agent, so prefer the default.
+        port: First port to try; if it is in use, the next free one is taken. 0 takes any free port.
+
+    Returns:
+        The running server.
 
     Raises:
-        ImportError: without viser; names the extra to install.
-        OSError: if one cannot listen there.
-        ValueError: if there is no such port.
+        ImportError: If viser is not installed; the message names the extra to install.
+        OSError: If the server cannot listen at that address.
+        ValueError: If there is no such port.
     """
     if not 0 <= port <= _PORTS:
         raise ValueError(f"there is no port {port}: expected a number from 0 to {_PORTS}")
@@ -42,30 +45,31 @@ def make_server(host: str = "127.0.0.1", port: int = 8080) -> viser.ViserServer:
 
     class LocalServer(viser.ViserServer):
         def request_share_url(self, verbose: bool = True) -> None:
-            """Refuses viser's tunnel through a public host, which any browser could ask for."""
+            """Ignore requests of browsers for viser's tunnel through a public host."""
 
     guard = Guard(host)
-    free = free_port(host, port)  # viser tries 1000 others for whatever reason, and then waits for ever
+    free = free_port(host, port)  # viser itself tries 1000 ports after any error, and then waits for ever
     with guard.around(), contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
         server = LocalServer(host=host, port=free, label="coachable", verbose=False)
     if not guard.active:
         server.stop()
-        raise ImportError(
-            f"viser {viser.__version__} starts its server in another way than the guard of the page knows"
-        )
-    server.gui.configure_theme(
-        show_logo=False, show_share_button=False, control_width="large", brand_color=(31, 119, 180)
-    )
+        raise ImportError(f"viser {viser.__version__} starts its server in a way that the page cannot guard")
+    blue = (31, 119, 180)
+    server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large", brand_color=blue)
     server.gui.set_panel_label("coachable")
     server.gui.main_panel.dock_right()
     return server
 
 
 def free_port(host: str, port: int) -> int:
-    """The first free port from `port` on.
+    """Find the first free port of an address.
+
+    Args:
+        host: Address to listen on.
+        port: First port to try; 0 finds any free one.
 
     Raises:
-        OSError: if one cannot listen at that address, or no port is free.
+        OSError: If one cannot listen at that address, or if 100 ports in a row are in use.
     """
     for candidate in range(port, min(port + _TRIED, _PORTS + 1)):
         try:
@@ -83,6 +87,6 @@ def free_port(host: str, port: int) -> int:
 
 
 def page_address(host: str, port: int) -> str:
-    """What to type into a browser on this machine."""
+    """Return the address of the page for a browser on this machine."""
     name = "localhost" if host in ("", "0.0.0.0", "::") else f"[{host}]" if ":" in host else host
     return f"http://{name}:{port}"

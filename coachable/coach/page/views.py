@@ -1,4 +1,4 @@
-"""What the page shows of the agent: MuJoCo bodies in 3-D, or the domain's own picture."""
+"""Views of the agent on the page: a 3-D scene, or the pictures of the domain's renderer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import viser
 
 _PICTURES_PER_SECOND = 12.0
-_DRAWING_SHARE = 0.3  # of the loop's time, at most: the agent acts in the rest
+_DRAWING_SHARE = 0.3  # largest share of the loop's time for drawing
 _PICTURE_SIZE = (800, 600)  # [px]
 _BORDER = 235  # grey
 _ASPECTS = (0.25, 4.0)  # of windows that pictures are fitted to
@@ -22,24 +22,24 @@ PHONE = 576  # [px]; in narrower windows viser's panel covers the lower right
 
 
 class View(Protocol):
-    """Draws a session; called only in the thread that steps it."""
+    """View of a session, used only in the thread that steps it."""
 
     def update(self) -> None:
-        """Shows the present state."""
+        """Show the current state."""
         ...
 
     def close(self) -> None:
-        """Releases what it holds."""
+        """Release the view's resources."""
         ...
 
 
 class PictureView:
-    """The domain's renderer as the background of the page, drawn only while somebody looks, slow ones less often."""
+    """Pictures of the domain's renderer as the background of the page, drawn while a browser is connected."""
 
     def __init__(self, server: viser.ViserServer, session: CoachSession) -> None:
         self._server, self._session = server, session
         self._renderer = session.domain.make_renderer(*_PICTURE_SIZE)
-        self._renderer.draw(session.env)  # one that cannot draw says so now
+        self._renderer.draw(session.env)  # raises here if it cannot draw
         self._due = 0.0
 
     def update(self) -> None:
@@ -63,12 +63,15 @@ class PictureView:
 
 
 def padded(picture: np.ndarray, aspect: float, upper_left: bool = False) -> np.ndarray:
-    """A picture with borders, so that a window of that width per height does not distort it.
+    """Add borders to a picture, so that a window of another aspect ratio does not distort it.
 
     Args:
-        picture: (height, width, 3) uint8.
-        aspect: width per height of the window, as its browser tells; far beyond those of screens it is not followed.
-        upper_left: leave the borders below and on the right, otherwise the picture is in the middle.
+        picture: Picture (height, width, 3) uint8.
+        aspect: Width per height of the window, clamped to 0.25 to 4; other values than positive ones add no border.
+        upper_left: Whether the picture is in the upper left corner instead of the middle.
+
+    Returns:
+        The picture with grey borders (height', width', 3) uint8.
     """
     height, width = picture.shape[:2]
     aspect = min(max(aspect, _ASPECTS[0]), _ASPECTS[1]) if aspect > 0 else width / height
@@ -79,7 +82,7 @@ def padded(picture: np.ndarray, aspect: float, upper_left: bool = False) -> np.n
 
 
 class NoView:
-    """A note why there is nothing to see; coaching works without."""
+    """Note that says why the agent cannot be shown; coaching works without a view."""
 
     def __init__(self, server: viser.ViserServer, reason: str) -> None:
         server.gui.add_markdown(f"**No view:** {reason}")
@@ -92,7 +95,7 @@ class NoView:
 
 
 def make_view(server: viser.ViserServer, session: CoachSession) -> View:
-    """The 3-D view of a domain that has one, otherwise its renderer's picture, otherwise the reason why not."""
+    """Make the domain's 3-D view if it has one, else a view of its renderer's pictures, else a note with the reason."""
     try:
         return (session.domain.make_scene or PictureView)(server, session)
     except (ImportError, RuntimeError) as error:  # an extra or an OpenGL library is missing

@@ -1,4 +1,4 @@
-"""Widgets of a style space: one per parameter, what was measured below it, and a chart of both."""
+"""Widgets of a style space: one per parameter, the measured values below it, and a chart of both."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coachable.coach.phrases.grammar import readable_number
 from coachable.coach.session.readout import StyleReport, measures_by_parameter
+from coachable.evaluation.wording import readable, readable_number
 from coachable.styles import Choice, Parameter, StyleSpace, Weight
 
 if TYPE_CHECKING:
@@ -23,13 +23,13 @@ _REQUESTED, _MEASURED = "#d62728", "#1f77b4"
 
 
 class ParameterWidget:
-    """A slider with its number box, or a dropdown, that follows the session and asks it.
+    """Slider or dropdown of one parameter, which follows the session and requests changes.
 
     Args:
-        server: where to add it.
-        parameter: what it sets.
-        value: present value.
-        ask: called in viser's threads after the user changed it.
+        server: Server of the page.
+        parameter: The parameter.
+        value: Current value.
+        ask: Called in viser's threads after the user changed the value.
     """
 
     def __init__(
@@ -37,41 +37,39 @@ class ParameterWidget:
     ) -> None:
         self.parameter = parameter
         self._shown = value
-        hint = parameter.help or None
+        name, hint = label(parameter), parameter.help or None
         if isinstance(parameter, Choice):
-            options = [_words(option) for option in parameter.options]
-            self.handle: Any = server.gui.add_dropdown(
-                label(parameter), options, initial_value=_words(str(value)), hint=hint
-            )
+            options = [readable(option) for option in parameter.options]
+            self.handle: Any = server.gui.add_dropdown(name, options, initial_value=readable(value), hint=hint)
         else:
-            step = 10.0 ** math.floor(math.log10((parameter.high - parameter.low) / _SLIDER_STEPS))
-            self.handle = server.gui.add_slider(
-                label(parameter), parameter.low, parameter.high, step, self._inside(float(value)), hint=hint
-            )
+            low, high = parameter.low, parameter.high
+            step = 10.0 ** math.floor(math.log10((high - low) / _SLIDER_STEPS))
+            shown = self._inside(float(value))
+            self.handle = server.gui.add_slider(name, low, high, step, shown, hint=hint)
         self.handle.on_update(lambda _: None if self._same(self.asked) else ask())
 
     @property
     def asked(self) -> float | str:
-        """What the widget shows, as the session understands it; a browser may have sent what is no option."""
+        """Value of the widget; of a choice, any text that a browser sent, which need not be an option."""
         if isinstance(self.parameter, Choice):
             shown = str(self.handle.value)
-            return next((o for o in self.parameter.options if _words(o) == shown), shown)
+            return next((o for o in self.parameter.options if readable(o) == shown), shown)
         return float(self.handle.value)
 
     def take(self) -> dict[str, float | str]:
-        """The request, which from now on counts as shown."""
+        """Return the widget's value by parameter name, as a request, and count it as shown."""
         self._shown = self.asked
         return {self.parameter.name: self._shown}
 
     def follow(self, value: float | str) -> None:
-        """Shows what is in force, unless it is what the user asked for already."""
+        """Show the value in force, unless the widget shows it already."""
         if self._same(value):
             return
         self._shown = value
-        self.handle.value = _words(value) if isinstance(value, str) else self._inside(value)
+        self.handle.value = readable(value) if isinstance(value, str) else self._inside(value)
 
     def _inside(self, value: float) -> float:
-        """Float32 has digits that nobody asked for, and rounds to just beyond the bounds."""
+        """Round a float32 value to six digits, and clamp it because rounding may exceed the bounds."""
         return min(max(float(f"{value:.6g}"), self.parameter.low), self.parameter.high)
 
     def _same(self, value: float | str) -> bool:
@@ -81,24 +79,19 @@ class ParameterWidget:
 
 
 class MeasuredText:
-    """The line below a widget: what was measured, whether it complies, whether the request was out of range."""
+    """Line below a widget: the measured values, the trained range, and whether the request lay outside."""
 
     def __init__(self, server: viser.ViserServer, parameter: Parameter) -> None:
         self.parameter = parameter
         self.handle = server.gui.add_markdown(trained(parameter))
 
     def update(self, report: StyleReport, measures: list[str]) -> None:
-        """Shows the report's values of the parameter's `measures`, or says why there are none."""
-        name, found = self.parameter.name, "not measured yet"
-        shown = [
-            f"{self._name(m)}**{self._value(report.measured[m])}{self._unit(m)}**"
-            for m in measures
-            if m in report.measured
-        ]
+        """Show the values of the parameter's `measures` in a report, or say why there are none."""
+        name, values = self.parameter.name, report.measured
+        shown = [f"{self._name(m)}**{self._value(values[m])}{self._unit(m)}**" for m in measures if m in values]
+        found = "no measure of its own" if report.seconds and not measures else "not measured yet"
         if shown:
             found = f"measured {', '.join(shown)}"
-        elif report.seconds and not measures:
-            found = "no measure of its own"
         text = " · ".join(filter(None, [found, trained(self.parameter)]))
         outside = report.outside.get(name)
         if outside is not None:
@@ -107,12 +100,12 @@ class MeasuredText:
         write(self.handle, text)
 
     def _name(self, measure: str) -> str:
-        """Without the parameter's own name."""
+        """Return the name of a measure without the name of the parameter."""
         rest = f"_{measure}_".replace(f"_{self.parameter.name}_", "_").strip("_")
-        return f"{_words(rest)} " if rest else ""
+        return f"{readable(rest)} " if rest else ""
 
     def _value(self, value: float) -> str:
-        """Of a choice, the share of the time in which it was met."""
+        """Format a value; that of a choice is the share of time in which it was met."""
         return f"{value:.0%}" if isinstance(self.parameter, Choice) else readable_number(value)
 
     def _unit(self, measure: str) -> str:
@@ -121,38 +114,43 @@ class MeasuredText:
 
 
 class Chart:
-    """Requested against measured over the last seconds, of one parameter at a time.
+    """Chart of the requested and measured values of one parameter over the last seconds.
 
-    The axis of time is fixed: viser's plot otherwise remembers which share of the data was in view before the first
-    were drawn, and may show a part of the axis that has none.
+    The time axis has a fixed range, because viser's plot otherwise keeps the visible share of the data from before the
+    first points were drawn, and may show a part of the axis without data.
 
     Args:
-        server: where to add it.
-        folder: in which folder.
-        space: the styles.
-        redraw: called in viser's threads after the user chose another parameter; `add` is to follow.
+        server: Server of the page.
+        folder: Folder of the page that contains the chart.
+        space: The style space.
+        redraw: Called in viser's threads after the user chose another parameter; `add` has to follow.
     """
 
     def __init__(self, server: viser.ViserServer, folder: Any, space: StyleSpace, redraw: Callable[[], None]) -> None:
         self._server, self._folder, self._space = server, folder, space
         self._history: deque[tuple[float, StyleReport]] = deque(maxlen=_HISTORY)
-        self._names = {_words(name): name for name in space.names}
+        self._names = {readable(name): name for name in space.names}
         numeric = [p.name for p in space.parameters if not isinstance(p, Choice)]
         self.shown = [*numeric, *space.names][0]
         with folder:
-            self.choice = server.gui.add_dropdown("show", list(self._names), initial_value=_words(self.shown))
+            self.choice = server.gui.add_dropdown("show", list(self._names), initial_value=readable(self.shown))
             self.note = server.gui.add_markdown("", visible=False)
         self.choice.on_update(lambda _: redraw())
         self.plot: Any = None
         self._drawn: tuple[str, bool] | None = None  # parameter of the plot, and whether it has anything measured
 
     def follow(self, name: str) -> None:
-        """Shows a parameter, because it was just asked for."""
-        if self.choice.value != _words(name):
-            self.choice.value = _words(name)
+        """Show a parameter that was just requested."""
+        if self.choice.value != readable(name):
+            self.choice.value = readable(name)
 
     def add(self, time: float, report: StyleReport) -> None:
-        """A further point."""
+        """Add a report as a further point and draw the chart.
+
+        Args:
+            time: Simulated time of the session [s].
+            report: The report.
+        """
         if self._history and time < self._history[-1][0]:
             self._history.clear()  # the session started over
         elif self._history and time == self._history[-1][0]:
@@ -161,23 +159,20 @@ class Chart:
         self._draw()
 
     def _draw(self) -> None:
-        """Shows the chosen parameter: a number as it is; of a choice, the share of time in which it was met."""
+        """Show the chosen parameter: the value of a number, or the share of time in which a choice was met."""
         self.shown = self._names.get(str(self.choice.value), self.shown)
         now = self._history[-1][0]
-        rows = [
-            (moment - now, self._requested(report), self._measured(report))
-            for moment, report in self._history
-            if moment >= now - _SPAN
-        ]
+        recent = [(moment - now, report) for moment, report in self._history if moment >= now - _SPAN]
+        rows = [(ago, self._requested(report), self._measured(report)) for ago, report in recent]
         measured = [row for row in rows if math.isfinite(row[2])]  # uPlot draws nothing at all if there are NaN
         columns = np.array(measured or rows, dtype=float).T
         self._plot((self.shown, bool(measured)), tuple(columns if measured else columns[:2]))
-        write(self.note, f"{_words(self.shown)}: nothing was measured in the last {_SPAN:g} s")
+        write(self.note, f"{readable(self.shown)}: nothing was measured in the last {_SPAN:g} s")
         if self.note.visible == bool(measured):
             self.note.visible = not measured
 
     def _plot(self, kind: tuple[str, bool], data: tuple[np.ndarray, ...]) -> None:
-        """Draws data in a plot of their kind: for another kind a new plot, so that its settings change together."""
+        """Draw data in the plot, or in a new one if the parameter changes, so that all its settings change together."""
         if kind == self._drawn:
             self.plot.data = data
             return
@@ -188,7 +183,7 @@ class Chart:
         self._drawn = kind
 
     def _layout(self, name: str, measured: bool) -> dict[str, Any]:
-        """Of a parameter: a weight and what it brings about have no common unit, hence an axis each."""
+        """Return the layout of the plot; a weight and its measure have different units and get an axis each."""
         import viser.uplot as uplot
 
         series = [uplot.Series(label="seconds ago"), uplot.Series(label="requested", stroke=_REQUESTED, width=2)]
@@ -216,22 +211,18 @@ class Chart:
 
 
 def label(parameter: Parameter) -> str:
-    """Name and unit."""
-    return _words(parameter.name) + (f" [{parameter.unit}]" if parameter.unit else "")
+    """Return the name and unit of a parameter."""
+    return readable(parameter.name) + (f" [{parameter.unit}]" if parameter.unit else "")
 
 
 def trained(parameter: Parameter) -> str:
-    """The trained range, of a number."""
+    """Return the trained range of a numeric parameter, or an empty text for a choice."""
     if isinstance(parameter, Choice):
         return ""
     return f"trained {parameter.low:g} to {parameter.high:g} {parameter.unit}".rstrip()
 
 
-def _words(name: str) -> str:
-    return name.replace("_", " ")
-
-
 def write(handle: Any, text: str) -> None:
-    """Only what changed is sent to the browsers."""
+    """Set the content of a text widget; only changes are sent to the browsers."""
     if handle.content != text:
         handle.content = text

@@ -1,1 +1,1 @@
-"""Phrases such as "shorter steps" read as changes of a style, by rules."""
+"""Rules that read phrases such as "shorter steps" as changes of a style."""

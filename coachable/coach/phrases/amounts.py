@@ -1,4 +1,4 @@
-"""What a request asks of a number: "0.4 m", "a bit longer", "twice as much", "avoid"."""
+"""Values of numeric parameters from requests such as "0.4 m", "a bit longer", "twice as much" or "avoid"."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import cast
 
 from coachable.coach.phrases.segments import Segment
 from coachable.coach.phrases.vocabulary import ANY, PERCENT, PLAINLY, SLIGHTLY, STRONGLY, TURNS, UNITS, stem
+from coachable.evaluation.wording import readable
 from coachable.styles import Choice, Setpoint, Weight
 
 Last = tuple[tuple[str, ...], float]  # parameters and direction of a change
@@ -14,17 +15,17 @@ _QUALITY = 0.85  # share of the range that an adjective such as "careful" asks f
 
 
 def amount(p: Weight | Setpoint, segment: Segment, now: float, last: Last | None, spent: bool = False) -> float | str:
-    """The value that a request asks for.
+    """Return the value that a request asks for.
 
     Args:
-        p: the parameter it is about.
-        segment: the request.
-        now: value in force.
-        last: the last change, to which "a bit more" refers.
-        spent: whether the parameter rewards saving what it is named after: "less fuel" asks for more of it.
+        p: The parameter that is changed.
+        segment: The request.
+        now: Value in force.
+        last: The last change, to which "a bit more" refers.
+        spent: Whether the parameter rewards saving what it is named after, so that "less fuel" asks for more of it.
 
     Returns:
-        The value, possibly outside the range where a number was given; or, as text, what is missing.
+        The value, which may lie outside the range if the request contains a number; or, as text, what is missing.
     """
     compared = segment.direction is not None or segment.level is not None
     sense = segment.sense or (-1 if spent and compared else 0)
@@ -47,21 +48,21 @@ def amount(p: Weight | Setpoint, segment: Segment, now: float, last: Last | None
         return _weight(p, segment, spent)
     if sense:
         return _level(p, _QUALITY if (sense > 0) != segment.negated else 1.0 - _QUALITY, segment.degree)
-    return f"how much? {p.name.replace('_', ' ')} goes from {p.low:g} to {p.high:g} {p.unit}".rstrip()
+    return f"how much? {readable(p.name)} goes from {p.low:g} to {p.high:g} {p.unit}".rstrip()
 
 
 def dimension_of(parameter: Weight | Setpoint | Choice) -> str:
-    """What a parameter measures, by its unit."""
+    """Return the dimension of a parameter's unit, such as "length"; "" if it has no known unit."""
     return UNITS.get(stem(parameter.unit), (ANY, 1.0))[0] if parameter.unit else ANY
 
 
 def default_of(parameter: Weight | Setpoint) -> float:
-    """Declared or derived, it is never None once the parameter exists."""
-    return cast(float, parameter.default)
+    """Return the default of a numeric parameter."""
+    return cast(float, parameter.default)  # declared, or derived when the parameter was made: never None
 
 
 def wrapped(p: Weight | Setpoint | Choice, value: float) -> float:
-    """The same direction within the range of a parameter that goes full circle; other values as they are."""
+    """Return the equivalent angle in the range of a full-circle parameter; return other values unchanged."""
     if _is_circle(p) and not p.low <= value <= p.high:
         return p.low + (value - p.low) % 360.0
     return value
@@ -72,9 +73,9 @@ def _is_circle(p: Weight | Setpoint | Choice) -> bool:
 
 
 def _sign(segment: Segment, p: Weight | Setpoint, last: Last | None, sense: int) -> float | None:
-    """+1 or -1 for a change relative to the value in force."""
+    """Return +1 or -1 for a change relative to the value in force, or None for an absolute request."""
     same = last is not None and p.name in last[0]
-    turn = -1.0 if sense < 0 and segment.dimension == ANY else 1.0  # "closer" is closer, also of "careful"
+    turn = -1.0 if sense < 0 and segment.dimension == ANY else 1.0  # "closer" means closer, also after "careful"
     if segment.direction is not None:
         dimension, sign = segment.direction
         if last is not None and same and segment.repeated and dimension == ANY and not segment.mentions:
@@ -96,7 +97,7 @@ def _moved(p: Weight | Setpoint, segment: Segment, now: float, sign: float) -> f
 
 
 def _level(p: Weight | Setpoint, share: float, degree: float) -> float:
-    """Of an adjective, such as "short" or "very short"."""
+    """Return the value of an adjective, such as "short" or "very short", at a share of the range."""
     if degree == STRONGLY and share != 0.5:
         share = float(round(share))
     elif degree == SLIGHTLY:
@@ -105,7 +106,7 @@ def _level(p: Weight | Setpoint, share: float, degree: float) -> float:
 
 
 def _weight(p: Weight, segment: Segment, spent: bool) -> float:
-    """Of a mere mention: "fire", "a bit of fire", "avoid fire"; "save fuel", "do not save fuel", "use fuel"."""
+    """Return the value of a weight that is only named: "fire", "a bit of fire", "avoid fire", "save fuel"."""
     if segment.negated and not segment.sense and not spent:
         return p.low
     if segment.negated != (segment.sense < 0):
@@ -114,7 +115,7 @@ def _weight(p: Weight, segment: Segment, spent: bool) -> float:
 
 
 def _given(p: Weight | Setpoint, segment: Segment, now: float, sign: float | None, sense: int) -> float | str:
-    """Of a number that was said."""
+    """Return the value of a request that contains a number, or what is missing."""
     assert segment.number is not None
     number, unit = segment.number
     if segment.negated:
@@ -126,7 +127,7 @@ def _given(p: Weight | Setpoint, segment: Segment, now: float, sign: float | Non
         return p.low + (p.high - p.low) * (1.0 - share if sense < 0 else share)
     if unit:
         if dimension_of(p) != UNITS[unit][0]:
-            return f"{p.name.replace('_', ' ')} is no {UNITS[unit][0]}" + (f", it is in {p.unit}" if p.unit else "")
+            return f"{readable(p.name)} is no {UNITS[unit][0]}" + (f", it is in {p.unit}" if p.unit else "")
         number = number * UNITS[unit][1] / UNITS[stem(p.unit)][1]
     if segment.signed or (number < 0 and p.low >= 0):
         return now + number

@@ -1,4 +1,4 @@
-"""The words of a domain that fit an agent's styles."""
+"""Selection of a domain's words that fit an agent's styles."""
 
 from __future__ import annotations
 
@@ -12,11 +12,14 @@ from coachable.styles import Choice, Parameter
 
 
 def fitting(words: Words, parameters: Sequence[Parameter]) -> Words:
-    """Leave out words and presets for what does not exist: an agent may have been trained on fewer styles.
+    """Leave out the words and presets of parameters and options that an agent does not have.
 
     Args:
-        words: of the domain.
-        parameters: of the agent's style space, and of the live controls.
+        words: Words of the domain.
+        parameters: Parameters of the agent's style space and of the live controls.
+
+    Returns:
+        The words of the domain that name only these parameters and their options.
     """
     options = {p.name: p.options if isinstance(p, Choice) else None for p in parameters}
 

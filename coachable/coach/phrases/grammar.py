@@ -1,7 +1,7 @@
-"""`StyleGrammar`: short phrases such as "shorter steps, arms up" or "0.4 m" into style parameters.
+"""`StyleGrammar`: read short phrases such as "shorter steps, arms up" or "0.4 m" as style parameters.
 
-A convenience built from the declarations, not language understanding: it knows names, options, words of the help texts
-and the words of `coachable.coach.phrases.vocabulary`. What it does not know, it says.
+The grammar consists of rules, the names, options and help texts of the parameters, and the words of
+`coachable.coach.phrases.vocabulary`. It reports words that are not among these.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from coachable.coach.phrases import segments
 from coachable.coach.phrases.amounts import Last, amount, dimension_of, wrapped
 from coachable.coach.phrases.segments import Mention, Segment
 from coachable.coach.phrases.vocabulary import RESERVED, stem, tokenise
+from coachable.evaluation.wording import readable, readable_number
 from coachable.styles import Choice, Parameter, StyleSpace, Weight
 
 Value = float | str
@@ -26,15 +27,15 @@ _EXAMPLES = 3
 
 @dataclass(frozen=True)
 class Understanding:
-    """What a phrase was taken to mean.
+    """Result of reading a phrase.
 
     Attributes:
-        phrase: as given.
-        changes: value by parameter name, to be handed to `CoachSession.set`; it may lie outside the trained range.
-        said: one sentence per request that was understood.
-        failed: one sentence per piece that was not.
-        last: parameters and direction of the last change, for "a bit more".
-        examples: phrases that would be understood, if a word was not known.
+        phrase: The phrase as given.
+        changes: Requested value by parameter name, for `CoachSession.set`; it may lie outside the trained range.
+        said: One sentence for each request that was understood.
+        failed: One sentence for each part that was not understood.
+        last: Parameters and direction of the last change, to which "a bit more" refers.
+        examples: Phrases that would be understood, if a word was unknown.
     """
 
     phrase: str
@@ -51,33 +52,33 @@ class Understanding:
 
 @dataclass
 class _Reading:
-    """A phrase while it is being read."""
+    """State of reading a phrase."""
 
     values: dict[str, Value]
     changes: dict[str, Value] = field(default_factory=dict)
     said: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
-    excluded: dict[str, str] = field(default_factory=dict)  # by parameter: an option was ruled out, none was named
+    excluded: dict[str, str] = field(default_factory=dict)  # sentence by choice: an option was ruled out, none named
     last: Last | None = None
 
 
 class StyleGrammar:
-    """Reads phrases about the parameters of a style space.
+    """Grammar of phrases about the parameters of a style space.
 
     Args:
-        parameters: what can be asked for; a `StyleSpace` or any list of declarations.
-        vocabulary: further words and phrases by meaning: "name" for a parameter, "name=option" for an option,
-            "name=low", "name=high" or "name=0.4" for a value, "+name" or "-name" for what asks for more or less of it,
-            such as "careful" or "aggressive" for a distance. Several names, separated by spaces, are meant together.
+        parameters: The parameters, as a `StyleSpace` or a list of declarations.
+        vocabulary: Further words and phrases by meaning: "name" for a parameter, "name=option" for an option,
+            "name=low", "name=high" or "name=0.4" for a value, "+name" or "-name" for a request of more or less of it,
+            such as "careful" or "aggressive" for a distance. Several names separated by spaces are changed together.
             A weight with "-" words is named after what it saves, so that "less fuel" asks for more of it. Words under
-            "" ask for nothing. Singular forms suffice.
-        examples: phrases to suggest where a word is not known; those that are not understood are left out.
+            "" are ignored. Give singular forms.
+        examples: Phrases to suggest after an unknown word; phrases that are not understood are left out.
 
     Attributes:
-        examples: phrases that are understood here.
+        examples: Suggested phrases, all of which are understood.
 
     Raises:
-        ValueError: if the vocabulary names something that does not exist.
+        ValueError: If the vocabulary names a parameter or an option that does not exist.
 
     Example:
         >>> from coachable.styles import Setpoint
@@ -111,16 +112,16 @@ class StyleGrammar:
         opposed = {name for mention in self.lexicon.values() if mention.sign < 0 for name in mention.names}
         self._spent = {name for name in opposed if isinstance(self.parameters[name], Weight)}
         self.examples = self._working(examples) or self._working(
-            [_words(p.options[-1]) if isinstance(p, Choice) else f"more {_words(p.name)}" for p in declared]
+            [readable(p.options[-1]) if isinstance(p, Choice) else f"more {readable(p.name)}" for p in declared]
         )
 
     def read(self, phrase: str, current: Mapping[str, Value], previous: Understanding | None = None) -> Understanding:
-        """Understand a phrase, relative to the style in force.
+        """Read a phrase relative to the style in force.
 
         Args:
-            phrase: what the coach said, at most 2,000 characters.
-            current: value of every parameter.
-            previous: what was understood before, to which "a bit more" refers.
+            phrase: The phrase, of at most 2,000 characters.
+            current: Value of every parameter.
+            previous: Result of the phrase before, to which "a bit more" refers.
         """
         reading = _Reading(dict(current), last=previous.last if previous is not None else None)
         if len(phrase) > MAX_PHRASE:
@@ -139,8 +140,6 @@ class StyleGrammar:
         hint = self.examples if reading.failed and unknown else ()
         return Understanding(phrase, reading.changes, tuple(reading.said), tuple(reading.failed), reading.last, hint)
 
-    # -- lexicon ---------------------------------------------------------------------------------------------------
-
     def _add(self, phrase: str, mention: Mention) -> None:
         words = tuple(stem(token) for token in tokenise(phrase))
         if words:
@@ -158,7 +157,7 @@ class StyleGrammar:
             self._add(name, mention)
 
     def _add_help(self) -> None:
-        """Content words of the help texts that belong to one parameter alone."""
+        """Add the words of the help texts that occur with one parameter only."""
         words = {p.name: {w for w in tokenise(p.help) if self._is_free(w)} for p in self.parameters.values()}
         counts = Counter(word for found in words.values() for word in found)
         for name, found in words.items():
@@ -167,7 +166,7 @@ class StyleGrammar:
                     self._add(word, Mention((name,)))
 
     def _is_free(self, word: str) -> bool:
-        """Whether a word has no other meaning, so that alone it may stand for a parameter."""
+        """Return whether a word has no other meaning and may stand for a parameter."""
         return word.isalpha() and len(word) > 1 and word not in RESERVED and word not in self._ignored
 
     def _mention(self, meaning: str) -> Mention:
@@ -189,34 +188,35 @@ class StyleGrammar:
         return Mention(signed, float(value))
 
     def _working(self, phrases: Sequence[str]) -> tuple[str, ...]:
-        """The first few phrases that are understood."""
+        """Return the first few phrases that are understood."""
         self.examples: tuple[str, ...] = ()
         return tuple(phrase for phrase in phrases if not self.read(phrase, self._defaults).failed)[:_EXAMPLES]
 
-    # -- meaning ---------------------------------------------------------------------------------------------------
-
     def _interpret(self, segment: Segment, reading: _Reading) -> None:
-        for name in segment.names:  # "the warrior bow": one word names it, the other describes it
+        for name in segment.names:  # "the warrior bow": one word is the name, the other one describes it
             segment.unknown = [word for word in segment.unknown if stem(word) not in self._context[name]]
-        if segment.negated and segment.unknown:  # what is denied is not known
-            reading.failed.append(f"'{segment.text}' (unknown: {', '.join(segment.unknown)})")
+        unknown = f"unknown: {', '.join(segment.unknown)}"
+        if segment.negated and segment.unknown:  # the negation may refer to the unknown word
+            reading.failed.append(f"'{segment.text}' ({unknown})")
             return
-        values = [mention for mention in segment.mentions if mention.value is not None]
-        if values:
-            self._take_values(segment, values, reading)
+        if any(mention.value is not None for mention in segment.mentions):
+            self._take_values(segment, reading)
             return
         names, problem = self._target(segment, reading)
         if not names:
             reading.failed.append(f"'{segment.text}'{problem}")
             return
-        parameter = self.parameters[names[0]]
+        name, parameter = names[0], self.parameters[names[0]]
         if isinstance(parameter, Choice):
-            self._choose(parameter, segment, reading)
+            if segment.keep or segment.default:
+                self._change(reading, name, (self._defaults if segment.default else reading.values)[name])
+                return
+            expected = f"{readable(name)} can be {_listed(parameter.options)}"
+            reading.failed.append(f"'{segment.text}' ({f'{unknown}; ' if segment.unknown else ''}{expected})")
             return
         numeric = [p for p in map(self.parameters.__getitem__, names) if not isinstance(p, Choice)]
-        asked = [
-            amount(p, segment, float(reading.values[p.name]), reading.last, p.name in self._spent) for p in numeric
-        ]
+        values, last, spent = reading.values, reading.last, self._spent
+        asked = [amount(p, segment, float(values[p.name]), last, p.name in spent) for p in numeric]
         problems = [value for value in asked if isinstance(value, str)]
         if problems:
             reading.failed.append(f"'{segment.text}' ({problems[0]})")
@@ -228,19 +228,11 @@ class StyleGrammar:
         if reading.last is not None and reading.last[0][0] in names:
             reading.last = (names, reading.last[1])
 
-    def _choose(self, parameter: Choice, segment: Segment, reading: _Reading) -> None:
-        """A choice without an option that was named."""
-        name = parameter.name
-        if segment.keep or segment.default:
-            self._change(reading, name, (self._defaults if segment.default else reading.values)[name])
-            return
-        unknown = f"unknown: {', '.join(segment.unknown)}; " if segment.unknown else ""
-        reading.failed.append(f"'{segment.text}' ({unknown}{_words(name)} can be {_listed(parameter.options)})")
-
-    def _take_values(self, segment: Segment, values: list[Mention], reading: _Reading) -> None:
-        """Options of choices, and values that the vocabulary gives a name."""
-        for mention in values:
-            assert mention.value is not None
+    def _take_values(self, segment: Segment, reading: _Reading) -> None:
+        """Change the parameters of named options and values, or exclude these values if the segment is negated."""
+        for mention in segment.mentions:
+            if mention.value is None:
+                continue
             if not segment.negated:
                 self._note_unknown(segment, reading)
             for name in mention.names:
@@ -250,11 +242,11 @@ class StyleGrammar:
                     self._change(reading, name, mention.value)
 
     def _deny(self, name: str, value: Value, segment: Segment, reading: _Reading) -> None:
-        """Any value but this one."""
+        """Request any other value than this one, or ask which."""
         parameter = self.parameters[name]
         others = [option for option in _options(parameter) if option != value]
         if isinstance(parameter, Choice) and reading.values[name] != value:
-            reading.said.append(f"{_words(name)} stays {_shown(parameter, reading.values[name])}")
+            reading.said.append(f"{readable(name)} stays {_shown(parameter, reading.values[name])}")
         elif isinstance(parameter, Weight) and value == 0.0:
             self._change(reading, name, parameter.high)  # "do not waste fuel"
         elif len(others) == 1:
@@ -264,7 +256,7 @@ class StyleGrammar:
             reading.excluded[name] = f"'{segment.text}' ({instead})"
 
     def _target(self, segment: Segment, reading: _Reading) -> tuple[tuple[str, ...], str]:
-        """The parameters that a segment is about, or why there is none."""
+        """Return the parameters that a segment refers to, and otherwise the reason why there are none."""
         if segment.mentions:
             return segment.names, ""
         if segment.unknown:
@@ -293,8 +285,6 @@ class StyleGrammar:
         if not changed:
             reading.said.append("everything stays at its default")
 
-    # -- echo ------------------------------------------------------------------------------------------------------
-
     def _change(self, reading: _Reading, name: str, value: Value, note: str = "") -> None:
         parameter, before = self.parameters[name], reading.values[name]
         if isinstance(value, float) and isinstance(before, float):
@@ -302,17 +292,17 @@ class StyleGrammar:
             if abs(value - before) <= 1e-6 * (parameter.high - parameter.low):
                 at = "already at its " + ("highest" if value >= parameter.high else "lowest")
                 ends = not parameter.low < value < parameter.high
-                reading.said.append(f"{_words(name)} stays {_shown(parameter, before)}" + (f", {at}" if ends else ""))
+                reading.said.append(f"{readable(name)} stays {_shown(parameter, before)}{f', {at}' if ends else ''}")
                 return
             reading.last = ((name,), 1.0 if value > before else -1.0)
             value = wrapped(parameter, value)
         if value == before:
-            reading.said.append(f"{_words(name)} stays {_shown(parameter, value)}")
+            reading.said.append(f"{readable(name)} stays {_shown(parameter, value)}")
             return
         was = readable_number(before) if isinstance(before, float) else _shown(parameter, before)
         outside = isinstance(before, float) and not parameter.low <= float(value) <= parameter.high
         trained = f", outside the trained range {parameter.low:g} to {parameter.high:g}" if outside else ""
-        reading.said.append(f"{_words(name)} {was} → {_shown(parameter, value)}{note}{trained}")
+        reading.said.append(f"{readable(name)} {was} → {_shown(parameter, value)}{note}{trained}")
         reading.values[name] = reading.changes[name] = value
 
     @staticmethod
@@ -322,7 +312,11 @@ class StyleGrammar:
 
 
 def read_meaning(meaning: str) -> tuple[tuple[str, ...], int, str]:
-    """Names, sign and value of a meaning of the vocabulary, such as "-longitudinal -lateral" or "pose=arms_up"."""
+    """Split a meaning of the vocabulary, such as "-gap_ahead -gap_beside" or "pose=arms_up".
+
+    Returns:
+        The names of the parameters, their sign (+1, -1, or 0 for none), and the value ("" for none).
+    """
     names, _, value = meaning.partition("=")
     signs = {_SIGNS.get(name[0], 0) for name in names.split()}
     return tuple(name.lstrip("+-") for name in names.split()), signs.pop() if signs else 0, value
@@ -332,20 +326,11 @@ def _options(parameter: Parameter) -> tuple[str, ...]:
     return tuple(parameter.options) if isinstance(parameter, Choice) else ()
 
 
-def _words(name: str) -> str:
-    return name.replace("_", " ")
-
-
 def _listed(names: Sequence[str]) -> str:
-    return " or ".join(map(_words, names))
+    return " or ".join(map(readable, names))
 
 
 def _shown(parameter: Parameter, value: Value) -> str:
     if isinstance(value, str):
-        return _words(value)
+        return readable(value)
     return f"{readable_number(value)} {parameter.unit}".rstrip()
-
-
-def readable_number(value: float) -> str:
-    """Three digits, however large."""
-    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"

@@ -1,4 +1,4 @@
-"""A phrase cut into single requests."""
+"""Division of a phrase into single requests."""
 
 from __future__ import annotations
 
@@ -24,25 +24,19 @@ from coachable.coach.phrases.vocabulary import (
     stem,
 )
 
-_FLAGS = {
-    "preferred": PREFERENCES,
-    "default": DEFAULTS,
-    "keep": KEEPS,
-    "repeated": REPEATS,
-    "absolute": ABSOLUTE,
-}
-"""Words by the attribute of a `Segment` that they set."""
+_FLAGS = {"preferred": PREFERENCES, "default": DEFAULTS, "keep": KEEPS, "repeated": REPEATS, "absolute": ABSOLUTE}
+"""Words by the attribute of `Segment` that they set."""
 
 
 @dataclass(frozen=True)
 class Mention:
-    """What a word or phrase of the lexicon names.
+    """Meaning of a word or phrase of the lexicon.
 
     Attributes:
-        names: parameters; several for a word such as "room", which is about the gaps on all sides.
-        value: an option or a number, if the word stands for one.
-        sign: +1 if the word asks for more of the parameters ("careful" for gaps), -1 if for less ("aggressive"), 0 if
-            it only names them ("gap").
+        names: Parameters that it names; several for a word such as "room", which means the gaps on all sides.
+        value: An option or a number, if the word stands for one.
+        sign: +1 if the word asks for more of the parameters ("careful" for gaps), -1 if it asks for less
+            ("aggressive"), 0 if it only names them ("gap").
     """
 
     names: tuple[str, ...]
@@ -52,18 +46,18 @@ class Mention:
 
 @dataclass
 class Segment:
-    """One request: at most one parameter, and what is asked of it.
+    """One request: at most one parameter, and how to change it.
 
     Attributes:
-        words: as they were said.
-        mentions: parameters and options named.
-        direction: dimension and sign of a comparative.
-        level: share of the range of an adjective.
-        dimension: what the words measure, "" if anything.
-        number: value and unit, "" if none was said.
-        degree: strength, 0 if none was said.
-        factor: of "twice" and the like.
-        unknown: words without a meaning here.
+        words: Words of the phrase.
+        mentions: Parameters and options that are named.
+        direction: Dimension and sign of a comparative.
+        level: Share of the range that an adjective stands for.
+        dimension: Dimension of the words, such as "length"; "" if they fit any.
+        number: Value and unit; the unit is "" if there is none.
+        degree: Strength of the change, 0 if there is none.
+        factor: Factor of words such as "twice".
+        unknown: Words without a meaning.
     """
 
     words: list[str] = field(default_factory=list)
@@ -85,33 +79,33 @@ class Segment:
 
     @property
     def text(self) -> str:
-        """What was said."""
+        """Words of the request as one text."""
         return " ".join(self.words)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The parameters that all mentions have in common: "the bow of the hunter" is one bow."""
+        """Parameters that all mentions have in common: "the bow of the hunter" names one bow."""
         first, *others = (mention.names for mention in self.mentions) if self.mentions else ((),)
         return tuple(name for name in first if all(name in names for names in others))
 
     @property
     def sense(self) -> int:
-        """+1 or -1 if the words ask for more or less of the parameters; 0 if they only name them."""
+        """Sign of the words: +1 or -1 if they ask for more or less of the parameters, 0 if they only name them."""
         return math.prod(signs) if (signs := [m.sign for m in self.mentions if m.sign]) else 0
 
     @property
     def too(self) -> bool:
-        """Whether something is too much; at the end of a request "too" means "also"."""
+        """Whether the request says "too", except at its end, where "too" means "also"."""
         return "too" in self.words[:-1]
 
     @property
     def explicit(self) -> bool:
-        """Whether it says how to change something, by a comparative, an adjective, a number or a factor."""
+        """Whether the request contains a comparative, an adjective, a number or a factor."""
         return any(part is not None for part in (self.direction, self.level, self.number, self.factor))
 
     @property
     def has_head(self) -> bool:
-        """Whether it asks for something, be it of an unnamed parameter."""
+        """Whether the request asks for a change, with or without the name of a parameter."""
         return self.explicit or self.default or self.repeated or self.keep or self.degree > 0
 
     @property
@@ -123,14 +117,14 @@ class Segment:
 def split(
     tokens: Sequence[str], lexicon: Mapping[tuple[str, ...], Mention], ignored: Collection[str] = ()
 ) -> list[Segment]:
-    """Cut a phrase at punctuation, conjunctions, and where a request is complete and another begins.
+    """Split a phrase at punctuation, at conjunctions, and where a request is complete and another one begins.
 
-    The work grows in proportion to the number of tokens.
+    The run time is proportional to the number of tokens.
 
     Args:
-        tokens: from `tokenise`.
-        lexicon: what stemmed words name.
-        ignored: words that ask for nothing, beside those of the vocabulary.
+        tokens: Output of `tokenise`.
+        lexicon: Meaning of stemmed words and phrases.
+        ignored: Words without a meaning, in addition to those of the vocabulary.
     """
     stems = [stem(token) for token in tokens]
     sizes, named_ahead = _look_up(stems, lexicon)
@@ -154,11 +148,11 @@ def split(
 
 
 def _look_up(stems: Sequence[str], lexicon: Mapping[tuple[str, ...], Mention]) -> tuple[list[int], list[bool]]:
-    """Find what the lexicon names at each token.
+    """Look up the entries of the lexicon that begin at each token.
 
     Returns:
-        The number of tokens of the longest entry that begins there, 0 if none does; and whether an entry lies between
-        there and the next separator.
+        The number of tokens of the longest entry that begins at each token, 0 if there is none; and whether an entry
+        lies between the token and the next separator.
     """
     longest = max((len(words) for words in lexicon), default=1)
     sizes, named_ahead = [0] * len(stems), [False] * len(stems)
@@ -175,7 +169,7 @@ def _look_up(stems: Sequence[str], lexicon: Mapping[tuple[str, ...], Mention]) -
 def _begins_another(segment: Segment, rest: Sequence[str], mention: Mention | None, named_ahead: bool) -> bool:
     if mention is not None:
         other = bool(segment.mentions) and not set(segment.names) & set(mention.names)
-        # "arms up": the option completes what the noun began
+        # "arms up": the option belongs to the noun before it
         return other or (mention.value is not None and segment.complete)
     if not segment.complete:
         return False
@@ -186,12 +180,12 @@ def _begins_another(segment: Segment, rest: Sequence[str], mention: Mention | No
         # "arms up high" is one request, "arms up high speed" are two
         dimension = (LEVELS.get(word) or DIRECTIONS[word])[0]
         return segment.number is None and (named_ahead or bool(dimension))
-    # A degree belongs to what follows it, if something does: "shorter steps much more melee".
+    # A degree belongs to the next word if that is a comparative or an adjective: "shorter steps much more melee".
     return word in DEGREES and len(rest) > 1 and (rest[1] in DIRECTIONS or rest[1] in LEVELS)
 
 
 def _take(segment: Segment, tokens: Sequence[str], i: int, ignored: Collection[str]) -> int:
-    """Note what a word means; return how many tokens were used."""
+    """Add the meaning of a word to a segment and return the number of tokens used."""
     word = tokens[i]
     segment.words.append(word)
     if word[-1].isdigit() and not math.isfinite(float(word)):
@@ -231,7 +225,7 @@ def _take_modifier(segment: Segment, word: str, ignored: Collection[str]) -> Non
 
 
 def _tidy(found: list[Segment]) -> list[Segment]:
-    """Drop empty segments and join what a comma tore apart: "steps, shorter", "shorter steps, just a bit"."""
+    """Drop empty segments and join those that a comma separates: "steps, shorter", "shorter steps, just a bit"."""
     kept: list[Segment] = []
     for segment in found:
         asks = segment.mentions or segment.unknown or segment.has_head or segment.negated or segment.preferred

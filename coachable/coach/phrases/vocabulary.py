@@ -1,4 +1,4 @@
-"""English words of the phrase box, and how a phrase becomes tokens."""
+"""English vocabulary of the phrase box, and the tokeniser."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ FILLERS = _words(
 RESERVED = frozenset().union(
     DIRECTIONS, LEVELS, FACTORS, NEGATIONS, PREFERENCES, DEFAULTS, FILLERS, SEPARATORS, UNITS, PERCENT
 )
-"""Words that have a meaning of their own, so that none of them alone may stand for a parameter."""
+"""Words with a meaning of their own; none of them may stand for a parameter."""
 
 _ARTICLES = _words("the your my his her its their")  # "raise your arms" reads as "raise arms"
 
@@ -111,12 +111,12 @@ _TOKEN = re.compile(r"[+-]?\d+(?:\.\d+)?|m/s|km/h|[a-z°]+|%|[,;.!?:]")
 
 
 def stem(word: str) -> str:
-    """The word without a plural's s."""
+    """Return a word without the s of the plural."""
     return word[:-1] if len(word) > 3 and word.endswith("s") and not word.endswith("ss") else word
 
 
 def tokenise(phrase: str) -> list[str]:
-    """Words, numbers, units and punctuation, in lower case, without articles and possessives.
+    """Split a phrase into words, numbers, units and punctuation, in lower case, without articles and possessives.
 
     Example:
         >>> tokenise("T-pose, don't: 0,4m or half a metre")
@@ -133,7 +133,7 @@ def tokenise(phrase: str) -> list[str]:
 
 
 def _spelt_numbers(tokens: list[str]) -> Iterator[str]:
-    """Replaces number words in front of a unit by digits."""
+    """Replace number words in front of a unit by digits."""
     i = 0
     while i < len(tokens):
         value, used = _FRACTIONS.get(tokens[i], _NUMBERS.get(tokens[i])), 1

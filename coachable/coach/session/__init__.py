@@ -1,1 +1,1 @@
-"""A coached agent without a page: session, episodes, recordings, what was asked and what was measured."""
+"""Coaching an agent from a script: sessions, episodes, recordings and reports."""

@@ -1,4 +1,4 @@
-"""A policy in one environment, episode after episode."""
+"""Episodes of a policy in one environment, one after the other."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ TIME_IS_UP = "time is up"
 
 
 class LiveEpisodes(Rollout):
-    """Step one environment with a policy and count how episodes end.
+    """Rollout in one environment that counts how episodes end.
 
     Args:
-        domain: gives the environment.
-        space: its styles.
-        endless: go on when the domain's time limit is reached.
-        terminated: what a terminated episode is called.
+        domain: Domain that makes the environment.
+        space: The agent's style space.
+        endless: Whether to continue when the domain's time limit is reached.
+        terminated: Reason to report for a terminated episode, such as "fell".
 
     Attributes:
-        env: of batch size 1.
-        ended: why the episode is over, None while it runs.
-        number: of the episode, from 1.
-        steps: since the episode began.
-        endings: how many episodes ended for which reason.
+        env: The environment, of batch size 1.
+        ended: Why the episode is over, or None while it runs.
+        number: Number of the episode, from 1.
+        steps: Number of steps since the episode began.
+        endings: Number of episodes that ended, by reason.
     """
 
     def __init__(self, domain: Domain, space: StyleSpace, *, endless: bool, terminated: str) -> None:
@@ -42,14 +42,14 @@ class LiveEpisodes(Rollout):
 
     @property
     def base_env(self) -> EnvBase:
-        """The domain's own environment, below the transforms."""
+        """The domain's environment without the transforms around it."""
         env = self.env
         while isinstance(env, TransformedEnv):
             env = env.base_env
         return env
 
     def seed(self, seed: int) -> None:
-        """Start over; `begin` must follow."""
+        """Seed the environment and the actions, and count episodes from 1 again; call `begin` afterwards."""
         super().seed(seed)
         self.number = 0
         self.endings.clear()
@@ -62,7 +62,7 @@ class LiveEpisodes(Rollout):
         self.ended = None
 
     def step(self, policy: TensorDictModuleBase, style: Tensor) -> TensorDictBase:
-        """Make one step under a style (d,); return the transition, batch shape (1,)."""
+        """Make one step with a style (d,) and return the transition, batch shape (1,)."""
         transition = super().step(policy, style[None])
         self.steps += 1
         after = transition.get("next")

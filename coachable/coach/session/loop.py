@@ -1,4 +1,4 @@
-"""Runs a session in real time, in a thread of its own; everybody else hands it what to do through a queue."""
+"""Real-time loop that steps a session in its own thread; other threads submit their changes through a queue."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from typing import Any
 
 from coachable.coach.session.session import CoachSession
 
-_LATE = 0.25  # [s], a delay beyond this is not made up for
-_IDLE = 0.05  # [s], between looks at the queue while paused
-_WAITING = 256  # changes, beyond which further ones are refused
+_LATE = 0.25  # [s], the loop does not catch up on longer delays
+_IDLE = 0.05  # [s], longest time between checks of the queue
+_WAITING = 256  # changes in the queue, further ones are refused
 
 
 class LiveLoop:
-    """Steps a session at the pace of its control step.
+    """Thread that steps a session in real time.
 
-    Only the loop's thread touches the session. What others want done is submitted, and carried out before the next
-    step: a request therefore acts at the next observation. A step that raises pauses the loop; the text of any
-    exception is kept in `problem`.
+    Only this thread uses the session. Other threads submit changes, which are made before the next step, so a request
+    applies from the next observation on. An exception in a step pauses the loop; the text of the last exception is
+    kept in `problem`.
 
     Args:
-        session: stepped here and nowhere else.
-        on_step: called in the loop's thread after each step and after each submitted change.
-        pause_at_end: how long an ended episode stays on view before the next begins [s].
+        session: The session, which no other thread may step.
+        on_step: Called in the loop's thread after each step and after each submitted change.
+        pause_at_end: How long an ended episode is shown before the next one begins [s].
 
     Attributes:
-        speed: simulated seconds per second, a finite number above 0.
-        paused: no steps except single ones.
-        problem: text of the last exception, empty if there was none since the last change.
+        speed: Simulated seconds per second, a finite number above 0.
+        paused: Whether the loop only makes single steps.
+        problem: Text of the last exception, empty if there was none since the last change.
     """
 
     def __init__(
@@ -50,10 +50,10 @@ class LiveLoop:
 
     @property
     def speed(self) -> float:
-        """See above.
+        """Simulated seconds per second.
 
         Raises:
-            ValueError: if it is set to anything else.
+            ValueError: If it is set to anything but a finite number above 0.
         """
         return self._speed
 
@@ -64,27 +64,30 @@ class LiveLoop:
         self._speed = speed
 
     def start(self) -> None:
-        """Begins to step."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Ends the thread after the step in progress."""
+        """End the thread after the current step."""
         self._stopping.set()
         if self._thread.is_alive() and self._thread is not threading.current_thread():
             self._thread.join()
 
     def submit(self, change: Callable[[CoachSession], Any]) -> None:
-        """Has something done to the session before its next step; returns at once.
+        """Queue a change of the session, to be made before its next step, and return at once.
 
-        What exceeds the steps that the session can take meanwhile is left out: see `problem`.
+        If the queue is full, the change is dropped and `problem` says so.
+
+        Args:
+            change: Function of the session, called in the loop's thread.
         """
         try:
             self._changes.put_nowait(change)
         except queue.Full:
-            self.problem = "more was asked for than can be carried out; some of it was left out"
+            self.problem = "too many requests are waiting; some were dropped"
 
     def refuse(self, reason: str) -> None:
-        """Says why something that was asked for is not carried out, as if it had been tried."""
+        """Report a refused request as a problem, in the order of the submitted changes."""
 
         def complain(_session: CoachSession) -> None:
             raise ValueError(reason)
@@ -92,17 +95,17 @@ class LiveLoop:
         self.submit(complain)
 
     def show(self) -> None:
-        """Has what is shown brought up to date, even while paused; returns at once."""
+        """Call `on_step` soon, even while paused, and return at once."""
         self._stale.set()
 
     def single_step(self) -> None:
-        """Pauses, and takes one step."""
+        """Pause the loop and make one step."""
         self.paused = True
         self.submit(lambda session: session.step())
 
     @property
     def factor(self) -> float:
-        """Real-time factor over the last second of simulated time: 1 is real time; 0 while paused."""
+        """Real-time factor over the last second of simulated time: 1 is real time, 0 is paused."""
         moments = list(self._steps)
         if self.paused or len(moments) < 2 or time.perf_counter() - moments[-1] > 1.0 + self.pause_at_end:
             return 0.0
@@ -120,13 +123,13 @@ class LiveLoop:
             elif now >= due:
                 self._attempt(lambda session: session.step())
                 due = self._next(due, now)
-                changed = True  # a step that failed has something to show as well
+                changed = True  # a failed step has a problem to show
             if changed:
-                self._attempt(lambda _: self.on_step(), pause=False)  # what is shown may fail, the agent goes on
+                self._attempt(lambda _: self.on_step(), pause=False)  # the agent continues if the display fails
             time.sleep(_IDLE if self.paused else min(_IDLE, max(0.0, due - time.perf_counter())))
 
     def _next(self, due: float, now: float) -> float:
-        """When the step after the one that was just taken is due."""
+        """Return the time at which the next step is due."""
         if self.session.ended is not None:
             self._steps.clear()
             return now + self.pause_at_end
@@ -135,16 +138,16 @@ class LiveLoop:
         return due if due > now - _LATE else now
 
     def _drain(self) -> bool:
-        waiting = self._changes.qsize()  # what comes meanwhile waits for the next step
+        waiting = self._changes.qsize()  # changes submitted from now on wait for the next step
         for _ in range(waiting):
             self.problem = ""
             self._attempt(self._changes.get_nowait(), pause=False)
         return waiting > 0
 
     def _attempt(self, change: Callable[[CoachSession], Any], pause: bool = True) -> None:
-        """A refused change leaves the agent acting, a failed step pauses it."""
+        """Call a function of the session and keep the text of an exception; pause the loop then if `pause`."""
         try:
             change(self.session)
-        except Exception as error:  # whatever it is, the page must show it and stay alive
+        except Exception as error:  # the page shows any problem and keeps running
             self.problem = f"{error}" or type(error).__name__
             self.paused = self.paused or pause

@@ -1,4 +1,4 @@
-"""A schedule of styles written in words: "0: T-pose; 3: arms up, shorter steps"."""
+"""Schedules of styles in words, such as "0: T-pose; 3: arms up, shorter steps"."""
 
 from __future__ import annotations
 
@@ -12,18 +12,21 @@ _ENTRY = re.compile(r"\s*(\d+(?:\.\d+)?)\s*(?:s\b)?\s*[: ]\s*(.+)")
 
 
 def read_plan(text: str, session: CoachSession) -> dict[float, dict[str, Value]]:
-    """Reads a schedule, to be handed to `CoachSession.schedule`.
+    """Read a schedule in words for `CoachSession.schedule`.
 
     Args:
-        text: `SECONDS: PHRASE`, separated by semicolons or new lines. Each phrase is understood relative to the style
-            before it, or names a preset. At most 20,000 characters.
-        session: whose style space, words and presets to use; it is not changed.
+        text: Entries `SECONDS: PHRASE`, separated by semicolons or new lines, of at most 20,000 characters. Each
+            phrase names a preset, or is read relative to the style before it.
+        session: Session whose style space, words and presets are used; it is not changed.
+
+    Returns:
+        Requested values by parameter name, by time [s].
 
     Raises:
-        ValueError: naming the entry that was not understood.
+        ValueError: If the text is empty or too long, or an entry is not understood.
     """
     if len(text) > MAX_PLAN:
-        raise ValueError(f"the schedule has {len(text):,} characters, at most {MAX_PLAN:,} are read")
+        raise ValueError(f"the schedule has {len(text):,} characters: expected at most {MAX_PLAN:,}")
     example = f"'3: {next(iter(session.grammar.examples), 'default')}'"
     style, plan, previous = dict(session.style), {}, None
     for entry in filter(str.strip, re.split(r"[;\n]", text)):

@@ -1,4 +1,4 @@
-"""Requested against measured style, as a session reports it."""
+"""Requested and measured style, as a session reports them."""
 
 from __future__ import annotations
 
@@ -17,25 +17,24 @@ from coachable.styles import StyleSpace
 
 @dataclass(frozen=True)
 class StyleReport:
-    """The last seconds of a session.
+    """Requested and measured style in the last seconds of a session.
 
     Attributes:
-        requested: the style in force.
-        measured: means over the window, without what had no value in it.
-        unmeasured: names of what had no value in it.
-        seconds: length of the window, which begins anew with each request and each episode [s].
-        outside: number that was asked for, by parameter, where the last request lay outside the trained range.
-        asks: whether anything is asked for; false if the style consists of weights that are all zero.
-        complying: share of the moments of the window that can be judged in which the agent did what was asked for; None
-            if there are none.
-        needs: what has to happen before it can be judged.
-        complied_after: time from the latest request until the agent first did what it asks for, None while it has not
-            [s].
-        since_request: time since the latest request [s].
-        episode: number of the episode, from 1.
-        episode_time: since the episode began [s].
-        ended: why the episode is over, None while it runs.
-        endings: how many episodes ended for that reason so far.
+        requested: The style in force, by parameter name.
+        measured: Mean of each measure over the window; a measure without a value in the window is left out.
+        unmeasured: Names of the measures without a value in the window.
+        seconds: Length of the window [s]. A request or a new episode starts a new window.
+        outside: Requested number by parameter name, where the last request lay outside the trained range.
+        asks: Whether the style asks for anything; false if it consists of weights that are all zero.
+        complying: Share of the steps that can be judged in which the agent complied with the request, or None if no
+            step of the window can be judged.
+        needs: What has to happen before compliance can be judged.
+        complied_after: Time from the latest request until the agent first complied [s], or None before that.
+        since_request: Time since the latest request [s].
+        episode: Number of the episode, from 1.
+        episode_time: Time since the episode began [s].
+        ended: Why the episode is over, or None while it runs.
+        endings: Number of episodes that ended so far, by reason.
     """
 
     requested: dict[str, float | str]
@@ -55,10 +54,14 @@ class StyleReport:
 
 
 def measures_by_parameter(space: StyleSpace, names: Iterable[str]) -> dict[str, list[str]]:
-    """Which measures belong to which parameter, those of none under "".
+    """Group measures by the parameter that they belong to; those of no parameter are listed under "".
 
-    A measure belongs to the parameter whose words occur in its name, in order and next to each other: `pose_held` to
-    `pose`, `damage_melee` to `melee`. Of several parameters the longest name wins.
+    A measure belongs to the parameter whose name is part of its own, word by word: `pose_held` to `pose`,
+    `damage_melee` to `melee`. Of several such parameters, the one with the longest name is chosen.
+
+    Args:
+        space: The style space.
+        names: Names of the measures.
 
     Example:
         >>> from coachable.styles import Setpoint
@@ -74,13 +77,13 @@ def measures_by_parameter(space: StyleSpace, names: Iterable[str]) -> dict[str, 
 
 
 class MeasuredWindow:
-    """What the agent did in the last steps since the latest request.
+    """Measured style over the last steps since the latest request.
 
     Args:
-        measures: the domain's measured style. In addition to `StyleMeasures` it may have a method `judged`, which gives
-            the steps, (T, N) bool, in which one can tell whether the agent complies, and `needs`, which says what they
-            take, such as "a footstep". Without them, every step is judged.
-        length: number of steps.
+        measures: The domain's measured style. In addition to `StyleMeasures` it may have a method `judged`, which
+            returns the steps (T, N) bool in which compliance can be judged, and an attribute `needs`, which says what
+            has to happen before, such as "a footstep". Without `judged`, every step can be judged.
+        length: Largest number of steps to keep.
     """
 
     def __init__(self, measures: StyleMeasures, length: int) -> None:
@@ -96,16 +99,16 @@ class MeasuredWindow:
         return getattr(self.measures, "needs", "a step")
 
     def add(self, transition: TensorDictBase) -> None:
-        """Notes a step, of batch shape (1,)."""
+        """Add the transition of one step, batch shape (1,)."""
         reward = transition.get(("next", TASK_REWARD)).reshape(1)
         self._rows.append({TASK_REWARD: reward} | self.measures.step(transition))
 
     def clear(self) -> None:
-        """Forgets everything."""
+        """Remove all steps."""
         self._rows.clear()
 
     def summary(self) -> dict[str, float]:
-        """The domain's measures over the window and the mean task reward; NaN for what had no value in it."""
+        """Return the mean task reward and the domain's measures over the window; NaN where there is no value."""
         if not self._rows:
             return {}
         record = _stacked(self._rows)
@@ -114,11 +117,11 @@ class MeasuredWindow:
         return {name: value.item() for name, value in values.items()}
 
     def complies(self) -> bool:
-        """Whether the agent did what its style asks for in the last step."""
+        """Return whether the agent complied with its style in the last step."""
         return bool(self._rows) and bool(self._done(_stacked([self._rows[-1]])).any())
 
     def complying(self) -> float | None:
-        """Share of the steps that can be judged in which it did so, None if there are none."""
+        """Return the share of the steps that can be judged in which the agent complied, or None if there are none."""
         if not self._rows:
             return None
         record = _stacked(self._rows)
@@ -134,5 +137,5 @@ class MeasuredWindow:
 
 
 def _stacked(rows: Collection[Mapping[str, Tensor]]) -> dict[str, Tensor]:
-    """Name to (T, 1)."""
+    """Stack the values of each name to (T, 1)."""
     return {name: torch.stack([row[name] for row in rows]) for name in next(iter(rows))}

@@ -1,4 +1,4 @@
-"""A coached session as JSON: the seed and what was asked when, which is enough to run it again exactly."""
+"""Recording of a coached session as JSON: the seed and all requests, from which it can be replayed exactly."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,24 +21,24 @@ SCHEMA_VERSION = 1
 
 
 class ReplayMismatch(RuntimeError):
-    """A replay does not reach the recorded states."""
+    """A replay reaches other states than the recorded ones."""
 
 
 @dataclass
 class Recording:
-    """A session since it was last seeded.
+    """Recording of a session since it was last seeded.
 
     Attributes:
-        domain: name of the domain.
-        source: where the policy came from, as the user gave it.
-        seed: of the initial states.
-        style: request at the start, by parameter name.
-        controls: live controls at the start.
-        endless: whether time limits were ignored.
-        events: `{"step": k, ...}` in order, each applied before step k (from 0) with one of `style` (what changed),
-            `controls` (what changed) and `reset` (true).
-        steps: length.
-        checks: step and checksum of the observation after it, by which a replay notices that it differs.
+        domain: Name of the domain.
+        source: Where the policy came from, as the user gave it.
+        seed: Seed of the initial states.
+        style: Request at the start, by parameter name.
+        controls: Live controls at the start, by name.
+        endless: Whether time limits were ignored.
+        events: `{"step": k, ...}` in order, each applied before step k (from 0), with one of `style` (changed
+            parameters), `controls` (changed controls) and `reset` (true).
+        steps: Number of steps.
+        checks: Pairs of a step and the checksum of the observation after it, with which a replay is compared.
     """
 
     domain: str
@@ -51,15 +52,15 @@ class Recording:
     checks: list[tuple[int, int]] = field(default_factory=list)
 
     def to_json(self) -> str:
-        """The recording as a JSON string; floats keep every bit."""
+        """Return the recording as a JSON string that keeps every bit of the floats."""
         return json.dumps({"version": SCHEMA_VERSION, **asdict(self)}, indent=1, allow_nan=False)
 
     @classmethod
     def from_json(cls, text: str) -> Recording:
-        """Reads what `to_json` wrote.
+        """Read a recording from the output of `to_json`.
 
         Raises:
-            ValueError: if it is no recording, or one of another version.
+            ValueError: If the text is not a recording, or one of another schema version.
         """
         try:
             values = json.loads(text)
@@ -79,15 +80,15 @@ class Recording:
         return recording
 
     def check(self, domain: str, space: StyleSpace, controls: Mapping[str, Control]) -> None:
-        """Sees whether a session can replay this.
+        """Check that a session can replay this recording.
 
         Args:
-            domain: of the session.
-            space: its styles.
-            controls: its live controls, by name.
+            domain: Name of the session's domain.
+            space: Its style space.
+            controls: Its live controls, by name.
 
         Raises:
-            ValueError: naming what the session lacks.
+            ValueError: If the session has another domain, or lacks a style parameter, a control or a value.
         """
         if self.domain != domain:
             raise ValueError(f"the recording belongs to {self.domain!r}, this session to {domain!r}")
@@ -95,9 +96,7 @@ class Recording:
         for style in (self.style, *(event.get("style", {}) for event in self.events)):
             for name, value in style.items():
                 if name not in space:
-                    raise ValueError(
-                        f"the recording has the unknown style parameter {name!r}: {domain} has {space.names}"
-                    )
+                    raise ValueError(f"the recording has the unknown style parameter {name!r}: expected {space.names}")
                 if not is_trained(space[name], value):
                     raise ValueError(f"the recording asks for {name} = {value!r}, which lies outside the trained range")
         for steering in (self.controls, *(event.get("controls", {}) for event in self.events)):
@@ -108,7 +107,7 @@ class Recording:
                     raise ValueError(f"the recording steers {name} = {value}, which lies outside its range")
 
     def save(self, file: Path | str) -> Path:
-        """Writes the JSON file."""
+        """Write the recording to a JSON file, whose folder is created if missing, and return the path."""
         file = Path(file)
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(self.to_json(), encoding="utf-8")
@@ -116,22 +115,22 @@ class Recording:
 
     @classmethod
     def load(cls, file: Path | str) -> Recording:
-        """Reads a JSON file; see `from_json`."""
+        """Read a recording from a JSON file; see `from_json`."""
         return cls.from_json(Path(file).read_text(encoding="utf-8"))
 
 
 def check_seed(seed: int) -> None:
-    """Sees whether every random generator takes a seed.
+    """Check that every random generator takes a seed.
 
     Raises:
-        ValueError: if not.
+        ValueError: If it is negative or has more than 63 bits.
     """
     if not 0 <= seed < 2**63:
         raise ValueError(f"seed = {seed}: expected a whole number from 0 to 2**63 - 1")
 
 
 def is_trained(parameter: Parameter, value: float | str) -> bool:
-    """Return whether agents were trained on a value: one of the options, or a number in the range, as float32."""
+    """Return whether a value is one of the options, or a number in the range of the parameter, as float32."""
     if isinstance(parameter, Choice):
         return value in parameter.options
     return not isinstance(value, str) and bool(
@@ -143,27 +142,16 @@ def _is_count(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and value >= 0
 
 
-def _is_style(value: Any) -> bool:
-    return isinstance(value, dict) and all(isinstance(v, str) or _is_number(v) for v in value.values())
-
-
-def _is_steering(value: Any) -> bool:
-    return isinstance(value, dict) and all(map(_is_number, value.values()))
-
-
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _is_event(value: Any) -> bool:
-    return isinstance(value, dict) and all(key in _EVENT and _EVENT[key](v) for key, v in value.items())
-
-
 def _are_events(value: Any) -> bool:
-    if not isinstance(value, list) or not all(_is_event(event) and "step" in event for event in value):
-        return False
-    steps = [event["step"] for event in value]
-    return steps == sorted(steps)
+    fits = isinstance(value, list) and all(
+        isinstance(event, dict) and "step" in event and all(k in _EVENT and _EVENT[k](v) for k, v in event.items())
+        for event in value
+    )
+    return fits and all(before["step"] <= after["step"] for before, after in pairwise(value))
 
 
 def _are_checks(value: Any) -> bool:
@@ -172,25 +160,21 @@ def _are_checks(value: Any) -> bool:
     )
 
 
-_EVENT: dict[str, Callable[[Any], bool]] = {
-    "step": _is_count,
-    "style": _is_style,
-    "controls": _is_steering,
-    "reset": lambda value: value is True,
+_SHARED: dict[str, Callable[[Any], bool]] = {
+    "style": lambda value: isinstance(value, dict) and all(isinstance(v, str) or _is_number(v) for v in value.values()),
+    "controls": lambda value: isinstance(value, dict) and all(map(_is_number, value.values())),
 }
-_SCHEMA: dict[str, Callable[[Any], bool]] = {
-    "domain": lambda value: isinstance(value, str),
-    "source": lambda value: isinstance(value, str),
-    "seed": _is_count,
-    "style": _is_style,
-    "controls": _is_steering,
+_EVENT = {**_SHARED, "step": _is_count, "reset": lambda value: value is True}
+_SCHEMA = {
+    **_SHARED,
+    **dict.fromkeys(("domain", "source"), lambda value: isinstance(value, str)),
+    **dict.fromkeys(("seed", "steps"), _is_count),
     "endless": lambda value: isinstance(value, bool),
     "events": _are_events,
-    "steps": _is_count,
     "checks": _are_checks,
 }
 
 
 def checksum(observation: Tensor) -> int:
-    """Of every bit of an observation."""
+    """Return the CRC-32 of every bit of an observation."""
     return zlib.crc32(observation.detach().cpu().contiguous().numpy().tobytes())

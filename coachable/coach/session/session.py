@@ -1,4 +1,4 @@
-"""`CoachSession`: an agent that acts while somebody tells it how. Headless; the page and scripts are its clients."""
+"""`CoachSession`: coach an agent while it acts, without a display; the page and scripts use it."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ from coachable.training.weights import domain_of, load_policy
 class CoachSession:
     """One agent in one environment, coached while it acts.
 
-    A request applies at the next observation: what `set` writes is what the policy sees in the following `step`. The
-    request stays in force through resets while `hold` is true; otherwise each episode draws a style as in training.
-    An episode that has ended is reset by the following `step`.
+    A request applies from the next observation on: the policy reads the style given to `set` in the following `step`.
+    While `hold` is true, the request stays in force when an episode begins; otherwise each episode draws a style as in
+    training. After an episode has ended, the next `step` begins a new one.
 
     Args:
-        policy: reads `observation` and `style`, writes `action`.
-        space: the styles it was trained on.
-        domain: where it acts.
-        source: where the policy came from, kept in recordings.
-        seed: of the initial states and drawn styles.
-        style: first request, by parameter name; the space's default for those left out.
-        strict: raise for a request outside the trained range instead of clamping it with a warning.
-        endless: go on when the domain's time limit is reached.
-        window: length of the measured window [s].
+        policy: Policy that reads `observation` and `style` and writes `action`.
+        space: Style space that it was trained on.
+        domain: Domain in which it acts.
+        source: Where the policy came from; kept in recordings.
+        seed: Seed of the initial states and drawn styles.
+        style: First request, by parameter name; other parameters have the space's default.
+        strict: Whether to raise for a request outside the trained range instead of clamping it with a warning.
+        endless: Whether to continue when the domain's time limit is reached.
+        window: Length of the measured window [s].
 
     Attributes:
-        policy: see above; may be exchanged between steps.
-        presets: named styles, yours to extend.
-        grammar: reads the phrases of `say`.
-        hold: see above.
+        policy: The policy; you may replace it between steps.
+        presets: Named styles; you may add your own.
+        grammar: Grammar that reads the phrases of `say`.
+        hold: Whether the request stays in force when an episode begins.
 
     Example:
         >>> session = CoachSession.open("humanoid", seed=1)
@@ -88,20 +88,18 @@ class CoachSession:
 
     @classmethod
     def open(cls, source: str | Path, **settings: Any) -> CoachSession:
-        """Opens a trained agent.
+        """Open a session with a trained agent.
 
         Args:
-            source: name of a domain that ships with weights, a run's folder, a checkpoint or a weights file.
-            **settings: as for the constructor.
+            source: Name of a domain that ships with weights, a run's folder, a checkpoint or a weights file.
+            **settings: Further arguments of the constructor.
 
         Raises:
-            CheckpointError: if there is no such agent, or it is of another version.
+            CheckpointError: If there is no such agent, or it is of another version.
         """
         agent = load_policy(source)
         domain = domain_of(agent)
         return cls(agent.actor, agent.space, domain, source=str(source), **settings)
-
-    # -- requests --------------------------------------------------------------------------------------------------
 
     @property
     def style(self) -> dict[str, float | str]:
@@ -110,38 +108,36 @@ class CoachSession:
 
     @property
     def controls(self) -> dict[str, float]:
-        """Values of the live controls, in their units."""
+        """Values of the live controls, by name, in their units."""
         return dict(self._control_values)
 
     def set(self, **values: float | str) -> None:
-        """Asks for another style from the next observation on; what is not named stays as it is.
+        """Request another style from the next observation on; parameters that are not named keep their values.
 
         Args:
-            **values: a number per `Weight` or `Setpoint`, an option's name per `Choice`.
+            **values: A number for each `Weight` or `Setpoint`, the name of an option for each `Choice`.
 
         Raises:
-            ValueError: for an unknown name or option, NaN, or in strict mode a number outside the trained range. The
-                request in force then stays.
+            ValueError: For an unknown name or option, for NaN, or in strict mode for a number outside the trained
+                range. The request in force then stays.
         """
         theta = self.space.make(strict=self.strict, **(self.style | values))
         self._timeline.take_over()
         self._request(theta, values)
 
     def apply(self, preset: str) -> None:
-        """Asks for a preset.
+        """Request the style of a preset.
 
         Raises:
-            ValueError: if there is none of that name.
+            ValueError: If there is no preset of that name.
         """
-        if preset not in self.presets:
-            raise ValueError(f"no preset named {preset!r}: expected one of {list(self.presets)}")
-        self.set(**self.presets[preset])
+        self.set(**self._preset(preset))
 
     def steer(self, **values: float) -> None:
-        """Sets live controls from the next step on; a circular one wraps around, others stop at their ends.
+        """Set live controls from the next step on; circular ones wrap around, others are clamped to their range.
 
         Raises:
-            ValueError: for an unknown control or NaN.
+            ValueError: For an unknown control or NaN.
         """
         for name in values:
             if name not in self._controls:
@@ -151,30 +147,30 @@ class CoachSession:
         self._apply({"controls": fitted})
 
     def say(self, phrase: str) -> Understanding:
-        """Asks in words: "shorter steps, arms up", "0.4 m", "a bit more", or a preset's name.
+        """Request a style in words: "shorter steps, arms up", "0.4 m", "a bit more", or a preset's name.
 
         Returns:
-            What was understood, and what was not. Only what was understood is asked for.
+            Which parts of the phrase were understood; only those are requested.
 
         Raises:
-            ValueError: in strict mode, for a number outside the trained range.
+            ValueError: In strict mode, for a number outside the trained range.
         """
         understood = self.understand(phrase)
         self.follow(understood)
         return understood
 
     def understand(self, phrase: str) -> Understanding:
-        """What `say` takes a phrase to mean; asks for nothing yet, and may be called beside the thread that steps."""
+        """Return how `say` reads a phrase, without requesting anything; other threads than the loop's may call it."""
         preset = next((name for name in list(self.presets) if name.lower() == phrase.strip().lower()), None)
         if preset is not None:
             return Understanding(phrase, dict(self.presets[preset]), (f"preset {preset}",), ())
         return self.grammar.read(phrase, self.style | self.controls, self._understood)
 
     def follow(self, understood: Understanding) -> None:
-        """Asks for what was understood.
+        """Request the changes of an understood phrase.
 
         Raises:
-            ValueError: in strict mode, for a number outside the trained range.
+            ValueError: In strict mode, for a number outside the trained range.
         """
         style = {name: value for name, value in understood.changes.items() if name in self.space}
         controls = {name: float(value) for name, value in understood.changes.items() if name in self._controls}
@@ -185,18 +181,19 @@ class CoachSession:
         self._understood = understood
 
     def schedule(self, plan: Mapping[float, Mapping[str, float | str] | str]) -> None:
-        """Asks for styles at given times from now on [s], each a style or a preset's name; replaces an earlier plan.
+        """Request styles at later times; an earlier plan is replaced.
+
+        Args:
+            plan: Style by parameter name, or the name of a preset, by time from now [s].
 
         Raises:
-            ValueError: for a negative time or a style that `set` would refuse; nothing is scheduled then.
+            ValueError: For a negative time or a style that `set` would refuse; nothing is scheduled then.
         """
         agenda: dict[int, dict[str, Any]] = {}
         for seconds, style in sorted(plan.items()):
             if not 0.0 <= seconds < math.inf:
                 raise ValueError(f"the plan has the time {seconds}: expected seconds from now on, 0 or more")
-            if isinstance(style, str) and style not in self.presets:
-                raise ValueError(f"no preset named {style!r}: expected one of {list(self.presets)}")
-            values = self.presets[style] if isinstance(style, str) else dict(style)
+            values = self._preset(style) if isinstance(style, str) else dict(style)
             theta = self.space.make(strict=self.strict, **(self.style | values))
             request = {name: value for name, value in self.space.describe(theta).items() if name in values}
             agenda[round(seconds / self.domain.control_step)] = {"style": request}
@@ -204,31 +201,29 @@ class CoachSession:
 
     @property
     def scheduled(self) -> int:
-        """Number of requests that are still to come, of a plan or a replay."""
+        """Number of coming requests of a plan or a replay."""
         return self._timeline.coming
 
     def cancel(self) -> None:
-        """Drops the rest of a plan or replay; the request in force stays."""
+        """Drop the rest of a plan or replay; the request in force stays."""
         self._timeline.cancel()
 
-    # -- acting ----------------------------------------------------------------------------------------------------
-
     def reset(self, seed: int | None = None) -> None:
-        """Starts a new episode; with a seed the session starts over, and with it the recording.
+        """Begin a new episode; the style and the live controls stay, a plan is dropped.
 
-        Style and live controls stay; a plan is dropped.
+        Args:
+            seed: Seed with which the session and its recording start over; None continues both.
 
         Raises:
-            ValueError: if the seed is negative or has more than 63 bits.
+            ValueError: If the seed is negative or has more than 63 bits.
         """
         if seed is None:
             self.cancel()
             self._apply({"reset": True})
             return
         check_seed(seed)
-        self._timeline = Timeline(
-            Recording(self.domain.name, self.source, seed, self.style, self.controls, self._episodes.endless)
-        )
+        start = Recording(self.domain.name, self.source, seed, self.style, self.controls, self._episodes.endless)
+        self._timeline = Timeline(start)
         self._steps_at_request = 0
         self._complied_at: int | None = None
         self._generator = torch.Generator().manual_seed(seed)
@@ -238,18 +233,18 @@ class CoachSession:
 
     @property
     def step_count(self) -> int:
-        """Steps since the session was last seeded."""
+        """Number of steps since the session was last seeded."""
         return self._timeline.step
 
     @torch.no_grad()
     def step(self) -> TensorDictBase:
-        """One control step under the request in force.
+        """Make one control step with the request in force.
 
         Returns:
-            The transition, batch shape (1,), as `env.step` gives it.
+            The transition as `env.step` returns it, batch shape (1,).
 
         Raises:
-            ReplayMismatch: if a replay differs from its recording; a further `step` goes on without checking.
+            ReplayMismatch: If a replay differs from its recording; later steps are not compared.
         """
         for event in self._timeline.due():
             self._apply(event)
@@ -263,16 +258,19 @@ class CoachSession:
         return transition
 
     def run(self, seconds: float, on_step: Callable[[CoachSession], None] | None = None) -> None:
-        """Steps for so long, in simulated time [s]."""
+        """Make steps for some simulated time.
+
+        Args:
+            seconds: Simulated time [s].
+            on_step: Called with this session after each step.
+        """
         for _ in range(round(seconds / self.domain.control_step)):
             self.step()
             if on_step is not None:
                 on_step(self)
 
-    # -- measuring -------------------------------------------------------------------------------------------------
-
     def report(self) -> StyleReport:
-        """Requested against measured style over the window, which begins anew with each request and episode."""
+        """Return requested and measured style over the window, which restarts with each request and episode."""
         summary = self._recent.summary()
         return StyleReport(
             requested=self.style,
@@ -293,7 +291,7 @@ class CoachSession:
 
     @property
     def ended(self) -> str | None:
-        """Why the episode is over, None while it runs."""
+        """Why the episode is over, or None while it runs."""
         return self._episodes.ended
 
     @property
@@ -303,31 +301,32 @@ class CoachSession:
 
     @property
     def base_env(self) -> EnvBase:
-        """The domain's own environment, below the transforms."""
+        """The domain's environment without the transforms around it."""
         return self._episodes.base_env
 
     def replica(self) -> CoachSession:
-        """Another session of the same agent, in an environment of its own."""
+        """Open another session of the same agent, in a new environment."""
         return CoachSession(self.policy, self.space, self.domain, source=self.source, window=self.window)
 
     def close(self) -> None:
-        """Releases the environment."""
+        """Release the environment."""
         self._episodes.close()
 
-    # -- recording -------------------------------------------------------------------------------------------------
-
     def recording(self) -> Recording:
-        """What happened since the session was last seeded, as a copy."""
+        """Return a copy of the recording since the session was last seeded."""
         return self._timeline.recording(self._episodes.observation)
 
     def replay(self, recording: Recording) -> None:
-        """Starts over as recorded; the following `recording.steps` steps repeat the session bit for bit.
+        """Start over as recorded; the following `recording.steps` steps repeat the session bit for bit.
 
-        Any request, steering or reset in between takes over from the replay.
+        A request, a changed control or a reset ends the replay.
+
+        Args:
+            recording: Recording of the same agent.
 
         Raises:
-            ValueError: if the recording belongs to another domain, style space or set of controls; the session then
-                goes on as it was.
+            ValueError: If the recording belongs to another domain, style space or set of controls; the session is
+                then unchanged.
         """
         recording.check(self.domain.name, self.space, self._controls)
         self._theta, self._outside = self.space.make(strict=True, **recording.style), {}
@@ -338,13 +337,16 @@ class CoachSession:
 
     @property
     def replaying(self) -> bool:
-        """Whether a replay is under way; false after its last step."""
+        """Whether a replay is running; false after its last step."""
         return self._timeline.replayed is not None
 
-    # -- inside ----------------------------------------------------------------------------------------------------
+    def _preset(self, name: str) -> dict[str, Any]:
+        if name not in self.presets:
+            raise ValueError(f"no preset named {name!r}: expected one of {list(self.presets)}")
+        return self.presets[name]
 
     def _apply(self, event: Mapping[str, Any]) -> None:
-        """Carries out an event now, and records it."""
+        """Apply an event now and record it."""
         if "style" in event:
             self._request(self.space.make(**(self.style | event["style"])), event["style"])
         if "controls" in event:
@@ -356,7 +358,7 @@ class CoachSession:
             self._begin_episode()
 
     def _request(self, theta: Tensor, asked: Mapping[str, Any]) -> None:
-        """Puts a style in force; `asked` is what led to it, perhaps beyond the trained range."""
+        """Put a style in force and record it; `asked` are the requested values before clamping."""
         everything = {**self._outside, **asked}
         self._outside = {name: value for name, value in everything.items() if not is_trained(self.space[name], value)}
         before = self.style
@@ -368,7 +370,7 @@ class CoachSession:
             self._timeline.note({"style": changed})
 
     def _begin_episode(self) -> None:
-        # The first episode has the style that was asked for, and a replay those that were drawn.
+        # The first episode has the requested style; a replay has recorded the styles that were drawn.
         if not self.hold and self._episodes.number and not self.replaying:
             drawn = self.space.sample((), self._generator)
             self._request(drawn, self.space.describe(drawn))

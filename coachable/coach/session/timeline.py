@@ -1,4 +1,4 @@
-"""What was asked when: keeps the recording, and what is still to come of a plan or a replay."""
+"""Timeline of a session: the recording of past events, and the coming events of a plan or a replay."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ Event = Mapping[str, Any]
 
 
 class Timeline:
-    """The events of a session, past and future, by the step before which they happen.
+    """Past and coming events of a session, by the step before which they happen.
 
     Args:
-        recording: empty, with the session's start; written here.
+        recording: Recording with the session's start and without events, which are added here.
 
     Attributes:
-        step: number of steps so far.
-        replayed: the recording that is being repeated, None after its last step.
+        step: Number of steps so far.
+        replayed: The recording that is being replayed, or None after its last step.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -34,62 +34,63 @@ class Timeline:
         self._expected: dict[int, int] = {}
 
     def note(self, event: Event) -> None:
-        """Records what happens before the next step."""
+        """Record an event before the next step."""
         self._recording.events.append({"step": self.step, **event})
 
     def plan(self, agenda: Mapping[int, Event]) -> None:
-        """Replaces what is to come by events at so many steps from now."""
+        """Replace the coming events by those of a plan, by the number of steps from now."""
         self.cancel()
         self._agenda = deque((self.step + later, agenda[later]) for later in sorted(agenda))
 
     def repeat(self, recording: Recording) -> None:
-        """Replaces what is to come by a recording; from now on observations are compared with it."""
+        """Replace the coming events by those of a recording, and compare observations with it from now on."""
         self._agenda = deque((event["step"], event) for event in recording.events)
         self.replayed, self._expected = recording, dict(recording.checks)
 
     def cancel(self) -> None:
-        """Drops what is to come."""
+        """Drop all coming events."""
         self._agenda.clear()
         self.replayed, self._expected = None, {}
 
     def take_over(self) -> None:
-        """Ends a replay, because somebody asked for something else; a plan goes on."""
+        """End a replay because of a new request; a plan continues."""
         if self.replayed is not None:
             self.cancel()
 
     @property
     def coming(self) -> int:
-        """Number of events that are to come."""
+        """Number of coming events."""
         return len(self._agenda)
 
     def due(self) -> Iterator[Event]:
-        """Takes the events that happen before the next step."""
+        """Take the events that happen before the next step."""
         while self._agenda and self._agenda[0][0] <= self.step:
             yield self._agenda.popleft()[1]
 
     def advance(self, observation: Tensor) -> None:
-        """Notes a step and now and then its checksum, and compares a replay with its recording.
+        """Count a step, record its checksum every 40 steps, and compare a replay with its recording.
+
+        Args:
+            observation: The observation after the step.
 
         Raises:
-            ReplayMismatch: if they differ; the comparison ends there.
+            ReplayMismatch: If they differ; later steps are not compared.
         """
         self.step += 1
         due = self._expected.pop(self.step, None)
-        found = checksum(observation) if due is not None or self.step % _CHECK_EVERY == 0 else None
-        if found is not None and self.step % _CHECK_EVERY == 0:
-            self._recording.checks.append((self.step, found))
-        source = self._recording.source
+        if self.step % _CHECK_EVERY == 0:
+            self._recording.checks.append((self.step, checksum(observation)))
         if self.replayed is not None and self.step >= self.replayed.steps:
             self.replayed = None
-        if due is not None and due != found:
+        if due is not None and due != checksum(observation):
             self._expected = {}
             raise ReplayMismatch(
                 f"the replay differs from the recording at step {self.step}: it was made with other weights than those "
-                f"of {source!r}, with other versions, or on another processor"
+                f"of {self._recording.source!r}, with other versions, or on another processor"
             )
 
     def recording(self, observation: Tensor) -> Recording:
-        """A copy of the recording up to now, with a checksum of the present observation."""
+        """Return a copy of the recording up to now, with a checksum of the current observation."""
         copy = Recording.from_json(self._recording.to_json())
         copy.steps = self.step
         if self.step % _CHECK_EVERY:

@@ -164,7 +164,7 @@ def test_a_viser_that_starts_otherwise_is_not_served_unguarded(monkeypatch):
     from contextlib import nullcontext
 
     monkeypatch.setattr(Guard, "around", lambda self: nullcontext())
-    with pytest.raises(ImportError, match="in another way than the guard of the page knows"):
+    with pytest.raises(ImportError, match="in a way that the page cannot guard"):
         make_server(port=18480)
 
 

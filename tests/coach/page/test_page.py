@@ -128,7 +128,7 @@ def test_more_requests_than_can_be_carried_out_are_left_out(page):
     assert held.wait(20)
     for _ in range(1000):
         page.loop.submit(lambda session: session.set(target=0.1))
-    assert "some of it was left out" in page.loop.problem
+    assert "some were dropped" in page.loop.problem
     go.set()
     wait_for(lambda: not page.loop._changes.qsize())
     do(page)
@@ -241,7 +241,7 @@ def test_the_agent_acts_while_a_phrase_is_read(page, monkeypatch):
     count = page.session.step_count
     wait_for(lambda: page.session.step_count > count + 5)
     page.run_plan.value = True
-    wait_for(lambda: "was given before is still being read" in page.status.content)
+    wait_for(lambda: "the input before is still being read" in page.status.content)
     finish.set()
     wait_for(lambda: page.session.style["target"] == pytest.approx(0.4))
 
@@ -282,7 +282,7 @@ def test_one_film_at_a_time_and_not_of_long_sessions(page, monkeypatch):
     wait_for(lambda: page.film_note.content == "Problem: torn")
     monkeypatch.setattr(film_module, "_LONGEST_SESSION", 0.01)
     page.loop.submit(lambda session: page._shoot(session, None))
-    wait_for(lambda: "at most 0 s are filmed here" in page.status.content)
+    wait_for(lambda: "expected at most 0 s" in page.status.content)
 
 
 def test_the_chart_follows_what_was_asked_for_last(page):
