@@ -131,7 +131,7 @@ def _only_ours(path: Path) -> bool:
 
 
 def _products(library: ctypes.CDLL) -> Products | None:
-    """Return the kernels' products where the processor has bfloat16 in vector registers; with AMX, torch's are faster."""
+    """Return the products where the processor has bfloat16 in vector registers; with AMX, torch's are faster."""
     capabilities = torch.cpu.get_capabilities()
     if not capabilities.get("avx512_bf16") or capabilities.get("amx_bf16") or not hasattr(library, "dense_forward"):
         return None

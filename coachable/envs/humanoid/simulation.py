@@ -176,7 +176,7 @@ class HumanoidSimulation:
         )
 
     def count_contacts(self, state: np.ndarray) -> int:
-        """Number of contacts of one state, for the search for collision-free postures."""
+        """Return the number of contacts of one state, for the search for collision-free postures."""
         data = self._dynamics_data[0]
         mujoco.mj_setState(self.model.dynamics, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         mujoco.mj_fwdPosition(self.model.dynamics, data)
