@@ -383,7 +383,8 @@ class TestHumanoid:
         assert humanoid.report().measured == {}, "nothing before a step was made"
         humanoid.step()
         report = humanoid.report()
-        assert report.unmeasured == ("step_length", "step_length_error") and report.needs == "a footstep"
+        assert report.unmeasured[:2] == ("step_length", "step_length_error") and report.needs == "a footstep"
+        assert set(report.measured) == {"task_reward", "forward_speed", "pose_held", "power", "drift"}
         assert report.complying is None and report.complied_after is None
         while humanoid.report().complied_after is None:
             humanoid.step()
