@@ -111,6 +111,16 @@ def test_episodes_start_upright_with_the_feet_on_the_ground_and_random_arms():
     assert set(env.gait.expected) == {0, 1}
 
 
+def test_no_arm_touches_the_body_at_the_start():
+    env = make_env(num_envs=1)
+    state = env.simulation.state[0].copy()
+    state[3] += 1.0  # above the floor, so that only contacts of the body with itself count
+    assert len(env._postures) == 512
+    for posture in env._postures[::8]:
+        state[1 + env.simulation.model.arm_positions] = posture
+        assert env.simulation.count_contacts(state) == 0
+
+
 def test_a_fall_terminates_and_time_truncates():
     env = make_env(num_envs=1)
     current = env.reset()
