@@ -121,7 +121,7 @@ def test_head_gain_scales_the_initial_head():
         assert 0.9 * bound < weight.abs().max() <= bound
 
 
-@pytest.mark.parametrize("widths", [(4, 4), (16, 16, 16)], ids=["cut", "padded"])
+@pytest.mark.parametrize("widths", [(4, 4), (13, 13), (16, 16, 16)], ids=["cut", "just wide enough", "padded"])
 def test_new_inputs_change_nothing_while_they_are_zero(widths):
     """Behind them are two inputs that a padded identity path then carries elsewhere."""
     net, wide = ResidualMLP(8, 3, widths), ResidualMLP(13, 3, widths)

@@ -48,6 +48,17 @@ def test_alone_on_the_track_no_margin_is_judged():
     assert found["longitudinal"].isnan().all() and found["lateral"].isnan().all()
 
 
+def test_driving_is_measured_in_its_units():
+    step = race([], [0.0, 0.0, 100.0, 1.0])
+    values = {"progress": 4.5, "speed": 46.0, "off": 1.0, "contact": 2.0, "wall": 3.0, "place": 4.0}
+    for name, value in values.items():
+        step["next", "telemetry"][0, TELEMETRY.index(name)] = value
+    found = RacingMeasures("resources").step(step)
+    assert found["pace"].item() == pytest.approx(45.0)  # [m/s], of 0.1 s
+    for name in ("speed", "off", "contact", "wall", "place"):
+        assert found[name].item() == values[name]
+
+
 def test_savings_are_not_judged_by_single_steps():
     measures = RacingMeasures("resources")
     found = measures.step(race([], [0.0, 0.0, 100.0, 1.0]))
