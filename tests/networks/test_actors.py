@@ -6,6 +6,8 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coachable.networks.actors import GaussianPolicy, make_gaussian_actor
+from coachable.networks.critics import make_critic
+from coachable.networks.residual import ResidualBlock
 
 
 class ScaledStyle:
@@ -30,6 +32,12 @@ def test_keys_and_shapes():
     assert out["action"].abs().max() <= 1
     spec = actor.spec["action"]
     assert (spec.shape, spec.low.tolist(), spec.high.tolist()) == ((2,), [-1.0, -1.0], [1.0, 1.0])
+
+
+def test_networks_have_the_papers_widths_unless_told_otherwise():
+    for network in (make_gaussian_actor(5, 2, ScaledStyle()), make_critic(5, 2, ScaledStyle())):
+        widths = [part.linear.out_features for part in network.modules() if isinstance(part, ResidualBlock)]
+        assert widths == [512, 512, 512]
 
 
 def test_style_is_encoded_inside():

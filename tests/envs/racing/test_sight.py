@@ -15,7 +15,7 @@ from coachable.envs.racing.physics.cars import CARS, load_car
 from coachable.envs.racing.physics.contact import Bodies
 from coachable.envs.racing.physics.dynamics import AIR_DENSITY, GRAVITY, WheelSet, total_mass, wheel_loads
 from coachable.envs.racing.physics.state import HEATS, ROW, SPINS, WEARS, CarState
-from coachable.envs.racing.race.observation import opponents_seen, own_car, own_columns
+from coachable.envs.racing.race.observation import car_columns, opponents_seen, own_car, own_columns
 from coachable.envs.racing.race.rescue import RESCUE_SPEED, back_on_track
 from coachable.envs.racing.race.run import SLIPSTREAM_LENGTH, SLIPSTREAM_WIDTH, Run, look_around, slipstream, tyre_view
 from coachable.envs.racing.race.scenarios import _longest_straight, rolling_cars
@@ -232,3 +232,11 @@ def test_the_engine_turns_with_the_driven_wheels():
     expected = torch.tensor([car.torque, 0.5 * car.torque, car.power / omega[2], 0.0], dtype=F64)
     torch.testing.assert_close(torque * car.torque, expected)
     assert rpm[2] < 1.0 < rpm[3] and expected[2] < car.torque < car.power / omega[1]
+
+
+def test_a_car_is_described_by_its_parameters_near_one():
+    fields = dict(mass=1200.0, power=400e3, torque=450.0, front_axle=1.2, rear_axle=1.8, grip=1.2)
+    fields |= dict(lift_area=2.4, drag_area=0.9, drive_share_front=0.3)
+    described = car_columns(SimpleNamespace(**{name: torch.tensor([value]) for name, value in fields.items()}))
+    expected = [1200 / 1500, 400 / 500, 450 / 600, 1.2 / 3.0, 1.2 / 1.5, 2.4 / 3.0, 0.9, 0.3]
+    torch.testing.assert_close(described, torch.tensor([expected]))
