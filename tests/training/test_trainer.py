@@ -311,6 +311,18 @@ def test_a_line_that_was_not_finished_is_dropped(tmp_path, torn):
     assert (tmp_path / "m.csv").read_text().splitlines() == ["frames,a,b", "1,1.0,2.0", "5,3.0,"]
 
 
+def test_progress_tells_rates_and_the_time_to_go(monkeypatch):
+    clock = iter([100.0, 160.0])
+    monkeypatch.setattr("coachable.training.logging.time.monotonic", lambda: next(clock))
+    stream = io.StringIO()
+    progress = Progress(9000, stream)
+    progress.start(frames=1000, updates=10)
+    progress.update(frames=3000, updates=40, metrics={})
+    line = json.loads(stream.getvalue())
+    assert line["steps_per_s"] == 33.3 and line["updates_per_s"] == 0.5
+    assert line["eta_min"] == 3.0  # 6000 steps at 2000 a minute
+
+
 def test_progress_writes_json_lines_without_a_terminal():
     stream = io.StringIO()
     progress = Progress(100, stream, every=0.0)
