@@ -10,13 +10,14 @@ less work. The gain of `matmul-bf16`, large products of matrices, is what the pr
 
 import argparse
 import json
+import os
 import platform
 import statistics
 import sys
 from pathlib import Path
 
 from contest import Worker, measure
-from learner_workers import MATMUL_FLOPS, PEERS, WORKERS, flops_per_update
+from learner_workers import MATMUL_FLOPS, PEERS, WIDTH, WORKERS, flops_per_update
 
 OURS, YARDSTICK = "coachable-bf16", "matmul-bf16"
 DEFAULT = (
@@ -74,10 +75,13 @@ def main() -> None:
     parser.add_argument("--peers", default=sys.executable, help="interpreter with stable-baselines3 and sbx-rl")
     parser.add_argument("--only", nargs="*", choices=list(WORKERS), default=DEFAULT, metavar="NAME", help="contestants")
     parser.add_argument("--threads", type=int, nargs="*", default=[1, 2])
+    parser.add_argument("--width", type=int, default=WIDTH, help="units per layer")
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--updates", type=int, default=8, help="per round and contestant, a multiple of 8")
     parser.add_argument("--json", type=Path, help="where to write the seconds of every round")
     args = parser.parse_args()
+    if args.width != WIDTH:  # which everything here was imported with
+        os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, "LEARNER_WIDTH": str(args.width)})
     python = {name: args.peers if name in PEERS else sys.executable for name in args.only}
     work = {name: 4 if name.startswith("matmul") else args.updates for name in args.only}
     seconds = {}
@@ -85,7 +89,7 @@ def main() -> None:
         workers = [Worker("learner_workers.py", name, python[name], threads) for name in args.only]
         times = measure(workers, args.rounds, work)
         seconds[threads] = {name: [spent["wall"] for spent in rounds] for name, rounds in times.items()}
-    print(f"{processor()}; SAC, batch 256, 3 x 512, wall time, medians of {args.rounds} rounds\n")
+    print(f"{processor()}; SAC, batch 256, 3 x {WIDTH}, wall time, medians of {args.rounds} rounds\n")
     print(table(seconds))
     for threads, run in seconds.items():
         if {OURS, YARDSTICK} <= set(run):

@@ -6,8 +6,8 @@ Each peer needs only its own packages, so that peers may live in another virtual
 
 `learner.py` drives several of them in turn, see `contest.py`.
 
-The work: batch 256, observation 84 + style 4, action 21, policy and twin critics of 3 x 512, fixed temperature 0.01,
-squared error, Adam, Polyak 0.005. "resnet" stands for the residual network with layer norm; the others are plain ReLU
+The work: batch 256, observation 84 + style 4, action 21, policy and twin critics of 3 x 512 (or LEARNER_WIDTH),
+fixed temperature 0.01, squared error, Adam, Polyak 0.005. "resnet" stands for the residual network with layer norm; the others are plain ReLU
 networks of the same widths, which is slightly less work.
 """
 
@@ -19,7 +19,8 @@ import sys
 
 from contest import serve
 
-B, OBS, STYLE, ACT, WIDTH, LAYERS = 256, 84, 4, 21, 512, 3
+B, OBS, STYLE, ACT, LAYERS = 256, 84, 4, 21, 3
+WIDTH = int(os.environ.get("LEARNER_WIDTH", "512"))
 ALPHA, GAMMA, TAU, LR = 0.01, 0.99, 0.005, 1e-4
 
 
