@@ -6,9 +6,9 @@ Each peer needs only its own packages, so that peers may live in another virtual
 
 `learner.py` drives several of them in turn, see `contest.py`.
 
-The work: batch 256, observation 84 + style 4, action 21, policy and twin critics of 3 x 512 (or LEARNER_WIDTH),
-fixed temperature 0.01, squared error, Adam, Polyak 0.005. "resnet" stands for the residual network with layer norm; the others are plain ReLU
-networks of the same widths, which is slightly less work.
+The work: batch 256, observation 84 + style 4, action 21, policy and twin critics of 3 x 512 (or LEARNER_WIDTH), fixed
+temperature 0.01, squared error, Adam, Polyak 0.005. "resnet" stands for the residual network with layer norm; the
+others are plain ReLU networks of the same widths, which is slightly less work.
 """
 
 import copy
