@@ -1,6 +1,7 @@
 """Time of an update of the learner and of its peers, alternating, in one table.
 
     python benchmarks/learner.py --peers /path/to/peers-venv/bin/python
+    LEARNER_WIDTH=256 python benchmarks/learner.py      networks of 3 x 256 instead of 3 x 512
 
 Every contestant is a process of its own for each number of threads (`learner_workers.py`); they take turns in rounds of
 a few updates. The table gives medians of the wall time over the rounds. Contestants with `resnet` in their names have
@@ -10,7 +11,6 @@ less work. The gain of `matmul-bf16`, large products of matrices, is what the pr
 
 import argparse
 import json
-import os
 import platform
 import statistics
 import sys
@@ -75,13 +75,10 @@ def main() -> None:
     parser.add_argument("--peers", default=sys.executable, help="interpreter with stable-baselines3 and sbx-rl")
     parser.add_argument("--only", nargs="*", choices=list(WORKERS), default=DEFAULT, metavar="NAME", help="contestants")
     parser.add_argument("--threads", type=int, nargs="*", default=[1, 2])
-    parser.add_argument("--width", type=int, default=WIDTH, help="units per layer")
     parser.add_argument("--rounds", type=int, default=9)
     parser.add_argument("--updates", type=int, default=8, help="per round and contestant, a multiple of 8")
     parser.add_argument("--json", type=Path, help="where to write the seconds of every round")
     args = parser.parse_args()
-    if args.width != WIDTH:  # which everything here was imported with
-        os.execve(sys.executable, [sys.executable, *sys.argv], {**os.environ, "LEARNER_WIDTH": str(args.width)})
     python = {name: args.peers if name in PEERS else sys.executable for name in args.only}
     work = {name: 4 if name.startswith("matmul") else args.updates for name in args.only}
     seconds = {}

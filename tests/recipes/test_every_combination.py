@@ -99,6 +99,14 @@ def test_the_papers_racing_learns_with_dropout_and_acts_without(tmp_path):
     assert torch.equal(again, mode) and torch.equal(loaded(acted.clone())["loc"], mode)
 
 
+def test_most_requests_of_the_continuous_one_hot_sampler_are_one_weight_of_any_size(tmp_path):
+    train = _train("combat_cat_rac", tmp_path, "sampler=continuous_one_hot", "impersonation.n=7")
+    assert train.learner.updates > 0
+    theta = train.replay.sample(64)["style"].reshape(-1, train.learner.loss_module.actor_network.module[0].space.dim)
+    single = theta[(theta != 0).sum(-1) == 1].sum(-1)
+    assert len(single) > 0.3 * len(theta) and len(single.unique()) > 20
+
+
 def test_returns_over_several_steps_are_relabelled_by_the_sum_of_their_features(tmp_path):
     train = _train("racing_qr_sac", tmp_path, "n_steps=3", "impersonation.n=2", "family=resources")
     sample = train.replay.sample(16)

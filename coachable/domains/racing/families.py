@@ -63,17 +63,6 @@ def resource_env(num_envs: int = 64, **options: Any) -> RacingEnv:
     return RacingEnv(num_envs, **(defaults | options))
 
 
-def race_env(num_envs: int = 65, **options: Any) -> RacingEnv:
-    """Make races of five cars on Endurance, with one model from the pool per race and any compound.
-
-    Args:
-        num_envs: Number of cars, all of which the agent drives.
-        **options: Options of `RacingEnv`.
-    """
-    options = {"cars": 5, "track": "endurance", "car": "pool", "conditions": Conditions.any_compound()} | options
-    return RacingEnv(num_envs, **options)
-
-
 def rival_env(num_envs: int = AGENTS * 21, **options: Any) -> RacingEnv:
     """Make races of GT3 cars against rivals, which are scripted or copies of the policy, from all kinds of starts.
 

@@ -12,7 +12,7 @@ COMPLETED, LENGTH, DURATION, STRIDE_FRACTION, KNEE_MIN, KNEE_MAX, TIMED_OUT = ra
 STYLE_FEATURES_SIZE = TIMED_OUT + 1
 
 WALK = "walk"
-"""Key of what is measured of the walk besides, see `pack_walk`; no reward under any theta depends on it."""
+"""Key of what is measured of the walk besides, see `pack_walk`; style rewards do not read it."""
 POWER, FORCE, CLEARANCE, PITCH, DRIFT, SWING_KNEE, FOOT = range(7)
 WALK_SIZE = FOOT + 1
 

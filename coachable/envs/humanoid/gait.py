@@ -147,8 +147,11 @@ class GaitTracker:
         completed = landed[index, expected]
 
         # The other foot struck last; the step before went from this foot's footprint to the other's.
-        step = rotate_to_course(soles[index, expected] - self.prints[index, 1 - expected], course)
-        before = rotate_to_course(self.prints[index, 1 - expected] - self.prints[index, expected], course)
+        own, other = self.prints[index, expected], self.prints[index, 1 - expected]
+        feet = kinematics.feet[..., :2]
+        apart = feet[index, expected] - feet[index, 1 - expected]
+        vectors = rotate_to_course(np.stack([soles[index, expected] - other, other - own, apart], axis=1), course)
+        step, before, apart = vectors[:, 0], vectors[:, 1], vectors[:, 2]
         length, previous = step[:, 0], before[:, 0]
         forward = (length > 0) & (previous > 0)
         fraction = np.where(forward, length / np.where(forward, length + previous, 1.0), 0.0)
@@ -175,8 +178,7 @@ class GaitTracker:
         self.prints = np.where(landed[..., None], soles, self.prints)
         self.airborne = np.where(touching, 0, self.airborne + 1)
         self.highest = np.where(touching, 0.0, np.maximum(self.highest, clearance))
-        feet = rotate_to_course(kinematics.feet, course)
-        self._begin_step(completed, feet[index, expected] - feet[index, 1 - expected], knees)
+        self._begin_step(completed, apart, knees)
         stance = forces[index, 1 - self.expected]
         self.force = np.where(completed, stance, np.maximum(self.force, stance))
         return report

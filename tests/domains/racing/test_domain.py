@@ -8,11 +8,12 @@ import torch
 
 from coachable.domain import load_domain
 from coachable.domains.racing.events import racing_events
-from coachable.domains.racing.families import family_env, family_style, race_env
+from coachable.domains.racing.families import family_env, family_style
 from coachable.domains.racing.metrics import RacingMeasures
 from coachable.domains.racing.render import RacingRenderer
 from coachable.envs.racing import RacingEnv
 from coachable.envs.racing.race.referee import TELEMETRY
+from coachable.envs.racing.race.scenarios import Conditions
 from coachable.transforms import coachable_env
 
 
@@ -39,7 +40,7 @@ def test_a_domain_makes_measures_and_draws(family):
 
 
 def test_five_cars_from_the_pool_start_a_race():
-    env = race_env(10, seed=0)
+    env = RacingEnv(10, cars=5, track="endurance", car="pool", conditions=Conditions.any_compound(), seed=0)
     assert (env.reset()["observation"].abs() < 50).all()
     assert env.garage.model.shape == (2,)
     assert len(set(env.compound[2:].argmax(0).reshape(5, 2)[:, 0].tolist())) == 1
