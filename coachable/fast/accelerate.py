@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, Literal, get_args
 
@@ -14,13 +14,16 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule, SoftUpdate
 
 from coachable.fast.crew import crew
-from coachable.fast.ensemble import CriticEnsemble, Triple, make_plan, planned_copy, residual_networks, use_plan
+from coachable.fast.direct_sac import DirectSAC, Share, has_direct_gradients
+from coachable.fast.ensemble import CriticEnsemble, make_plan, planned_copy, residual_networks, use_plan
 from coachable.fast.flat import FlatBuffers
 from coachable.fast.flat_adam import FlatAdam
 from coachable.fast.fused import Plan
 from coachable.fast.native import KERNEL_THREADS, load_kernels
+from coachable.networks.residual import ResidualMLP
 from coachable.training.backend import Backend
 from coachable.training.learner import Learner
+from coachable.training.loss_functions import LossFunctions
 
 __all__ = ["Acceleration", "When", "accelerate", "obstacle"]
 
@@ -147,6 +150,21 @@ class Acceleration(Backend):
         """Return a context without effect, because the passes choose their precision themselves."""
         return nullcontext()
 
+    def both(self, losses: LossFunctions, batch: TensorDictBase, trained: Sequence[str]) -> Any:
+        """Evaluate all losses and set their gradients, see :meth:`Backend.both`."""
+        direct = self._direct_for(batch)
+        return direct.both(batch) if direct else super().both(losses, batch, trained)
+
+    def actor(self, losses: LossFunctions, batch: TensorDictBase) -> tuple[Tensor, Any]:
+        """Return the policy's loss and its metadata, after its gradients are set."""
+        direct = self._direct_for(batch)
+        return direct.actor(batch) if direct else super().actor(losses, batch)
+
+    def critic(self, losses: LossFunctions, batch: TensorDictBase) -> tuple[Tensor, Any]:
+        """Return the critics' loss and its metadata, after its gradients are set."""
+        direct = self._direct_for(batch)
+        return direct.critic(batch) if direct else super().critic(losses, batch)
+
     def make_optimizer(self, name: str, params: list[nn.Parameter], lr: float, eps: float) -> torch.optim.Adam:
         """Return `FlatAdam` for the policy and the critics, `torch.optim.Adam` for the temperature."""
         if name == "alpha":
@@ -181,6 +199,9 @@ class Acceleration(Backend):
             flat.bind(tensors)
         self._prepare()
 
+    def _direct_for(self, batch: TensorDictBase) -> DirectSAC | None:
+        return self._direct if self._direct is not None and self._direct.serves(batch) else None
+
     def _leaves(self) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
         """Return the parameters of policy, critics and target critics that the loss has now."""
         loss = self._loss
@@ -197,21 +218,53 @@ class Acceleration(Backend):
         self._trained = [*zip(self._actor.originals, self._actor.grads, strict=True)]
         self._trained += zip(self._critic.originals, self._critic.grads, strict=True)
         self._policies = residual_networks(self._loss.actor_network)
-        self._actor_plans = {
-            name: make_plan(network, name, _triples(self._actor, self._actor_names), 0, trained=True)
-            for name, network in self._policies.items()
-        }
-
-        def plans(flat: FlatBuffers, trained: bool) -> dict[str, Plan]:
-            tensors = _triples(flat, self._critic_names)
-            networks = residual_networks(critic).items()
-            return {name: make_plan(net, name, tensors, members, trained=trained) for name, net in networks}
-
-        self._critic_plans = plans(self._critic, True)
+        self._actor_plans = self._plans(self._policies, self._actor, self._actor_names, 0)
+        networks = residual_networks(critic)
+        names = self._critic_names
+        self._critic_plans = self._plans(networks, self._critic, names, members)
+        target_plans = self._plans(networks, self._target, names, members)
         self._trained_critics = _critics(critic, self._critic_plans)
-        self._frozen_critics = _critics(critic, plans(self._critic, False))
-        self._target_critics = _critics(critic, plans(self._target, False))
+        self._frozen_critics = _critics(critic, self._plans(networks, self._critic, names, members, []))
+        self._target_critics = _critics(critic, target_plans)
         self._ensemble = CriticEnsemble(critic, self._choose, members)
+        self._direct = None
+        if has_direct_gradients(self._loss) and load_kernels():
+            every = (self._actor_plans, self._critic_plans, target_plans)
+            (actor,), (own,), (target,) = (plans.values() for plans in every)
+            own_gradients = {"actor": self._actor.grad, "critic": self._critic.grad}
+            self._direct = DirectSAC(self._loss, Share(actor, own, target, own_gradients), self._another_share)
+
+    def _another_share(self) -> Share:
+        """Return plans of the same parameters, with gradients of their own."""
+        networks, members = residual_networks(self._loss.qvalue_network), self._critic.tensors[0].shape[0]
+        names = self._critic_names
+        gradients = {"actor": self._actor.another_gradient(), "critic": self._critic.another_gradient()}
+        (actor,) = self._plans(self._policies, self._actor, self._actor_names, 0, gradients["actor"][1]).values()
+        (critic,) = self._plans(networks, self._critic, names, members, gradients["critic"][1]).values()
+        (target,) = self._plans(networks, self._target, names, members).values()
+        return Share(actor, critic, target, {name: vector for name, (vector, _) in gradients.items()})
+
+    @staticmethod
+    def _plans(
+        networks: dict[str, ResidualMLP],
+        flat: FlatBuffers,
+        names: list[str],
+        members: int,
+        gradients: list[Tensor] | None = None,
+    ) -> dict[str, Plan]:
+        """Return the plans of residual networks by name.
+
+        Args:
+            networks: The networks by name.
+            flat: Their buffers.
+            names: Names of the tensors in the buffers.
+            members: Size of the ensemble; 0 for one network.
+            gradients: Where the gradients go; the buffers' own by default, none if it is empty.
+        """
+        places = flat.grads if gradients is None else gradients
+        triples = zip(flat.tensors, flat.low, places or [None] * len(names), strict=True)
+        tensors = dict(zip(names, triples, strict=True))
+        return {name: make_plan(net, name, tensors, members, trained=bool(places)) for name, net in networks.items()}
 
     def _choose(self, params: TensorDictBase) -> nn.Module:
         loss = self._loss
@@ -237,8 +290,3 @@ def _critics(critic: TensorDictModule, plans: dict[str, Plan]) -> nn.Module:
 def _leaves(params: Any, names: list[str]) -> list[Tensor]:
     tensors = dict(params.named_parameters()) or dict(params.named_buffers())
     return [tensors[name] for name in names]
-
-
-def _triples(flat: FlatBuffers, names: list[str]) -> dict[str, Triple]:
-    grads = flat.grads or [None] * len(names)
-    return dict(zip(names, zip(flat.tensors, flat.low, grads, strict=True), strict=True))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -11,12 +12,17 @@ import torch
 
 __all__ = ["crew", "crew_size", "share_out"]
 
-_size = 1
+
+class _Size(threading.local):
+    value = 1
+
+
+_size = _Size()
 
 
 def crew_size() -> int:
-    """Return how many threads share the work: 1 outside of :func:`crew`."""
-    return _size
+    """Return how many threads share the work: 1 outside of :func:`crew`, and in work that is shared out."""
+    return _size.value
 
 
 @contextmanager
@@ -29,31 +35,32 @@ def crew(largest: int) -> Iterator[None]:
     Args:
         largest: With more threads than this nothing changes.
     """
-    global _size
     threads = torch.get_num_threads()
-    if not 1 < threads <= largest or _size > 1:
+    if not 1 < threads <= largest or _size.value > 1:
         yield
         return
     torch.set_num_threads(1)
-    _size = threads
+    _size.value = threads
     try:
         yield
     finally:
-        _size = 1
+        _size.value = 1
         torch.set_num_threads(threads)
 
 
 def share_out(calls: Sequence[Callable[[], None]]) -> None:
     """Make all calls, each on a thread of the crew, the first one on this thread."""
-    if _size == 1 or len(calls) == 1:
+    threads = _size.value
+    if threads == 1:
         for call in calls:
             call()
         return
-    pool = _pool(_size - 1)
-    others = [pool.submit(call) for call in calls[1:]]
+    others = [_pool(threads - 1).submit(call) for call in calls[1:]]
+    _size.value = 1
     try:
         calls[0]()
     finally:
+        _size.value = threads
         for other in others:
             other.result()
 

@@ -59,6 +59,10 @@ class FlatBuffers:
         increment_version(self.tensors)
         self._versions = [tensor._version for tensor in self.tensors]
 
+    def another_gradient(self) -> tuple[Tensor, list[Tensor]]:
+        """Return a vector like `grad`, and its parts like `grads`."""
+        return self._views(self.tensors[0].dtype)
+
     def _views(self, dtype: torch.dtype) -> tuple[Tensor, list[Tensor]]:
         """Return a buffer of zeros and its parts in the shapes of the tensors."""
         starts, total = [], 0

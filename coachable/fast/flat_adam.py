@@ -45,6 +45,7 @@ class FlatAdam(torch.optim.Adam):
     ) -> None:
         super().__init__(params, lr=lr, eps=eps, fused=True)
         self._flat, self._target, self._tau = flat, target, tau
+        self._used: tuple[list[Any], list[Any]] = [], []
         self._complete_state()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -67,7 +68,7 @@ class FlatAdam(torch.optim.Adam):
         if single and torch.get_num_threads() <= KERNEL_THREADS and (kernels := load_kernels()):
             taken = steps[0].item() + 1.0
             rate, root = rate / (1.0 - beta1**taken), (1.0 - beta2**taken) ** -0.5
-            tables = _tables(flat, target, first, second, crew_size())
+            tables = self._tables_for(first, second)
             adam = kernels[torch.float32].adam
             share_out(
                 [partial(adam, table, len(tensors), rate, beta1, beta2, root, eps, self._tau) for table in tables]
@@ -85,6 +86,16 @@ class FlatAdam(torch.optim.Adam):
         if target is not None:
             torch._foreach_lerp_(target.tensors, tensors, self._tau)
             target.refresh()
+
+    def _tables_for(self, first: list[Tensor], second: list[Tensor]) -> list[Any]:
+        """Return the kernel's tables, which are made again when a tensor or the number of threads is another one."""
+        flat, target, shares = self._flat, self._target, crew_size()
+        used = [shares, flat.tensors, None if target is None else target.tensors, *first, *second]
+        known, tables = self._used
+        if len(known) != len(used) or any(one is not other for one, other in zip(known, used, strict=True)):
+            tables = _tables(flat, target, first, second, shares)
+            self._used = used, tables
+        return tables
 
     def _complete_state(self) -> None:
         """Make the moments contiguous tensors of this optimiser's own, zeros where there are none yet."""

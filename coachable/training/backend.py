@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import LossModule, SoftUpdate
+
+from coachable.training.loss_functions import LossFunctions
 
 __all__ = ["Backend"]
 
@@ -46,6 +50,30 @@ class Backend:
             return nullcontext()
         return torch.autocast(self._device_type, dtype=torch.bfloat16)
 
+    def both(self, losses: LossFunctions, batch: TensorDictBase, trained: Sequence[str]) -> Any:
+        """Evaluate all losses and set their gradients.
+
+        Args:
+            losses: The functions of the loss.
+            batch: Transitions, into which `td_error` is written.
+            trained: Names of the losses to differentiate.
+
+        Returns:
+            The losses and further results by name.
+        """
+        with self.evaluating():
+            outputs = losses.both(batch)
+        cast(Tensor, sum(outputs[name] for name in trained)).backward()
+        return outputs
+
+    def actor(self, losses: LossFunctions, batch: TensorDictBase) -> tuple[Tensor, Any]:
+        """Return the policy's loss and its metadata, after its gradients are set."""
+        return self._differentiated(losses.actor, batch)
+
+    def critic(self, losses: LossFunctions, batch: TensorDictBase) -> tuple[Tensor, Any]:
+        """Return the critics' loss and its metadata, after its gradients are set."""
+        return self._differentiated(losses.critic, batch)
+
     def make_optimizer(self, name: str, params: list[nn.Parameter], lr: float, eps: float) -> torch.optim.Adam:
         """Return an optimiser whose state dict has the format of `torch.optim.Adam`.
 
@@ -67,3 +95,9 @@ class Backend:
 
     def follow(self) -> None:
         """Use the loss's present parameters, after they were replaced, cast or moved in memory."""
+
+    def _differentiated(self, function: Callable[..., Any], batch: TensorDictBase) -> tuple[Tensor, Any]:
+        with self.evaluating():
+            loss, extra = function(batch)
+        loss.backward()
+        return loss, extra

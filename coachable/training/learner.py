@@ -287,11 +287,9 @@ class Learner:
             cast(Any, self.optimizers[name]).found_inf = (~total.isfinite()).float()
 
     def _simultaneous(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        with self.backend.evaluating():
-            outputs = self._losses.both(batch)
         trained = ["loss_actor", "loss_qvalue", *(["loss_alpha"] if self._params["alpha"] else [])]
+        outputs = self.backend.both(self._losses, batch, trained)
         losses = {name: outputs[name] for name in trained}
-        cast(Tensor, sum(losses.values())).backward()
         metrics = {key: outputs[key].detach() for key in ("loss_actor", "loss_qvalue", "alpha", "entropy")}
         norms = self._step(losses, *(name for name, group in self._params.items() if group))
         metrics |= {key: norms[key] for key in ("grad_norm_actor", "grad_norm_critic")}
@@ -300,9 +298,7 @@ class Learner:
 
     def _policy_first(self, batch: TensorDictBase) -> dict[str, Tensor]:
         metrics = self._update_actor(batch)
-        with self.backend.evaluating():
-            loss_qvalue, extra = self._losses.critic(batch)
-        loss_qvalue.backward()
+        loss_qvalue, extra = self.backend.critic(self._losses, batch)
         metrics["loss_qvalue"] = loss_qvalue.detach()
         metrics |= self._step({"loss_qvalue": loss_qvalue}, "critic")
         batch.set("td_error", extra["td_error"])
@@ -310,9 +306,7 @@ class Learner:
         return metrics | _critic_health(extra)
 
     def _update_actor(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        with self.backend.evaluating():
-            loss_actor, extra = self._losses.actor(batch)
-        loss_actor.backward()
+        loss_actor, extra = self.backend.actor(self._losses, batch)
         metrics = {"loss_actor": loss_actor.detach(), **self._step({"loss_actor": loss_actor}, "actor")}
         loss: Any = self.loss_module
         if "log_prob" in extra:
