@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule, SoftUpdate
 
 from coachable.fast.crew import crew
-from coachable.fast.direct_sac import DirectSAC, Share, has_direct_gradients
+from coachable.fast.direct import DirectGradients, Share, has_direct_gradients
 from coachable.fast.ensemble import CriticEnsemble, make_plan, planned_copy, residual_networks, use_plan
 from coachable.fast.flat import FlatBuffers
 from coachable.fast.flat_adam import FlatAdam
@@ -199,7 +199,7 @@ class Acceleration(Backend):
             flat.bind(tensors)
         self._prepare()
 
-    def _direct_for(self, batch: TensorDictBase) -> DirectSAC | None:
+    def _direct_for(self, batch: TensorDictBase) -> DirectGradients | None:
         return self._direct if self._direct is not None and self._direct.serves(batch) else None
 
     def _leaves(self) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
@@ -228,11 +228,12 @@ class Acceleration(Backend):
         self._target_critics = _critics(critic, target_plans)
         self._ensemble = CriticEnsemble(critic, self._choose, members)
         self._direct = None
-        if has_direct_gradients(self._loss) and load_kernels():
-            every = (self._actor_plans, self._critic_plans, target_plans)
-            (actor,), (own,), (target,) = (plans.values() for plans in every)
-            own_gradients = {"actor": self._actor.grad, "critic": self._critic.grad}
-            self._direct = DirectSAC(self._loss, Share(actor, own, target, own_gradients), self._another_share)
+        every = [[*plans.values()] for plans in (self._actor_plans, self._critic_plans, target_plans)]
+        if all(len(plans) == 1 for plans in every):
+            plans = [own for (own,) in every]
+            if has_direct_gradients(self._loss, *plans):
+                share = Share(*plans, {"actor": self._actor.grad, "critic": self._critic.grad})
+                self._direct = DirectGradients(self._loss, share, self._another_share)
 
     def _another_share(self) -> Share:
         """Return plans of the same parameters, with gradients of their own."""

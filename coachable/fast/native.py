@@ -1,4 +1,4 @@
-"""Build and load `kernels.c` with the machine's C compiler, where there is one."""
+"""Build and load `kernels.c` and `sac.c` with the machine's C compiler, where there is one."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ KERNEL_THREADS = 4  # the kernels run on one thread; beside many, the parallel o
 
 _LOG = logging.getLogger(__name__)
 _TYPES = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int)
-_SOURCE = Path(__file__).with_name("kernels.c")
+_SOURCE = Path(__file__).with_name("sac.c")
+_INCLUDED = Path(__file__).with_name("kernels.c")
 _FLAGS = (
     *("-O3", "-march=native", "-mprefer-vector-width=512", "-std=c11", "-shared", "-fPIC"),
     # Sums in any order; infinities and NaN keep their meaning.
@@ -50,6 +51,13 @@ class Kernels:
     head_backward: Any
     adam: Any
     products: Products | None
+    sac_gradients: Any = None
+
+
+def load_sac() -> Any:
+    """Return the function `sac_gradients` of `sac.c`, or `None` where it was not built; see `direct.py`."""
+    kernels = load_kernels().get(torch.bfloat16)
+    return None if kernels is None else kernels.sac_gradients
 
 
 @functools.cache
@@ -85,7 +93,7 @@ def _library(compiler: str) -> ctypes.CDLL:
 
     Without a cache that only the user can write to, it is built in a folder that goes away again.
     """
-    source = _SOURCE.read_bytes()
+    source = _SOURCE.read_bytes() + _INCLUDED.read_bytes()
     machine = repr(sorted(torch.cpu.get_capabilities().items()))  # the cache may be shared between machines
     key = hashlib.sha256(b"\0".join((source, machine.encode(), compiler.encode(), repr(_FLAGS).encode()))).hexdigest()
     name = f"kernels-{key[:20]}.so"
@@ -164,5 +172,8 @@ def _bind(library: ctypes.CDLL) -> dict[torch.dtype, Kernels]:
         head_backward.argtypes = [p, p, p, i, i, i, flag, flag, p, p, p, p]
         forward.restype = backward.restype = head.restype = head_backward.restype = None
         products = _products(library) if dtype == torch.bfloat16 else None
-        kernels[dtype] = Kernels(forward, backward, head, head_backward, adam, products)
+        sac = library.sac_gradients if products is not None else None
+        if sac is not None:
+            sac.argtypes, sac.restype = [p, i, i, flag, flag], None
+        kernels[dtype] = Kernels(forward, backward, head, head_backward, adam, products, sac)
     return kernels
