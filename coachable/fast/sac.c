@@ -78,7 +78,7 @@ static void give_back(Mark m) {
 /* Exponential and logarithm to 2e-7, in a form that compilers vectorise; a NaN stays one. */
 static inline float exp_of(float x) {
     x = x < -87.0f ? -87.0f : x > 88.0f ? 88.0f : x;
-    const float n = __builtin_rintf(x * 1.44269504f);
+    const float n = x != x ? 0.0f : __builtin_rintf(x * 1.44269504f);
     const float r = __builtin_fmaf(n, -1.42860677e-6f, __builtin_fmaf(n, -0.693145752f, x));
     float p = 1.0f / 720.0f;
     p = __builtin_fmaf(p, r, 1.0f / 120.0f);
