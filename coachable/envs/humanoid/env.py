@@ -54,6 +54,7 @@ class HumanoidEnv(EnvBase):
         costs: weights of `walk_costs`, which are taken off the task reward; none by default, as in the paper.
         push_force: largest force of random pushes of the torso [N], in any horizontal direction for 0.2 s; 0 for none.
         push_interval: mean time between pushes [s].
+        regular_pushes: whether every push has the largest force and comes exactly `push_interval` after the last one.
 
     Keys written: `observation` (N, 82) float32, `task_reward` (N, 1), `style_features` (N, 13), `walk` (N, 7),
     `done`, `terminated`, `truncated` (N, 1).
@@ -75,6 +76,7 @@ class HumanoidEnv(EnvBase):
         costs: Mapping[str, float] | None = None,
         push_force: float = 0.0,
         push_interval: float = 2.0,
+        regular_pushes: bool = False,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
@@ -98,7 +100,7 @@ class HumanoidEnv(EnvBase):
         self.course = np.zeros(num_envs)
         self.steps = np.zeros(num_envs, dtype=np.int64)
         self.costs = {name: weight for name, weight in (costs or {}).items() if weight}
-        self.push_force, self._push_chance = push_force, CONTROL_STEP / push_interval
+        self.push_force, self.push_interval, self.regular_pushes = push_force, push_interval, regular_pushes
         self.push = np.zeros((num_envs, 3))
         self._push_left = np.zeros(num_envs, dtype=np.int64)
         self.divergences = 0
@@ -258,10 +260,13 @@ class HumanoidEnv(EnvBase):
         self._observation[rows] = self._observe(kinematics, rows)
 
     def _pushes(self) -> np.ndarray:
-        """Return the force on each torso in this control step (N, 3) [N]; random pushes begin as they come."""
+        """Return the force on each torso in this control step (N, 3) [N], and begin the pushes that are due."""
         if self.push_force:
-            begins = (self._random.random(self.num_envs) < self._push_chance) & (self._push_left == 0)
+            begins = (self._random.random(self.num_envs) < CONTROL_STEP / self.push_interval) & (self._push_left == 0)
             size = self._random.uniform(0.0, self.push_force, self.num_envs)
+            if self.regular_pushes:
+                begins = (self.steps > 0) & (self.steps % max(1, round(self.push_interval / CONTROL_STEP)) == 0)
+                size = np.full(self.num_envs, self.push_force)
             angle = self._random.uniform(-np.pi, np.pi, self.num_envs)
             force = np.stack([size * np.cos(angle), size * np.sin(angle), np.zeros(self.num_envs)], axis=1)
             self.push_torso(np.where(begins[:, None], force, 0.0))

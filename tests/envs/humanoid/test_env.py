@@ -306,6 +306,20 @@ def test_random_pushes_come_as_often_and_as_hard_as_asked():
     assert np.abs(forces.mean(axis=(0, 1))).max() < 2.0  # from every side
 
 
+def test_regular_pushes_have_the_full_force_at_equal_intervals():
+    env = make_env(num_envs=50, push_force=100.0, push_interval=0.5, regular_pushes=True)
+    env.reset()
+    forces = []
+    for _ in range(60):  # 1.5 s
+        forces.append(env._pushes())
+        env.steps += 1
+    sizes = np.linalg.norm(forces, axis=-1)
+    pushed = (np.arange(60) % 20 < 8) & (np.arange(60) >= 20)  # each for 0.2 s, the first after 0.5 s
+    np.testing.assert_allclose(sizes, np.where(pushed, 100.0, 0.0)[:, None].repeat(50, 1))
+    angles = np.arctan2(forces[20][:, 1], forces[20][:, 0])
+    assert angles.std() > 1.0  # from every side
+
+
 def test_pushes_continue_exactly_from_a_saved_state():
     env, other = make_env(push_force=80.0, push_interval=0.1), make_env(seed=9, push_force=80.0, push_interval=0.1)
     roll(env, actions(env, 6))
