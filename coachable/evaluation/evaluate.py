@@ -164,8 +164,9 @@ def _report(
     text += markdown_table(rows, columns)
     if medians:
         text += f"\n## Median of the {len(rows)} styles, and its target\n\n"
-        numbers = dict.fromkeys(("median", "lowest", "highest"), ".3g")
-        text += markdown_table(medians, {"measure": "", "unit": "", **numbers, "at_most": "", "met": ""})
+        numbers = ("median", "lowest", "highest")
+        shown = [row | {n: format(row[n], domain.columns[row["measure"]]) for n in numbers} for row in medians]
+        text += markdown_table(shown, dict.fromkeys(medians[0], ""))
     if response:
         text += "\n## Response to the request\n\n"
         numbers = ("slope", "rank_correlation", "mean_error")
