@@ -78,12 +78,14 @@ def _parser() -> argparse.ArgumentParser:
     _add_rollout(evaluate)
 
     render = command("render", _render, "film an agent whose style is switched while it acts", _SOURCE_HELP)
-    _add_out(render, "coachable.mp4", ".mp4, .gif or .png")
+    _add_out(render, "coachable.mp4", ".mp4, .gif, .webp or .png")
     text = "one request, NAME=VALUE,NAME=VALUE; repeat it to switch (default: a tour of the styles)"
     render.add_argument("--style", action="append", type=_style, dest="styles", metavar="NAME=VALUE,...", help=text)
     text = "per style (%(default)s)"
     render.add_argument("--seconds", type=_seconds, default=4.0, dest="seconds_per_style", help=text)
-    render.add_argument("--size", type=_size, default=(640, 480), metavar="WIDTHxHEIGHT")
+    text = "of the picture of one style (default: 640x480)"
+    render.add_argument("--size", type=_size, default=(640, 480), metavar="WIDTHxHEIGHT", help=text)
+    render.add_argument("--together", action="store_true", help="show all styles at once, side by side")
     render.add_argument("--seed", type=_at_least(0), default=0)
 
     curves = command("curves", _curves, "draw learning curves of runs, with intervals over seeds")

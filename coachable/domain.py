@@ -154,6 +154,9 @@ class Domain:
             parameter name. By default a few values over each parameter's evaluation range.
         control_step: Duration of one env step [s]; by default from the environment's attributes, or 1.
         episode_steps: Length of a full episode; by default from the environment's attributes, or 1000.
+        trials: Options of `make_env` by label, such as disturbances, under which `coachable evaluate` counts the
+            episodes in the default style that survive.
+        targets: Largest value of a metric that is wanted as its median over the styles, by name.
         columns: Metrics of the published table, in order, with the format of their values; by default all.
         units: Units of measured quantities by name, for the axes of figures.
         observation_groups: Name and width of each block of the observation, in order, for explanations; by default
@@ -176,6 +179,8 @@ class Domain:
     grid: Mapping[str, Sequence[Any]] | Sequence[Mapping[str, Any]] = _GRID
     control_step: float = _CONTROL_STEP
     episode_steps: int = _EPISODE_STEPS
+    trials: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    targets: Mapping[str, float] = field(default_factory=dict)
     columns: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
     observation_groups: Sequence[tuple[str, int]] = ()

@@ -58,6 +58,7 @@ class OffscreenMujoco:
 
     def close(self) -> None:
         """Release the OpenGL context."""
+        self._gl.make_current()  # another renderer's context may be the current one
         self._context.free()
         self._gl.free()
 

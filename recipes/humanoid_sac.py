@@ -3,6 +3,7 @@
 python recipes/humanoid_sac.py                            on a CPU or a GPU
 python recipes/humanoid_sac.py preset=smoke               every part once, within a minute
 python recipes/humanoid_sac.py preset=paper               the paper's settings
+python recipes/humanoid_sac.py family=gait                walking speed as a third style
 python recipes/humanoid_sac.py loss=qr_sac                another loss; see --help for all groups
 python recipes/humanoid_sac.py train.batch_size=512 seed=1 run_dir=runs/mine
 python recipes/humanoid_sac.py resume=runs/mine           continue where it stopped
@@ -15,7 +16,8 @@ import recipe_boxes as boxes
 from recipe_config import run_recipe
 from torchrl.envs import Compose, EnvBase
 
-from coachable.domains.humanoid import humanoid_style_reward, humanoid_style_space
+from coachable.domains.humanoid import humanoid_style_reward
+from coachable.domains.humanoid.families import humanoid_family
 from coachable.domains.humanoid.mirror_maps import humanoid_mirror_maps
 from coachable.fast import accelerate
 from coachable.training.episodes import EpisodeSums
@@ -30,12 +32,14 @@ def build(config: dict[str, Any]) -> Trainer:
     cfg = run.settings
 
     # Styles and their reward
-    space = humanoid_style_space()
+    family = humanoid_family(config.get("family", "steps"))  # checkpoints of earlier versions name no family
+    space = family.make_space()
     space = space.with_sampler(boxes.make(cfg.sampler)(space))
     style_reward = boxes.make_style_reward(run, humanoid_style_reward, space)
 
     # Environment: styles are drawn at reset, the reward is the sum of the task's and the style's
     def make_env(seed: int, **settings: Any) -> EnvBase:
+        settings = {**family.options, **settings}
         humanoid = boxes.make(cfg.env)(seed=seed, num_threads=run.simulator_threads, **settings)
         env = CoachableEnv(humanoid, Compose(StyleSampler(space), StyleRewardTransform(style_reward), EpisodeSums()))
         env.set_seed(seed)
@@ -56,7 +60,7 @@ def build(config: dict[str, Any]) -> Trainer:
     # Replay buffer: sums over n steps, mirror images, and relabelling with other styles
     relabelled = []
     if cfg.mirror:
-        relabelled.append(MirrorSymmetry(humanoid_mirror_maps(), cfg.mirror, seed=cfg.seed))
+        relabelled.append(MirrorSymmetry(humanoid_mirror_maps(family.styled_speed), cfg.mirror, seed=cfg.seed))
     if cfg.impersonation.n:
         relabelled.append(TaskImpersonation(style_reward, n=cfg.impersonation.n, seed=cfg.seed))
     replay = boxes.make_replay(run, example, *relabelled)

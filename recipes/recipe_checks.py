@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from dataclasses import Field, fields, is_dataclass
 from typing import Any
 
-from configs.schema import RacingSettings, Settings, composed_type
+from configs.schema import FamilySettings, Settings, composed_type
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException, ValidationError
 
@@ -154,7 +154,7 @@ def _checked(value: Any, path: tuple[str, ...]) -> Any:
 
 def _declared(path: tuple[str, ...]) -> Field[Any] | None:
     """Return the field of the schema at a path, or None in a group with a `_target_`."""
-    kind, entry = RacingSettings, None
+    kind, entry = FamilySettings, None
     for part in path:
         entry = {field.name: field for field in fields(kind)}.get(part) if is_dataclass(kind) else None
         kind = entry and entry.type

@@ -48,6 +48,7 @@ _FIXED = (
     "init_new_observations",
     "stage",
     "stages",
+    "family",
 )
 
 _PATHS = ("run_dir", "resume", "init_from")
@@ -65,6 +66,9 @@ def config_groups(config_name: str) -> dict[str, list[str]]:
 
 OmegaConf.register_new_resolver(  # for --help
     "groups", lambda name: "\n".join(f"{group}: {', '.join(choices)}" for group, choices in config_groups(name).items())
+)
+OmegaConf.register_new_resolver(  # the default family has the domain of the recipe, others one of their own
+    "domain_of_family", lambda domain, default, family: domain if family == default else f"{domain}_{family}"
 )
 
 

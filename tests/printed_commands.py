@@ -36,7 +36,7 @@ NOT_RUN = {
     r"tests\.(random_kills|mutation)": "takes a quarter of an hour or more",
     r"^coachable (evaluate|report) ": "evaluates for minutes",
     r"domains\.racing\.frontier": "evaluates for minutes",
-    r"^coachable render humanoid$": "draws a film of an episode for about a minute",
+    r"^coachable render humanoid($| --together)": "draws a film of an episode for about a minute",
 }
 
 

@@ -1,4 +1,4 @@
-"""`coachable evaluate`: the style grid and the switching test of a trained agent, as tables and a figure."""
+"""`coachable evaluate`: the style grid, the trials and the switching test of an agent, as tables and a figure."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from coachable.domain import Domain
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import draw_style_grid
+from coachable.evaluation.statistics import wilson_interval
 from coachable.evaluation.style_grid import (
     StyleGrid,
     evaluate_grid,
@@ -23,7 +26,7 @@ from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
 
 def evaluate(source: str | Path, out: Path, **settings: Any) -> str:
-    """Evaluate an agent and write `grid.csv`, `response.csv`, `report.md`, `grid.png` and `summary.json` into a folder.
+    """Evaluate an agent and write the results into a folder, by default those of `evaluate_styles`.
 
     Args:
         source: Checkpoint, run folder, weights file, or the name of a domain that ships with weights.
@@ -43,51 +46,136 @@ def evaluate(source: str | Path, out: Path, **settings: Any) -> str:
     asked = EvaluationSettings(**settings)
     if domain.evaluation is not None:
         return domain.evaluation(domain, agent, out, asked)
-    episodes, switch_episodes = asked.episodes, asked.switch_episodes
-    grid = evaluate_grid(domain, agent.actor, agent.space, episodes=episodes, **asked.rollout)
-    switching = evaluate_switching(domain, agent.actor, agent.space, episodes=switch_episodes, **asked.rollout)
-    rows, response = grid.rows(), grid.response(agent.space)
+    return evaluate_styles(domain, agent, out, asked)[0]
+
+
+def evaluate_styles(
+    domain: Domain, agent: LoadedPolicy, out: Path, settings: EvaluationSettings
+) -> tuple[str, StyleGrid]:
+    """Evaluate an agent in the styles of its domain's grid, in the domain's trials, and while the style switches.
+
+    The files are `grid.csv`, `response.csv`, `medians.csv`, `trials.csv`, `report.md`, `grid.png` and `summary.json`.
+
+    Args:
+        domain: Domain of the agent.
+        agent: Policy and its style space.
+        out: Existing folder for the results.
+        settings: Numbers of episodes and settings of the rollouts.
+
+    Returns:
+        The report as Markdown, and the measurements in the styles of the grid.
+    """
+    episodes, switch_episodes = settings.episodes, settings.switch_episodes
+    grid = evaluate_grid(domain, agent.actor, agent.space, episodes=episodes, **settings.rollout)
+    trials = evaluate_trials(domain, agent, settings)
+    switching = evaluate_switching(domain, agent.actor, agent.space, episodes=switch_episodes, **settings.rollout)
+    tables = {"grid": grid.rows(), "response": grid.response(agent.space)}
+    tables |= {"medians": median_rows(domain, grid), "trials": trials}
     title = f"{domain.name}: {episodes} episodes of {grid.steps} steps per style, 95 % intervals"
     draw_style_grid(grid, domain, agent.space, out / "grid.png", title)
-    report = _report(domain, agent, grid, rows, response, switching, switch_episodes)
-    return write_results(out, report, _summary(grid, rows, switching), {"grid": rows, "response": response})
+    report = _report(domain, agent, grid, tables, switching, switch_episodes)
+    return write_results(out, report, _summary(grid, tables, switching), tables), grid
 
 
-def _summary(grid: StyleGrid, rows: list[dict[str, Any]], switching: SwitchReport) -> dict[str, Any]:
-    """Return the lowest, mean and highest cell of each metric, and the results of the switching test."""
+def evaluate_trials(domain: Domain, agent: LoadedPolicy, settings: EvaluationSettings) -> list[dict[str, Any]]:
+    """Count the episodes that survive in each of a domain's trials, in the agent's default style.
+
+    Args:
+        domain: Domain with the trials.
+        agent: Policy and its style space.
+        settings: Number of episodes and settings of the rollouts.
+
+    Returns:
+        One row per trial with its label, the number of episodes, how many of them survived, and the 95 % Wilson
+        interval of their share.
+    """
+    rows = []
+    for label, options in domain.trials.items():
+        count = settings.trial_episodes
+        style = agent.space.describe(agent.space.default)
+        grid = evaluate_grid(
+            domain, agent.actor, agent.space, episodes=count, cells=[style], env_options=options, **settings.rollout
+        )
+        survived = round(grid.episodes["survived"].sum())
+        low, high = wilson_interval(survived, count)
+        rows.append({"trial": label, "episodes": count, "survived": survived, "share_low": low, "share_high": high})
+    return rows
+
+
+def median_rows(domain: Domain, grid: StyleGrid) -> list[dict[str, Any]]:
+    """Return the median, the lowest and the highest style of each published metric of a domain that has targets.
+
+    Args:
+        domain: Domain with the columns and the targets.
+        grid: Measurements in all styles.
+
+    Returns:
+        Rows with the metric, its unit, the three values, its target and whether the median meets it; the last two are
+        empty without a target.
+    """
+    rows = []
+    for name in [name for name in domain.columns if name in grid.episodes and domain.targets]:
+        means = np.array([mean_of(values) for values in grid.episodes[name]])
+        means = means[~np.isnan(means)]
+        median, lowest, highest = np.percentile(means, [50, 0, 100]) if len(means) else [math.nan] * 3
+        row: dict[str, Any] = {"measure": name, "unit": domain.units.get(name, "")}
+        row |= {"median": float(median), "lowest": float(lowest), "highest": float(highest)}
+        target = domain.targets.get(name)
+        met = "" if target is None else "yes" if median <= target else "no"
+        rows.append(row | {"at_most": "" if target is None else f"{target:g}", "met": met})
+    return rows
+
+
+def _summary(grid: StyleGrid, tables: dict[str, list[dict[str, Any]]], switching: SwitchReport) -> dict[str, Any]:
+    """Return the lowest, mean and highest cell of each metric, and the results of the trials and the switching test."""
     spans = {}
     for name, values in grid.episodes.items():
         means = [mean for mean in map(mean_of, values) if not math.isnan(mean)]
         if means:
             spans[name] = {"lowest_cell": min(means), "mean": sum(means) / len(means), "highest_cell": max(means)}
-    return {
+    summary: dict[str, Any] = {
         "grid": spans,
-        "cells": len(rows),
+        "cells": len(grid.cells),
         "episodes_per_cell": grid.episodes["survived"].shape[1],
         "seed": grid.seed,
         "switching": {**switching.metrics, "complied": switching.complied, "switches": switching.switches},
     }
+    if tables["medians"]:
+        summary["medians"] = {row["measure"]: row["median"] for row in tables["medians"]}
+    if tables["trials"]:
+        summary["trials"] = {row["trial"]: row["survived"] / row["episodes"] for row in tables["trials"]}
+    return summary
 
 
 def _report(
     domain: Domain,
     agent: LoadedPolicy,
     grid: StyleGrid,
-    rows: list[dict[str, Any]],
-    response: list[dict[str, Any]],
+    tables: dict[str, list[dict[str, Any]]],
     switching: SwitchReport,
     switch_episodes: int,
 ) -> str:
+    rows, response, medians, trials = (tables[name] for name in ("grid", "response", "medians", "trials"))
     columns = {name: ".6g" if isinstance(value, float) else "" for name, value in grid.cells[0].items()}
     columns |= published(domain, grid.episodes)
     text = f"# {domain.name}: requested and measured style\n\n"
     text += f"{policy_sentence(agent)}; {rows[0]['episodes']} episodes of "
     text += f"{grid.steps} steps per style, seed {grid.seed}.\n\n![style grid](grid.png)\n\n"
     text += markdown_table(rows, columns)
+    if medians:
+        text += f"\n## Median of the {len(rows)} styles, and its target\n\n"
+        numbers = ("median", "lowest", "highest")
+        shown = [row | {n: format(row[n], domain.columns[row["measure"]]) for n in numbers} for row in medians]
+        text += markdown_table(shown, dict.fromkeys(medians[0], ""))
     if response:
         text += "\n## Response to the request\n\n"
         numbers = ("slope", "rank_correlation", "mean_error")
         text += markdown_table(response, {name: ".3f" if name in numbers else "" for name in response[0]})
+    if trials:
+        text += "\n## Trials in the default style\n\n"
+        text += markdown_table(
+            trials, {"trial": "", "episodes": "", "survived": "", "share_low": ".0%", "share_high": ".0%"}
+        )
     times = switching.comply_seconds
     median = f"{times.median():.2f} s" if len(times) else "never"
     text += f"\n## Style switched at random every 100 steps ({switch_episodes} episodes)\n\n"

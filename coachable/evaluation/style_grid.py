@@ -53,11 +53,13 @@ class StyleGrid:
 
         Returns:
             Rows with the other parameters' values, `slope` of the realised over the requested value (least squares over
-            episodes), `rank_correlation`, and `mean_error`.
+            episodes), `rank_correlation`, and `mean_error`. Of several set-points, the one that is measured is empty.
         """
         rows = []
-        for name in (p.name for p in space.parameters if isinstance(p, Setpoint) and p.name in self.episodes):
-            others = [{k: v for k, v in cell.items() if k != name} for cell in self.cells]
+        names = [p.name for p in space.parameters if isinstance(p, Setpoint) and p.name in self.episodes]
+        for name in names:
+            own = {name: ""} if len(names) > 1 else {}
+            others = [{k: v for k, v in (cell | own).items() if k != name or own} for cell in self.cells]
             for group in (other for i, other in enumerate(others) if other not in others[:i]):
                 members = [i for i, other in enumerate(others) if other == group]
                 realised = self.episodes[name][members].ravel()
@@ -66,7 +68,7 @@ class StyleGrid:
                 slope = np.polyfit(requested[valid], realised[valid], 1)[0] if valid.sum() > 1 else float("nan")
                 row = {**group, "parameter": name, "slope": float(slope)}
                 row["rank_correlation"] = rank_correlation(requested, realised)
-                rows.append(row | {"mean_error": float(np.nanmean(np.abs(realised - requested)))})
+                rows.append(row | {"mean_error": mean_of(np.abs(realised - requested))})
         return rows
 
 

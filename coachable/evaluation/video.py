@@ -1,4 +1,4 @@
-"""`coachable render`: film an agent whose style is switched while it acts."""
+"""`coachable render`: film an agent whose style is switched while it acts, or several styles side by side."""
 
 from __future__ import annotations
 
@@ -22,10 +22,12 @@ from coachable.extras import how_to_install
 from coachable.styles import Choice, StyleRangeWarning, StyleSpace, Weight
 from coachable.training.weights import domain_of, load_policy
 
-VIDEO_SUFFIXES = (".mp4", ".gif", ".png")
-_GIF_FPS = 20
-_MEASURES_IN_CAPTION = 4  # as many as fit
+VIDEO_SUFFIXES = (".mp4", ".gif", ".webp", ".png")
+_IMAGE_FPS = 20  # of films that are not mp4
+_WEBP_QUALITY = 50  # of 100
+_MEASURES_IN_CAPTION, _MEASURES_IN_PANEL = 4, 2  # as many as fit
 CAPTION = 44  # [px]
+_SMALLEST_FONT = 8  # [px]
 _SMALLEST = (64, CAPTION + 16)  # [px]
 _LARGEST = 4096  # [px]
 _LONGEST = 3600.0  # [s]
@@ -39,18 +41,21 @@ def render(
     seconds_per_style: float = 4.0,
     size: tuple[int, int] = (640, 480),
     seed: int = 0,
+    together: bool = False,
     progress: bool = True,
 ) -> Path:
     """Film one agent, with the requested and the measured style in the picture.
 
     Args:
         source: Checkpoint, run folder, weights file, or the name of a domain that ships with weights.
-        out: File to write: `.mp4`, `.gif`, or `.png` for a sheet with one picture per style.
+        out: File to write: `.mp4`, `.gif`, `.webp`, or `.png` for a sheet with one picture per style.
         styles: Requests by parameter name, in order; by default those of `default_tour`. Numbers outside the trained
             range are clamped, which the caption says.
-        seconds_per_style: Time between switches [s], above 0 and at most 3600.
-        size: Width and height [px], at least 64 x 60 and at most 4096 x 4096; even for mp4.
+        seconds_per_style: Time between switches, or length of a film of all styles together [s], above 0 and at most
+            3600.
+        size: Width and height of the picture of one style [px], at least 64 x 60 and at most 4096 x 4096; even for mp4.
         seed: Seed of the initial state and of sampled actions.
+        together: Whether to show all styles at once, side by side in rows of three, instead of one after the other.
         progress: Whether to show a progress bar.
 
     Returns:
@@ -76,15 +81,24 @@ def render(
     requests = default_tour(domain, agent.space) if styles is None else list(styles)
     period = max(1, round(seconds_per_style / domain.control_step))
     sheet = out.suffix == ".png"
+    fps = round(1 / domain.control_step)
     # A sheet shows the last step of each style, so that the agent has had time to comply.
-    frames = _film(domain, agent.actor, agent.space, requests, period, size, seed, every=period if sheet else 1)
-    total = len(requests) * (1 if sheet else period)
+    every = period if sheet else 1 if out.suffix == ".mp4" else min(_stride(fps), period)
+
+    def film(styles: Sequence[dict[str, Any]]) -> Iterator[np.ndarray]:
+        panel = together and not sheet
+        return _film(domain, agent.actor, agent.space, styles, period, size, seed, every=every, panel=panel)
+
+    frames, total = film(requests), len(requests) * (period // every)
+    if together and not sheet:
+        panels = [film([request]) for request in requests]
+        frames, total = (tiled(row) for row in zip(*panels, strict=True)), period // every
     bar = tqdm(frames, total=total, desc="drawing", unit="frame", disable=None if progress else True, leave=False)
     with complete_file(out) as unfinished:
         if sheet:
-            _write_sheet(list(bar), unfinished)
+            Image.fromarray(tiled(list(bar))).save(unfinished)
         else:
-            write_video(bar, unfinished, round(1 / domain.control_step))
+            write_video(bar, unfinished, max(1, fps // every))
     return out
 
 
@@ -102,17 +116,19 @@ def default_tour(domain: Domain, space: StyleSpace) -> list[dict[str, Any]]:
 
 
 def write_video(frames: Iterable[np.ndarray], out: Path, fps: int) -> None:
-    """Write frames (height, width, 3) uint8 as mp4 (H.264) or gif.
+    """Write frames (height, width, 3) uint8 as mp4 (H.264), gif or animated WebP.
 
     Args:
         frames: The frames.
-        out: File to write, `.mp4` or `.gif`.
-        fps: Frames per second; a gif leaves some out to have about 20.
+        out: File to write, `.mp4`, `.gif` or `.webp`.
+        fps: Frames per second; gif and WebP leave some out to have about 20.
     """
-    if out.suffix == ".gif":
-        stride = max(1, fps // _GIF_FPS)
+    if out.suffix != ".mp4":
+        stride = _stride(fps)
         images = [Image.fromarray(frame) for frame in itertools.islice(frames, 0, None, stride)]
-        images[0].save(out, save_all=True, append_images=images[1:], duration=1000 * stride // fps, loop=0)
+        options: dict[str, Any] = {"append_images": images[1:], "duration": 1000 * stride // fps, "loop": 0}
+        options |= {"quality": _WEBP_QUALITY} if out.suffix == ".webp" else {}
+        images[0].save(out, save_all=True, **options)
         return
     av = _import_av()
     with av.open(str(out), "w") as container:
@@ -125,6 +141,10 @@ def write_video(frames: Iterable[np.ndarray], out: Path, fps: int) -> None:
         container.mux(stream.encode())
 
 
+def _stride(fps: int) -> int:
+    return max(1, fps // _IMAGE_FPS)
+
+
 def _film(
     domain: Domain,
     policy: Any,
@@ -134,8 +154,9 @@ def _film(
     size: tuple[int, int],
     seed: int,
     every: int,
+    panel: bool = False,
 ) -> Iterator[np.ndarray]:
-    """Yield every `every`-th frame of the `period` steps of each request."""
+    """Yield every `every`-th frame of the `period` steps of each request, with a short caption for a panel."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", StyleRangeWarning)  # the caption mentions clamped values
         thetas = [space.make(**request) for request in requests]
@@ -151,7 +172,8 @@ def _film(
                 transition = rollout.step(policy, theta[None])
                 recent.append(domain.measures.step(transition))
                 if step % every == 0:
-                    yield caption(renderer.draw(env), (asked, _measured_line(domain, recent, failures)))
+                    measured = _measured_line(domain, recent, failures, space.names if panel else ())
+                    yield caption(renderer.draw(env), (asked, measured))
                 if transition["next", "done"].any():
                     failures += int(transition["next", "terminated"].sum())
                     rollout.begin(theta[None])
@@ -181,15 +203,17 @@ def asked_line(space: StyleSpace, request: Mapping[str, Any], theta: Tensor) -> 
     return readable(f"asked: {', '.join(parts) or 'every weight 0'}")
 
 
-def _measured_line(domain: Domain, recent: list[dict[str, Tensor]], failures: int) -> str:
+def _measured_line(domain: Domain, recent: list[dict[str, Tensor]], failures: int, first: Sequence[str] = ()) -> str:
+    """Return what was measured in the last two seconds; a short line if the names to begin with are given."""
     window = recent[-round(2.0 / domain.control_step) :]
     record = {name: torch.stack([row[name] for row in window]) for name in window[0]}
     measured = domain.measures.summarise(record, torch.ones(len(window), 1, dtype=torch.bool))
     wanted = [name.removeprefix("measured_") for name in domain.columns]
     published = {name: value for name, value in measured.items() if name in wanted} or measured
-    known = [f"{name} {value.item():.2f}" for name, value in published.items() if not bool(value.isnan().any())]
-    shown = ", ".join(known[:_MEASURES_IN_CAPTION])
-    return f"last 2 s: {shown}; failures {failures}".replace("_", " ")
+    names = [name for name, value in published.items() if not bool(value.isnan().any())]
+    names = sorted(names, key=lambda name: name not in first)[: _MEASURES_IN_PANEL if first else _MEASURES_IN_CAPTION]
+    shown = ", ".join(f"{name} {published[name].item():.2f}" for name in names)
+    return f"last 2 s: {shown}{f'; failures {failures}' if failures or not first else ''}".replace("_", " ")
 
 
 def caption(frame: np.ndarray, lines: tuple[str, str]) -> np.ndarray:
@@ -197,20 +221,22 @@ def caption(frame: np.ndarray, lines: tuple[str, str]) -> np.ndarray:
 
     Args:
         frame: Frame (height, width, 3) uint8.
-        lines: The lines; the first one is larger.
+        lines: The lines; the first one is larger. Long lines are written smaller, so that they fit.
 
     Returns:
         Frame (height + `CAPTION`, width, 3) uint8.
     """
     image = Image.new("RGB", (frame.shape[1], CAPTION), (20, 20, 30))
     draw = ImageDraw.Draw(image)
-    large, small = ImageFont.load_default(16), ImageFont.load_default(12)
-    draw.text((8, 2), lines[0], font=large, fill=(255, 220, 120))
-    draw.text((8, 24), lines[1], font=small, fill=(220, 220, 220))
+    for line, top, largest, colour in zip(lines, (2, 24), (16, 12), ((255, 220, 120), (220, 220, 220)), strict=True):
+        fonts = (ImageFont.load_default(size) for size in range(largest, _SMALLEST_FONT - 1, -1))
+        font = next((f for f in fonts if draw.textlength(line, f) <= frame.shape[1] - 12), None)
+        draw.text((8, top), line, font=font or ImageFont.load_default(_SMALLEST_FONT), fill=colour)
     return np.concatenate([frame, np.asarray(image)])
 
 
-def _write_sheet(frames: Sequence[np.ndarray], out: Path, columns: int = 3) -> None:
+def tiled(frames: Sequence[np.ndarray], columns: int = 3) -> np.ndarray:
+    """Return frames of one size (height, width, 3) uint8 as one picture, in rows of `columns`."""
     height, width = frames[0].shape[:2]
     columns = min(columns, len(frames))
     rows = -(-len(frames) // columns)
@@ -218,7 +244,7 @@ def _write_sheet(frames: Sequence[np.ndarray], out: Path, columns: int = 3) -> N
     for index, frame in enumerate(frames):
         row, column = divmod(index, columns)
         sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = frame
-    Image.fromarray(sheet).save(out)
+    return sheet
 
 
 def _import_av() -> Any:

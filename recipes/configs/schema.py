@@ -147,8 +147,8 @@ class Settings:
 
 
 @dataclass(kw_only=True)
-class RacingSettings(Settings):
-    """Configuration of racing."""
+class FamilySettings(Settings):
+    """Configuration of a recipe for several families of styles."""
 
     family: str
 
@@ -157,7 +157,7 @@ def register_schema() -> None:
     """Register the classes with Hydra under their names in the lists of defaults."""
     store = ConfigStore.instance()
     store.store("settings", composed_type(Settings))
-    store.store("racing_settings", composed_type(RacingSettings))
+    store.store("family_settings", composed_type(FamilySettings))
 
 
 def composed_type(kind: Any) -> Any:

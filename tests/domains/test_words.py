@@ -6,11 +6,12 @@ from coachable.coach.phrases.fitting import fitting
 from coachable.coach.phrases.grammar import StyleGrammar
 from coachable.domain import load_domain
 from coachable.domains.combat.styles import combat_style_space
-from coachable.domains.humanoid import humanoid_style_space
+from coachable.domains.humanoid import gait_style_space, humanoid_style_space
 from coachable.domains.racing.styles import aggressiveness_style_space, drift_style_space, resource_style_space
 
 SPACES = {
     "humanoid": humanoid_style_space,
+    "humanoid_gait": gait_style_space,
     "combat": combat_style_space,
     "racing_drift": drift_style_space,
     "racing_resources": resource_style_space,
@@ -38,6 +39,19 @@ def grammar_of(domain):
 @pytest.mark.parametrize(
     ("domain", "phrase", "changes"),
     [
+        ("humanoid_gait", "walk faster", {"speed": 1.1}),
+        ("humanoid_gait", "walk slower", {"speed": 0.7}),
+        ("humanoid_gait", "walk much slower", {"speed": 0.5}),
+        ("humanoid_gait", "a bit faster", {"speed": 1.0}),
+        ("humanoid_gait", "slow down", {"speed": 0.55}),
+        ("humanoid_gait", "walk fast", {"speed": 1.25}),
+        ("humanoid_gait", "0.8 m/s", {"speed": 0.8}),
+        ("humanoid_gait", "3.6 km/h", {"speed": 1.0}),
+        ("humanoid_gait", "0.4 m", {"step_length": 0.4}),
+        ("humanoid_gait", "shorter steps", {"step_length": 0.405}),
+        ("humanoid_gait", "longer steps, slower", {"step_length": 0.545, "speed": 0.7}),
+        ("humanoid_gait", "faster, arms up", {"speed": 1.1, "pose": "arms_up"}),
+        ("humanoid", "shorter steps", {"step_length": 0.405}),
         ("combat", "freeze it", {"frost": 0.6}),
         ("combat", "burn it, but no plasma", {"fire": 0.9, "plasma": -0.03}),
         ("combat", "break its weapon", {"part_weapon": 1.0}),

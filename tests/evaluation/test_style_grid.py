@@ -1,5 +1,7 @@
 """The grid, the switching test and their files, on an env whose outcome is known: its action is its measured style."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,20 +11,24 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from coachable.domain import Domain, load_domain
+from coachable.evaluation.evaluate import evaluate_styles
+from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.rollouts import record_episodes
 from coachable.evaluation.style_grid import evaluate_grid, markdown_table, write_csv
 from coachable.evaluation.switching import evaluate_switching
 from coachable.styles import Choice, Setpoint, StyleReward, StyleSpace, Term
+from coachable.training.weights import LoadedPolicy
 from coachable.transforms import coachable_env
 
 SPACE = StyleSpace([Choice("hat", ("red", "blue")), Setpoint("speed", 0.0, 2.0, unit="m/s")], name="toy")
 
 
 class ToyEnv(EnvBase):
-    """`style_features` is the action. Ends after 5 steps where the action exceeds 1.5."""
+    """`style_features` is the action. Ends after 5 steps where the action exceeds a limit."""
 
-    def __init__(self, num_envs, num_threads=None):
+    def __init__(self, num_envs, num_threads=None, limit=1.5):
         super().__init__(batch_size=[num_envs])
+        self.limit = torch.as_tensor(limit).expand(num_envs).unsqueeze(-1)
         n = num_envs
         one = Unbounded(shape=(n, 1))
         self.observation_spec = Composite(observation=one, task_reward=one, style_features=one, shape=(n,))
@@ -57,7 +63,7 @@ class ToyEnv(EnvBase):
     def _step(self, tensordict):
         self.steps += 1
         action = tensordict["action"]
-        return self._outputs(action.clone(), (action > 1.5) & (self.steps >= 5))
+        return self._outputs(action.clone(), (action > self.limit) & (self.steps >= 5))
 
 
 class ToyMeasures:
@@ -145,6 +151,36 @@ def test_switching_counts_compliance_per_switch():
     torch.testing.assert_close(report.comply_seconds, torch.full_like(report.comply_seconds, 0.1))
 
 
+def test_trials_and_medians_are_reported(tmp_path):
+    two_of_nine_fall = torch.tensor([1.5] * 7 + [0.5] * 2)
+    domain = replace(
+        DOMAIN,
+        trials={"calm": {}, "gale": {"limit": two_of_nine_fall}},
+        columns={"survived": ".0%", "measured_speed": ".2f", "error": ".2f"},
+        targets={"error": 0.2},
+        units={"error": "m/s"},
+    )
+    agent = LoadedPolicy(POLICY, SPACE, {}, {})
+    settings = EvaluationSettings(episodes=5, switch_episodes=2, progress=False)
+    report, grid = evaluate_styles(domain, agent, tmp_path, settings)
+    assert len(grid.cells) == 6
+    assert "| calm | 9 | 9 | 70% | 100% |" in report
+    assert "| gale | 9 | 7 | 45% | 94% |" in report
+    assert "| error | m/s | 0.00 | 0.00 | 1.00 | 0.2 | yes |" in report  # 0, 0, 0, 1, 0, 1
+    assert "| survived |  | 100% | 0% | 100% |  |  |" in report
+    assert "gale,9,7," in (tmp_path / "trials.csv").read_text()
+    assert (tmp_path / "medians.csv").is_file()
+
+
+def test_a_domain_without_trials_and_targets_reports_none(tmp_path):
+    settings = EvaluationSettings(episodes=1, switch_episodes=1, progress=False)
+    report, _ = evaluate_styles(DOMAIN, LoadedPolicy(POLICY, SPACE, {}, {}), tmp_path, settings)
+    assert "Trials" not in report and "Median" not in report
+    assert {file.name for file in tmp_path.iterdir()} == {
+        *("grid.csv", "grid.png", "report.md", "response.csv", "summary.json"),
+    }
+
+
 def test_tables(tmp_path):
     rows = [{"hat": "red", "speed": 0.12345}, {"hat": "blue", "speed": 2.0}]
     assert markdown_table(rows, {"hat": "", "speed": ".2f"}).splitlines()[2] == "| red | 0.12 |"
@@ -153,7 +189,7 @@ def test_tables(tmp_path):
 
 
 def test_an_unknown_domain_is_refused_with_the_known_ones():
-    with pytest.raises(ValueError, match=r"unknown domain 'chess': expected one of \['combat', 'humanoid', 'racing_"):
+    with pytest.raises(ValueError, match=r"unknown domain 'chess': expected one of \['combat', 'humanoid', .*'racing_"):
         load_domain("chess")
 
 

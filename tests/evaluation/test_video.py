@@ -2,17 +2,20 @@
 
 import warnings
 from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from coachable.domain import load_domain
 from coachable.domains.humanoid import humanoid_style_space
 from coachable.evaluation import video
-from coachable.evaluation.video import asked_line, default_tour, render, write_video
+from coachable.evaluation.video import CAPTION, asked_line, caption, default_tour, render, tiled, write_video
 from coachable.styles import StyleRangeWarning, StyleSpace, Weight
-from coachable.training.weights import load_policy
+from coachable.training.weights import domain_of, load_policy
 
 
 def frames(count=8):
@@ -38,6 +41,57 @@ def test_gif_keeps_the_duration(tmp_path):
     with Image.open(tmp_path / "film.gif") as image:
         assert image.n_frames == 4  # 20 a second
         assert image.info["duration"] == 50
+
+
+def test_webp_keeps_the_duration(tmp_path):
+    write_video(frames(), tmp_path / "film.webp", fps=40)
+    with Image.open(tmp_path / "film.webp") as image:
+        assert image.n_frames == 4 and image.size == (64, 48)
+        image.load()
+        assert image.info["duration"] == 50
+
+
+@pytest.mark.parametrize(
+    ("suffix", "together", "count", "size"),
+    [
+        (".webp", True, 4, (3 * 160, 2 * 100)),
+        (".gif", True, 4, (3 * 160, 2 * 100)),
+        (".webp", False, 16, (160, 100)),
+        (".png", True, 1, (3 * 160, 2 * 100)),
+    ],
+)
+def test_styles_are_filmed_together_or_in_turn(tmp_path, monkeypatch, suffix, together, count, size):
+    monkeypatch.setattr(video, "domain_of", lambda agent: replace(domain_of(agent), make_renderer=GreyRenderer))
+    styles = [{"step_length": length} for length in (0.3, 0.4, 0.5, 0.6)]
+    settings = {"styles": styles, "seconds_per_style": 0.2, "size": (160, 100), "together": together}
+    out = render("humanoid", tmp_path / f"film{suffix}", progress=False, **settings)
+    with Image.open(out) as image:
+        assert getattr(image, "n_frames", 1) == count and image.size == size
+
+
+def test_tiles_fill_rows_of_three():
+    tiles = [np.full((2, 3, 3), value, dtype=np.uint8) for value in (1, 2, 3, 4)]
+    assert tiled(tiles)[::2, ::3, 0].tolist() == [[1, 2, 3], [4, 0, 0]]
+
+
+def test_long_lines_of_the_caption_are_written_smaller():
+    line, frame = "asked: pose arms in front, step length 0.475", np.zeros((10, 280, 3), dtype=np.uint8)
+    shown = caption(frame, (line, line))
+    assert shown.shape == (10 + CAPTION, 280, 3)
+    background = shown[-1, -1]
+    assert (shown[10:, -3:] == background).all(), "it ends before the edge"
+    assert (shown[10:, 200:] != background).any()
+
+
+def test_a_panel_names_the_requested_quantities_first():
+    domain = load_domain("humanoid")
+    names = ("forward_speed", "pose_held", "step_length", "power")
+    measures = SimpleNamespace(summarise=lambda record, alive: dict.fromkeys(names, torch.tensor([0.5])))
+    recent = [{"power": torch.zeros(1)}]
+    shown = partial(video._measured_line, replace(domain, measures=measures), recent)
+    assert shown(0, ("pose", "step_length")) == "last 2 s: step length 0.50, forward speed 0.50"
+    assert shown(2, ("pose", "step_length")).endswith("; failures 2")
+    assert shown(0) == "last 2 s: forward speed 0.50, pose held 0.50, step length 0.50, power 0.50; failures 0"
 
 
 def test_the_tour_shows_every_pose_with_three_lengths():
@@ -94,6 +148,18 @@ def test_the_film_of_a_request_outside_the_range_says_so(monkeypatch):
     film = video._film(domain, agent.actor, agent.space, [{"step_length": 9.0}], 1, (64, 64), 0, every=1)
     assert len(list(film)) == 1
     assert captions[0][0] == "asked: pose arms in front, step length 0.65 (clamped from 9)"
+
+
+class GreyRenderer:
+    def __init__(self, width, height):
+        self.picture = np.full((height, width, 3), 128, dtype=np.uint8)
+
+    def draw(self, env):
+        self.picture += 16  # an equal frame would be joined with the one before
+        return self.picture.copy()
+
+    def close(self):
+        pass
 
 
 class BlankRenderer:

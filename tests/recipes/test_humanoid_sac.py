@@ -17,7 +17,7 @@ from coachable.envs.humanoid import HumanoidEnv
 from coachable.training import Learner
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
 from coachable.training.train_settings import TrainSettings
-from coachable.training.weights import load_policy
+from coachable.training.weights import domain_of, load_policy
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 RECIPE = REPOSITORY / "recipes" / "humanoid_sac.py"
@@ -197,6 +197,30 @@ def test_a_new_run_starts_from_another_ones_weights(tmp_path):
     first = read_state(find_checkpoint(tmp_path / "first"))
     for name, value in read_state(find_checkpoint(tmp_path / "second"))["actor"].items():
         assert torch.equal(value, first["actor"][name]), name
+
+
+def test_the_family_of_gaits_trains_with_a_domain_of_its_own(tmp_path):
+    assert _compose()["domain"] == "humanoid" and _compose("family=gait")["domain"] == "humanoid_gait"
+    train = _run(tmp_path / "run", "family=gait", "impersonation.n=1", "train.total_frames=24")
+    assert train.learner.updates == 2
+    agent = load_policy(tmp_path / "run")
+    assert agent.space.names == ("pose", "step_length", "speed")
+    env = domain_of(agent).make_env(num_envs=1, num_threads=1)
+    assert env.styled_speed and env.gait.step_max == 2.0
+    with pytest.raises(SystemExit, match="family cannot change in a resumed run"):
+        _compose(f"resume={tmp_path / 'run'}", "family=steps")
+    _resume(tmp_path / "run", "train.total_frames=32")
+    with pytest.raises(ValueError, match="unknown family 'run': expected steps or gait"):
+        _run(tmp_path / "other", "family=run")
+
+
+def test_a_checkpoint_that_names_no_family_is_of_the_default_one(tmp_path):
+    import humanoid_sac
+
+    config = _compose(*TINY, f"run_dir={tmp_path}", "train.total_frames=8")
+    del config["family"]
+    humanoid_sac.build(config).run()
+    assert load_policy(tmp_path).space.names == ("pose", "step_length")
 
 
 def test_the_command_line_from_another_folder(tmp_path):

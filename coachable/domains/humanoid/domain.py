@@ -23,6 +23,8 @@ DOMAIN = Domain(
     grid={"pose": POSES, "step_length": (0.30, 0.35, 0.40, 0.45, 0.50, 0.55, 0.60, 0.65)},
     control_step=CONTROL_STEP,
     episode_steps=EPISODE_STEPS,
+    trials={f"pushes of {force:g} N": {"push_force": force, "regular_pushes": True} for force in (100.0, 150.0)},
+    targets={"clearance": 0.15, "knee_asymmetry": 10.0, "strike_force": 3.0, "drift": 0.5, "power": 680.0},
     columns={
         "survived": ".0%",
         "forward_speed": ".2f",

@@ -13,6 +13,7 @@ from coachable.domains.humanoid.styles import POSES, pose_bounds_deg
 from coachable.envs.humanoid.features import (
     CLEARANCE,
     COMPLETED,
+    DURATION,
     FOOT,
     FORCE,
     LENGTH,
@@ -27,6 +28,7 @@ from coachable.keys import STYLE, STYLE_FEATURES
 
 POSE_TOLERANCE_DEG = 10.0
 LENGTH_TOLERANCE = 0.06  # [m], a step this close to the request complies
+SPEED_TOLERANCE = 0.15  # [m/s], a step whose speed is this close to the request complies
 _DRIFT_SECONDS = 15.0
 _FORWARD_SPEED = sum(width for _, width, _ in OBSERVATION_GROUPS[:4])  # first of `com_velocity`
 
@@ -94,3 +96,19 @@ class HumanoidMeasures:
     def judged(self, record: Mapping[str, Tensor]) -> Tensor:
         """(T, N) bool: a foot struck."""
         return ~torch.isnan(record["step_length"])
+
+
+class GaitMeasures(HumanoidMeasures):
+    """Measures of a humanoid whose style sets the speed: also the speed, and its error at each strike [m/s]."""
+
+    def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
+        """See `StyleMeasures.step`. The error is that of the step's length over its duration."""
+        found = super().step(transition)
+        requested = transition.get(STYLE)[:, len(POSES) + 1]
+        duration = transition.get(("next", STYLE_FEATURES))[:, DURATION]
+        error = (found["step_length"] / duration - requested).abs()
+        return {"speed": found.pop("forward_speed"), "speed_error": error, **found}
+
+    def complies(self, record: Mapping[str, Tensor]) -> Tensor:
+        """See `StyleMeasures.complies`: also at the requested speed."""
+        return super().complies(record) & (record["speed_error"] < SPEED_TOLERANCE)

@@ -7,7 +7,7 @@ otherwise (shoulders, ankle_x).
 
 from __future__ import annotations
 
-from coachable.envs.humanoid.features import NUM_ARM_JOINTS, STYLE_FEATURES_SIZE
+from coachable.envs.humanoid.features import NUM_ARM_JOINTS, STYLE_FEATURES_SIZE, STYLED_SPEED_SIZE
 from coachable.envs.humanoid.observation import OBSERVATION_GROUPS
 from coachable.transforms.mirror import MirrorMap
 
@@ -59,14 +59,20 @@ def _map(parts: tuple[list[int], list[int]]) -> MirrorMap:
 OBSERVATION = _map(_join(*(_GROUPS[name] for name, _, _ in OBSERVATION_GROUPS)))
 # The motors' order: abdomen y, z, x; per leg hip x, z, y, knee, ankle x, y; per arm shoulder 1, 2, elbow.
 ACTION = _map(_join(_keep((1, -1, -1)), _swap((1, 1, 1, 1, -1, 1)), _swap(_ARM)))
-STYLE_FEATURES = _map(_join(_swap(_ARM), _keep((1,) * (STYLE_FEATURES_SIZE - NUM_ARM_JOINTS))))
+STYLE_FEATURES, STYLED_SPEED_FEATURES = (
+    _map(_join(_swap(_ARM), _keep((1,) * (size - NUM_ARM_JOINTS)))) for size in (STYLE_FEATURES_SIZE, STYLED_SPEED_SIZE)
+)
 
 
-def humanoid_mirror_maps() -> dict[str | tuple[str, ...], MirrorMap]:
-    """Return the mirror maps of a stored transition by key, for `MirrorSymmetry`."""
+def humanoid_mirror_maps(styled_speed: bool = False) -> dict[str | tuple[str, ...], MirrorMap]:
+    """Return the mirror maps of a stored transition by key, for `MirrorSymmetry`.
+
+    Args:
+        styled_speed: Option of the `HumanoidEnv`.
+    """
     return {
         "observation": OBSERVATION,
         "action": ACTION,
         ("next", "observation"): OBSERVATION,
-        ("next", "style_features"): STYLE_FEATURES,
+        ("next", "style_features"): STYLED_SPEED_FEATURES if styled_speed else STYLE_FEATURES,
     }

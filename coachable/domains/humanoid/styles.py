@@ -1,4 +1,4 @@
-"""Style space of the humanoid, with three arm poses and a step length, and the reward terms of its styles."""
+"""Style spaces of the humanoid and the reward terms of its styles: arm pose, step length, and walking speed."""
 
 from __future__ import annotations
 
@@ -10,19 +10,23 @@ import torch
 from torch import Tensor
 
 from coachable.envs.humanoid.features import (
+    BEARING,
     COMPLETED,
     DURATION,
     KNEE_MAX,
     KNEE_MIN,
     LENGTH,
     NUM_ARM_JOINTS,
+    SPEED,
     STRIDE_FRACTION,
     TIMED_OUT,
 )
 from coachable.envs.humanoid.model import CONTROL_STEP
-from coachable.styles import Choice, ChoiceTolerance, Setpoint, StyleReward, StyleSpace, Term, tolerance
+from coachable.envs.humanoid.rewards import WALK_SPEED
+from coachable.styles import Choice, ChoiceTolerance, Setpoint, StyleReward, StyleSpace, StyleTerm, Term, tolerance
 
 STEP_LENGTH_RANGE = (0.30, 0.65)  # [m]
+SPEED_RANGE = (0.4, 1.4)  # [m/s]
 
 # Joint bounds of each pose [deg]: right shoulder1, shoulder2, elbow. The left arm mirrors the shoulder joints' signs.
 # Centres: the reach of the hand in the pose's direction, maximised within the joint limits; the elbow nearly straight.
@@ -37,6 +41,9 @@ LENGTH_MARGIN = 0.05  # [m] (paper)
 _NEAR_MARGIN, _FAR_MARGIN = 0.25, 0.5  # [m], margins of the gait's guide
 STRIDE_FRACTION_BOUNDS = (1 / 3, 2 / 3)
 _STRIDE_FRACTION_MARGIN = 1 / 6
+SPEED_MARGIN = 0.2  # [m/s]
+SPEED_SLACK = (WALK_SPEED[1] - WALK_SPEED[0]) / 2  # [m/s] to either side of the request that costs nothing
+_MOST_SPEED = 2.0  # [m/s], difference from the request beyond which the guide does not fall further
 KNEE_RANGE_DEG = (-145.0, 0.0)
 _KNEE_MARGIN_DEG = 30.0
 
@@ -69,6 +76,13 @@ def humanoid_style_space() -> StyleSpace:
     )
 
 
+def gait_style_space() -> StyleSpace:
+    """Return the space of arm pose, step length and walking speed, which are drawn independently at a reset."""
+    low, high = SPEED_RANGE
+    speed = Setpoint("speed", low, high, unit="m/s", help="speed of walking", encoding="range")
+    return StyleSpace([*humanoid_style_space().parameters, speed], name="humanoid_gait")
+
+
 def humanoid_style_reward(
     space: StyleSpace,
     *,
@@ -77,6 +91,8 @@ def humanoid_style_reward(
     gait_scale: float = 1.0,
     gait_guide_scale: float = 1.5,
     timeout_penalty: float = 0.1,
+    speed_scale: float = 1.0,
+    speed_guide_scale: float = 1.0,
 ) -> StyleReward:
     """Return the style reward lambda_pose * r_pose + lambda_gait * r_gait (Appendix C, DMC Humanoid) with two guides.
 
@@ -84,13 +100,20 @@ def humanoid_style_reward(
     improvement earns almost nothing. The guides reward the same quantities over their whole range. With guide scales of
     0 the reward is the paper's.
 
+    A space with a speed adds two terms, which the paper does not have. `speed` is the closeness of the speed of each
+    step, its length over its duration, to the request. `speed_guide` is the loss of `move_reward` for walking at
+    another speed than the requested one: with a request of 1.1 m/s, `bearing_reward + speed_guide` equals
+    `move_reward`.
+
     Args:
-        space: Style space of the humanoid.
+        space: Style space of the humanoid, with or without a speed.
         pose_scale: Scale lambda_pose of the pose.
         pose_guide_scale: Scale of the pose's guide.
         gait_scale: Scale lambda_gait of the gait.
         gait_guide_scale: Scale of the gait's guide.
         timeout_penalty: Penalty v_m that r_gait subtracts in every control step in which the step is timed out.
+        speed_scale: Scale of the speed of steps.
+        speed_guide_scale: Scale of the speed's guide.
     """
     bounds = torch.from_numpy(np.deg2rad(pose_bounds_deg()))
 
@@ -116,16 +139,26 @@ def humanoid_style_reward(
         far = (1 - error / _FAR_MARGIN).clamp(min=-1.0)
         return _per_control_step(features, 0.5 * (near + far))
 
-    return StyleReward(
-        space,
-        {
-            "pose": arms(POSE_MARGIN_DEG, "long_tail", 0.1),
-            "pose_guide": arms(_POSE_GUIDE_MARGIN_DEG, "linear", 0.0),
-            "gait": Term(gait, parameters=("step_length",)),
-            "gait_guide": Term(gait_guide, parameters=("step_length",)),
-        },
-        scales={"pose": pose_scale, "pose_guide": pose_guide_scale, "gait": gait_scale, "gait_guide": gait_guide_scale},
-    )
+    def speed(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
+        stepped = features[..., LENGTH] / features[..., DURATION].clamp(min=CONTROL_STEP)
+        score = tolerance(stepped, style["speed"], style["speed"], SPEED_MARGIN, "long_tail")
+        return _per_control_step(features, score)
+
+    def speed_guide(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
+        difference = (features[..., SPEED] - style["speed"]).abs()
+        return -features[..., BEARING] * (difference - SPEED_SLACK).clamp(min=0.0, max=_MOST_SPEED)
+
+    terms: dict[str, StyleTerm] = {
+        "pose": arms(POSE_MARGIN_DEG, "long_tail", 0.1),
+        "pose_guide": arms(_POSE_GUIDE_MARGIN_DEG, "linear", 0.0),
+        "gait": Term(gait, parameters=("step_length",)),
+        "gait_guide": Term(gait_guide, parameters=("step_length",)),
+    }
+    scales = {"pose": pose_scale, "pose_guide": pose_guide_scale, "gait": gait_scale, "gait_guide": gait_guide_scale}
+    if "speed" in space:
+        terms |= {name: Term(term, ("speed",)) for name, term in (("speed", speed), ("speed_guide", speed_guide))}
+        scales |= {"speed": speed_scale, "speed_guide": speed_guide_scale}
+    return StyleReward(space, terms, scales=scales)
 
 
 def _per_control_step(features: Tensor, score: Tensor) -> Tensor:

@@ -12,7 +12,14 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from coachable.envs.humanoid.features import STYLE_FEATURES_SIZE, WALK, WALK_SIZE, pack_style_features, pack_walk
+from coachable.envs.humanoid.features import (
+    STYLE_FEATURES_SIZE,
+    STYLED_SPEED_SIZE,
+    WALK,
+    WALK_SIZE,
+    pack_style_features,
+    pack_walk,
+)
 from coachable.envs.humanoid.gait import GaitTracker
 from coachable.envs.humanoid.model import CONTROL_STEP, NUM_ACTIONS, NUM_POSITIONS
 from coachable.envs.humanoid.observation import (
@@ -23,7 +30,7 @@ from coachable.envs.humanoid.observation import (
     rotate_to_course,
     suite_observation,
 )
-from coachable.envs.humanoid.rewards import COSTS, move_reward, walk_costs
+from coachable.envs.humanoid.rewards import COSTS, bearing_reward, move_reward, walk_costs
 from coachable.envs.humanoid.simulation import HumanoidSimulation, Kinematics
 from coachable.finite import require_finite_action
 from coachable.keys import STYLE_FEATURES, TASK_REWARD
@@ -54,8 +61,11 @@ class HumanoidEnv(EnvBase):
         costs: weights of `walk_costs`, which are taken off the task reward; none by default, as in the paper.
         push_force: largest force of random pushes of the torso [N], in any horizontal direction for 0.2 s; 0 for none.
         push_interval: mean time between pushes [s].
+        regular_pushes: whether every push has the largest force and comes exactly `push_interval` after the last one.
+        styled_speed: whether the style sets the speed. The task reward is then `bearing_reward`, and the style features
+            have the forward speed and the bearing, too.
 
-    Keys written: `observation` (N, 82) float32, `task_reward` (N, 1), `style_features` (N, 13), `walk` (N, 7),
+    Keys written: `observation` (N, 82) float32, `task_reward` (N, 1), `style_features` (N, 13 or 15), `walk` (N, 7),
     `done`, `terminated`, `truncated` (N, 1).
 
     Example:
@@ -75,6 +85,8 @@ class HumanoidEnv(EnvBase):
         costs: Mapping[str, float] | None = None,
         push_force: float = 0.0,
         push_interval: float = 2.0,
+        regular_pushes: bool = False,
+        styled_speed: bool = False,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
@@ -98,9 +110,11 @@ class HumanoidEnv(EnvBase):
         self.course = np.zeros(num_envs)
         self.steps = np.zeros(num_envs, dtype=np.int64)
         self.costs = {name: weight for name, weight in (costs or {}).items() if weight}
-        self.push_force, self._push_chance = push_force, CONTROL_STEP / push_interval
+        self.push_force, self.push_interval, self.regular_pushes = push_force, push_interval, regular_pushes
         self.push = np.zeros((num_envs, 3))
         self._push_left = np.zeros(num_envs, dtype=np.int64)
+        self.styled_speed = styled_speed
+        self._features_size = STYLED_SPEED_SIZE if styled_speed else STYLE_FEATURES_SIZE
         self.divergences = 0
         self._observation = np.zeros((num_envs, OBSERVATION_SIZE), dtype=np.float32)
         self._postures = self._find_postures()
@@ -127,7 +141,7 @@ class HumanoidEnv(EnvBase):
             {
                 "observation": Unbounded(shape=rows(OBSERVATION_SIZE), dtype=torch.float32),
                 TASK_REWARD: Unbounded(shape=rows(1), dtype=torch.float32),
-                STYLE_FEATURES: Unbounded(shape=rows(STYLE_FEATURES_SIZE), dtype=torch.float32),
+                STYLE_FEATURES: Unbounded(shape=rows(self._features_size), dtype=torch.float32),
                 WALK: Unbounded(shape=rows(WALK_SIZE), dtype=torch.float32),
             },
             shape=self.batch_size,
@@ -153,7 +167,7 @@ class HumanoidEnv(EnvBase):
             {
                 "observation": torch.from_numpy(self._observation.copy()),
                 TASK_REWARD: zero,
-                STYLE_FEATURES: torch.zeros(self.num_envs, STYLE_FEATURES_SIZE),
+                STYLE_FEATURES: torch.zeros(self.num_envs, self._features_size),
                 WALK: torch.zeros(self.num_envs, WALK_SIZE),
                 "done": done,
                 "terminated": done.clone(),
@@ -175,7 +189,12 @@ class HumanoidEnv(EnvBase):
         forward_speed = rotate_to_course(kinematics.com_velocity, self.course)[:, 0]
         upright = kinematics.torso_axes[:, 2, 2]
         facing = cosine_to_course(kinematics.pelvis_quaternion, self.course)
-        task_reward = move_reward(forward_speed, kinematics.head_height, upright, facing, controls)
+        further: tuple[np.ndarray, ...] = ()
+        if self.styled_speed:
+            task_reward = bearing_reward(kinematics.head_height, upright, facing, controls)
+            further = (forward_speed, task_reward)
+        else:
+            task_reward = move_reward(forward_speed, kinematics.head_height, upright, facing, controls)
         if self.costs:
             costs = walk_costs(power, forces, kinematics.foot_clearance, report)
             task_reward = task_reward - sum(weight * costs[name] for name, weight in self.costs.items())
@@ -189,7 +208,7 @@ class HumanoidEnv(EnvBase):
                 "observation": torch.from_numpy(self._observation.copy()),
                 TASK_REWARD: reward,
                 "reward": reward.clone(),
-                STYLE_FEATURES: torch.from_numpy(pack_style_features(arms, report)),
+                STYLE_FEATURES: torch.from_numpy(pack_style_features(arms, report, *further)),
                 WALK: torch.from_numpy(pack_walk(power, report)),
                 "done": terminated | truncated,
                 "terminated": terminated,
@@ -258,10 +277,13 @@ class HumanoidEnv(EnvBase):
         self._observation[rows] = self._observe(kinematics, rows)
 
     def _pushes(self) -> np.ndarray:
-        """Return the force on each torso in this control step (N, 3) [N]; random pushes begin as they come."""
+        """Return the force on each torso in this control step (N, 3) [N], and begin the pushes that are due."""
         if self.push_force:
-            begins = (self._random.random(self.num_envs) < self._push_chance) & (self._push_left == 0)
+            begins = (self._random.random(self.num_envs) < CONTROL_STEP / self.push_interval) & (self._push_left == 0)
             size = self._random.uniform(0.0, self.push_force, self.num_envs)
+            if self.regular_pushes:
+                begins = (self.steps > 0) & (self.steps % max(1, round(self.push_interval / CONTROL_STEP)) == 0)
+                size = np.full(self.num_envs, self.push_force)
             angle = self._random.uniform(-np.pi, np.pi, self.num_envs)
             force = np.stack([size * np.cos(angle), size * np.sin(angle), np.zeros(self.num_envs)], axis=1)
             self.push_torso(np.where(begins[:, None], force, 0.0))

@@ -10,6 +10,9 @@ from coachable.envs.humanoid.gait import StepReport
 NUM_ARM_JOINTS = 6
 COMPLETED, LENGTH, DURATION, STRIDE_FRACTION, KNEE_MIN, KNEE_MAX, TIMED_OUT = range(NUM_ARM_JOINTS, NUM_ARM_JOINTS + 7)
 STYLE_FEATURES_SIZE = TIMED_OUT + 1
+# Two more where the style sets the speed, see `HumanoidEnv.styled_speed`.
+SPEED, BEARING = STYLE_FEATURES_SIZE, STYLE_FEATURES_SIZE + 1
+STYLED_SPEED_SIZE = BEARING + 1
 
 WALK = "walk"
 """Key of what is measured of the walk besides, see `pack_walk`; style rewards do not read it."""
@@ -17,15 +20,16 @@ POWER, FORCE, CLEARANCE, PITCH, DRIFT, SWING_KNEE, FOOT = range(7)
 WALK_SIZE = FOOT + 1
 
 
-def pack_style_features(arms: np.ndarray, report: StepReport) -> np.ndarray:
-    """Pack the raw quantities of both style terms, which do not depend on theta.
+def pack_style_features(arms: np.ndarray, report: StepReport, *further: np.ndarray) -> np.ndarray:
+    """Pack the raw quantities of the style terms, which do not depend on theta.
 
     Args:
         arms: (N, 6) arm joint angles [rad].
         report: what the gait did in this control step.
+        *further: (N,) forward speed [m/s] and bearing where the style sets the speed, otherwise nothing.
 
     Returns:
-        (N, 13) float32 in the layout above.
+        (N, 13) or (N, 15) float32 in the layout above.
     """
     step = (
         report.completed,
@@ -36,7 +40,7 @@ def pack_style_features(arms: np.ndarray, report: StepReport) -> np.ndarray:
         report.knee_max,
         report.timed_out,
     )
-    return np.concatenate([arms, np.stack(step, axis=1)], axis=1).astype(np.float32)
+    return np.concatenate([arms, np.stack((*step, *further), axis=1)], axis=1).astype(np.float32)
 
 
 def pack_walk(power: np.ndarray, report: StepReport) -> np.ndarray:

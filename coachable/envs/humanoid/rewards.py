@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from dm_control.utils.rewards import tolerance
 
@@ -48,13 +50,28 @@ def move_reward(
     """
     slow, fast = WALK_SPEED
     moving = np.maximum(1 - np.maximum(0, np.maximum(slow - forward_speed, forward_speed - fast)), -1)
+    standing, effortless = _bearing(head_height, upright, facing, controls)
+    return moving * standing * (1 + effortless) / 2
+
+
+def bearing_reward(
+    head_height: np.ndarray, upright: np.ndarray, facing: np.ndarray, controls: np.ndarray
+) -> np.ndarray:
+    """Return the factors of `move_reward` without that of the speed (N,), within [0, 1].
+
+    It is the task reward where the style sets the speed. The arguments are those of `move_reward`.
+    """
+    standing, effortless = _bearing(head_height, upright, facing, controls)
+    return standing * (1 + effortless) / 2
+
+
+def _bearing(head_height: np.ndarray, upright: np.ndarray, facing: np.ndarray, controls: np.ndarray) -> tuple[Any, Any]:
     standing = tolerance(head_height, bounds=(STAND_HEIGHT, np.inf), margin=_STAND_MARGIN)
     for cosine, margin in ((upright, _UPRIGHT_MARGIN), (facing, _FACING_MARGIN)):
         standing = standing * tolerance(
             cosine, bounds=(ALIGNED, np.inf), margin=margin, value_at_margin=0, sigmoid="linear"
         )
-    effortless = np.mean(tolerance(controls, margin=1, value_at_margin=0, sigmoid="quadratic"), axis=1)
-    return moving * standing * (1 + effortless) / 2
+    return standing, np.mean(tolerance(controls, margin=1, value_at_margin=0, sigmoid="quadratic"), axis=1)
 
 
 COSTS = ("power", "impact", "clearance", "toe_strike", "drift")

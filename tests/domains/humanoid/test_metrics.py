@@ -6,12 +6,13 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from coachable.domains.humanoid import humanoid_style_space
-from coachable.domains.humanoid.metrics import HumanoidMeasures
+from coachable.domains.humanoid import gait_style_space, humanoid_style_space
+from coachable.domains.humanoid.metrics import GaitMeasures, HumanoidMeasures
 from coachable.domains.humanoid.styles import POSES, pose_bounds_deg
 from coachable.envs.humanoid.features import (
     CLEARANCE,
     COMPLETED,
+    DURATION,
     FOOT,
     FORCE,
     LENGTH,
@@ -115,3 +116,17 @@ def test_walking_is_judged_by_footsteps():
     measures = HumanoidMeasures()
     assert measures.judged(record)[:, 0].tolist() == [False, True, True, True]
     assert measures.complies(record)[:, 0].tolist() == [False, True, False, False]
+
+
+@pytest.mark.parametrize(("asked", "complies"), [(1.0, True), (1.14, True), (1.16, False), (0.84, False)])
+def test_the_speed_of_a_step_is_compared_with_the_request(asked, complies):
+    walked = transition(pose="arms_in_front", asked=0.5, length=0.5, speed=0.9)
+    walked["next", STYLE_FEATURES][0, DURATION] = 0.5  # [s]
+    walked[STYLE] = gait_style_space().make(step_length=0.5, speed=asked)[None]
+    measures = GaitMeasures()
+    row = measures.step(walked)
+    assert row["speed"].item() == pytest.approx(0.9) and "forward_speed" not in row
+    assert row["speed_error"].item() == pytest.approx(abs(asked - 1.0), abs=1e-6)
+    assert measures.complies(row).item() is complies
+    walked["next", STYLE_FEATURES][0, COMPLETED] = 0.0
+    assert math.isnan(measures.step(walked)["speed_error"])

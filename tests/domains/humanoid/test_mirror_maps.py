@@ -5,7 +5,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from coachable.domains.humanoid.mirror_maps import ACTION, OBSERVATION, STYLE_FEATURES, humanoid_mirror_maps
+from coachable.domains.humanoid.mirror_maps import ACTION, OBSERVATION, humanoid_mirror_maps
 from coachable.envs.humanoid import HumanoidEnv
 from coachable.envs.humanoid.model import NUM_POSITIONS
 from coachable.transforms.mirror import MirrorMap, MirrorSymmetry
@@ -30,8 +30,10 @@ def mirror_state(state):
     return mirrored
 
 
-def test_a_mirrored_walker_stays_the_mirror_image():
-    env = HumanoidEnv(num_envs=2, seed=4, num_threads=1)
+@pytest.mark.parametrize("styled_speed", [False, True])
+def test_a_mirrored_walker_stays_the_mirror_image(styled_speed):
+    env = HumanoidEnv(num_envs=2, seed=4, num_threads=1, styled_speed=styled_speed)
+    feature_map = humanoid_mirror_maps(styled_speed)["next", "style_features"]
     env.reset()
     simulation = env.simulation
     simulation.velocities[0] = np.random.default_rng(0).uniform(-0.5, 0.5, 27)
@@ -46,7 +48,7 @@ def test_a_mirrored_walker_stays_the_mirror_image():
         after = env.step(TensorDict({"action": torch.stack([action, image(ACTION, action)])}, [2]))["next"]
         observation, features = after["observation"], after["style_features"]
         torch.testing.assert_close(image(OBSERVATION, observation[0]), observation[1], atol=2e-4, rtol=0)
-        torch.testing.assert_close(image(STYLE_FEATURES, features[0]), features[1], atol=2e-4, rtol=0)
+        torch.testing.assert_close(image(feature_map, features[0]), features[1], atol=2e-4, rtol=0)
         torch.testing.assert_close(after["task_reward"][0], after["task_reward"][1], atol=1e-4, rtol=0)
         strikes += int(features[0, 6])
     assert strikes > 0  # the gait took part

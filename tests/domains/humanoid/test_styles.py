@@ -7,19 +7,24 @@ import numpy as np
 import pytest
 import torch
 
-from coachable.domains.humanoid import humanoid_style_reward, humanoid_style_space
+from coachable.domains.humanoid import gait_style_space, humanoid_style_reward, humanoid_style_space
+from coachable.domains.humanoid.families import humanoid_family
 from coachable.domains.humanoid.styles import POSES, pose_bounds_deg
 from coachable.envs.humanoid.features import (
+    BEARING,
     COMPLETED,
     DURATION,
     KNEE_MAX,
     KNEE_MIN,
     LENGTH,
+    SPEED,
     STRIDE_FRACTION,
     STYLE_FEATURES_SIZE,
+    STYLED_SPEED_SIZE,
     TIMED_OUT,
 )
 from coachable.envs.humanoid.model import CONTROL_STEP, NUM_POSITIONS
+from coachable.envs.humanoid.rewards import move_reward
 from coachable.envs.humanoid.simulation import HumanoidSimulation
 
 SPACE = humanoid_style_space()
@@ -148,3 +153,63 @@ def test_reward_sums_the_scaled_terms_and_is_the_papers_without_guides():
     assert reward(a_step(0.5), theta).item() == pytest.approx(0.5 + 3.0 + 2.0 * 20.0 + 0.1 * 20.0)
     paper = humanoid_style_reward(SPACE, pose_guide_scale=0.0, gait_guide_scale=0.0)
     assert paper(a_step(0.45), theta).item() == pytest.approx(1.0 + 20 * 0.1, rel=1e-5)
+
+
+GAIT_SPACE = gait_style_space()
+
+
+def speed_terms(asked, values):
+    row = torch.zeros(1, STYLED_SPEED_SIZE)
+    for index, value in values.items():
+        row[0, index] = value
+    theta = GAIT_SPACE.make(speed=asked)[None]
+    paid = humanoid_style_reward(GAIT_SPACE).terms_of(row, theta)
+    return {name: paid[name].item() for name in ("speed", "speed_guide")}
+
+
+def test_the_gait_has_a_speed_beside_pose_and_step_length():
+    assert GAIT_SPACE.names == ("pose", "step_length", "speed")
+    assert (GAIT_SPACE["speed"].low, GAIT_SPACE["speed"].high) == (0.4, 1.4)
+    torch.testing.assert_close(GAIT_SPACE.encode(GAIT_SPACE.make(speed=1.4))[-1], torch.tensor(1.0))
+    longest = GAIT_SPACE["step_length"].high / GAIT_SPACE["speed"].low  # [s]
+    assert humanoid_family("gait").options["step_max"] > longest, "the slowest step that may be asked for is in time"
+    with pytest.raises(ValueError, match="unknown family 'run': expected steps or gait"):
+        humanoid_family("run")
+
+
+@pytest.mark.parametrize(("asked", "closeness"), [(0.8, 1.0), (1.0, 0.1), (0.6, 0.1)])
+def test_the_speed_of_a_step_is_paid_for_the_control_steps_it_took(asked, closeness):
+    step = {COMPLETED: 1, LENGTH: 0.4, DURATION: 0.5}  # 0.8 m/s
+    assert speed_terms(asked, step)["speed"] == pytest.approx(20 * closeness, rel=1e-4)
+    assert speed_terms(asked, {LENGTH: 0.0})["speed"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("speed", "expected"), [(0.6, 0.0), (0.7, 0.0), (0.5, 0.0), (0.9, -0.2), (0.0, -0.5), (-9.0, -2.0), (9.0, -2.0)]
+)
+def test_the_guide_costs_what_the_speed_is_off_by_more_than_a_tenth(speed, expected):
+    assert speed_terms(0.6, {SPEED: speed, BEARING: 1.0})["speed_guide"] == pytest.approx(expected, abs=1e-6)
+    assert speed_terms(0.6, {SPEED: speed, BEARING: 0.5})["speed_guide"] == pytest.approx(expected / 2, abs=1e-6)
+
+
+@pytest.mark.parametrize("speed", [-2.0, -0.5, 0.0, 0.7, 1.0, 1.1, 1.2, 1.9])
+def test_bearing_and_guide_are_the_movement_reward_at_its_own_speed(speed):
+    values = [np.array([value]) for value in (speed, 1.5, 1.0, 1.0)]
+    paid = speed_terms(1.1, {SPEED: speed, BEARING: 1.0})["speed_guide"]
+    assert 1.0 + paid == pytest.approx(move_reward(*values, np.zeros((1, 21)))[0], abs=1e-6)
+
+
+def test_the_best_speed_is_the_requested_one():
+    speeds = np.linspace(0.2, 1.6, 57)
+    for asked in (0.4, 0.8, 1.4):
+        paid = [
+            sum(speed_terms(asked, {SPEED: v, BEARING: 1, COMPLETED: 1, LENGTH: v / 2, DURATION: 0.5}).values())
+            for v in speeds
+        ]
+        assert speeds[np.argmax(paid)] == pytest.approx(asked)
+
+
+def test_a_space_without_a_speed_has_no_terms_for_it():
+    reward = humanoid_style_reward(SPACE, speed_scale=9.0)
+    assert list(reward.terms) == ["pose", "pose_guide", "gait", "gait_guide"]
+    assert list(humanoid_style_reward(GAIT_SPACE).terms) == [*reward.terms, "speed", "speed_guide"]

@@ -6,10 +6,11 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-from coachable.domains.humanoid import humanoid_style_reward, humanoid_style_space
+from coachable.domains.humanoid import gait_style_space, humanoid_style_reward, humanoid_style_space
 from coachable.envs.humanoid import HumanoidEnv
+from coachable.envs.humanoid.features import BEARING, SPEED
 from coachable.envs.humanoid.observation import OBSERVATION_GROUPS, suite_observation
-from coachable.transforms import coachable_env
+from coachable.transforms import TaskImpersonation, coachable_env
 
 
 def make_env(num_envs=3, seed=0, **options):
@@ -30,8 +31,9 @@ def roll(env, sequence):
     return torch.stack(seen)
 
 
-def test_specs_hold():
-    check_env_specs(make_env(), seed=0)
+@pytest.mark.parametrize("styled_speed", [False, True])
+def test_specs_hold(styled_speed):
+    check_env_specs(make_env(styled_speed=styled_speed), seed=0)
 
 
 def test_observations_are_finite_and_none_is_constant():
@@ -217,6 +219,34 @@ def test_reward_is_task_plus_style_under_the_style_that_the_policy_saw():
     assert torch.equal(data["next", "reward"], expected)
 
 
+def test_a_styled_speed_changes_the_task_reward_and_adds_two_features():
+    plain, styled = make_env(), make_env(styled_speed=True, costs={"power": 0.5})
+    first, second = plain.reset(), styled.reset()
+    for action in actions(plain, 5):
+        first = plain.step(first.set("action", action))["next"]
+        second = styled.step(second.set("action", action))["next"]
+        assert torch.equal(first["observation"], second["observation"])
+        features = second["style_features"]
+        assert features.shape == (3, 15) and torch.equal(first["style_features"], features[:, :13])
+        speed = second["observation"][:, 37]  # along the course
+        torch.testing.assert_close(features[:, SPEED], speed)
+        moving = (1 - (1 - speed).clamp(min=0)).clamp(min=-1)  # none is faster than 1.2 m/s
+        torch.testing.assert_close(first["task_reward"][:, 0], moving * features[:, BEARING])
+        cost = 0.5 * torch.from_numpy(styled.simulation.power()).clamp(max=3000).float() / 1000
+        torch.testing.assert_close(second["task_reward"][:, 0], features[:, BEARING] - cost)
+
+
+def test_another_speed_is_relabelled_without_the_simulator():
+    space = gait_style_space()
+    reward = humanoid_style_reward(space)
+    env = coachable_env(make_env(num_envs=5, styled_speed=True), space, reward, seed=0)
+    data = env.rollout(40, break_when_any_done=False).reshape(-1)
+    relabelled = TaskImpersonation(reward, n=2)(data)
+    assert torch.equal(relabelled["next", "reward"][:, 0], data["next", "reward"])
+    expected = data["next", "task_reward"] + reward(data["next", "style_features"], relabelled["style"][:, 2])
+    assert torch.equal(relabelled["next", "reward"][:, 2], expected)
+
+
 def test_only_speeds_of_joints_are_scaled():
     """The suite's 67 numbers, of which the last 27 are speeds in tenths, the pelvis and the gait."""
     env = make_env(num_envs=2)
@@ -304,6 +334,20 @@ def test_random_pushes_come_as_often_and_as_hard_as_asked():
     begins = ((sizes[1:] > 0) & (sizes[:-1] != sizes[1:])).sum()
     assert begins / 200 == pytest.approx(10 / (0.5 + 0.2), rel=0.05)  # none begins while one lasts
     assert np.abs(forces.mean(axis=(0, 1))).max() < 2.0  # from every side
+
+
+def test_regular_pushes_have_the_full_force_at_equal_intervals():
+    env = make_env(num_envs=50, push_force=100.0, push_interval=0.5, regular_pushes=True)
+    env.reset()
+    forces = []
+    for _ in range(60):  # 1.5 s
+        forces.append(env._pushes())
+        env.steps += 1
+    sizes = np.linalg.norm(forces, axis=-1)
+    pushed = (np.arange(60) % 20 < 8) & (np.arange(60) >= 20)  # each for 0.2 s, the first after 0.5 s
+    np.testing.assert_allclose(sizes, np.where(pushed, 100.0, 0.0)[:, None].repeat(50, 1))
+    angles = np.arctan2(forces[20][:, 1], forces[20][:, 0])
+    assert angles.std() > 1.0  # from every side
 
 
 def test_pushes_continue_exactly_from_a_saved_state():

@@ -6,7 +6,7 @@ import pytest
 from coachable.envs.humanoid.gait import StepReport
 from coachable.envs.humanoid.model import CONTROL_STEP
 from coachable.envs.humanoid.observation import cosine_to_course
-from coachable.envs.humanoid.rewards import COSTS, move_reward, walk_costs
+from coachable.envs.humanoid.rewards import COSTS, bearing_reward, move_reward, walk_costs
 
 
 def reward(speed=1.0, head=1.5, upright=1.0, facing=1.0, control=0.0):
@@ -34,6 +34,16 @@ def reward(speed=1.0, head=1.5, upright=1.0, facing=1.0, control=0.0):
 )
 def test_each_factor(change, expected):
     assert reward(**change) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    "change", [{}, {"head": 1.2}, {"upright": 0.7}, {"facing": 0.3}, {"facing": -1.0}, {"control": 0.6}]
+)
+def test_the_bearing_is_the_reward_at_the_best_speed(change):
+    given = {"head": 1.5, "upright": 1.0, "facing": 1.0} | change
+    control = given.pop("control", 0.0)
+    values = [np.array([given[name]]) for name in ("head", "upright", "facing")]
+    assert bearing_reward(*values, np.full((1, 21), control))[0] == reward(speed=1.1, **change)
 
 
 def test_facing_is_the_cosine_of_the_heading_relative_to_the_course():
