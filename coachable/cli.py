@@ -91,7 +91,9 @@ def _parser() -> argparse.ArgumentParser:
     curves = command("curves", _curves, "draw learning curves of runs, with intervals over seeds")
     text = "runs by label, such as bf16='runs/bf16_*'"
     curves.add_argument("groups", nargs="+", type=_group, metavar="LABEL=PATTERN", help=text)
-    curves.add_argument("--x", default="updates", help="metric of the horizontal axis (default: %(default)s)")
+    curves.add_argument(
+        "--x", default="updates", help="updates, frames, minutes or another metric (default: %(default)s)"
+    )
     curves.add_argument("--y", default="episode/return", help="metric to draw (default: %(default)s)")
     _add_number(curves, "--smooth", 5, "rows of the moving average")
     _add_out(curves, "curves.png")
@@ -290,7 +292,9 @@ def _group(text: str) -> tuple[str, list[Path]]:
     label, equals, pattern = text.partition("=")
     if not equals:
         raise argparse.ArgumentTypeError(f"{text!r}: expected LABEL=PATTERN")
-    runs = [Path(run) for run in sorted(glob.glob(pattern)) if (Path(run) / "metrics.csv").is_file()]
+    from coachable.evaluation.curves import metrics_files
+
+    runs = [Path(run) for run in sorted(glob.glob(pattern)) if metrics_files(Path(run))]
     if not runs:
         raise argparse.ArgumentTypeError(f"no run with a metrics.csv matches {pattern!r}")
     return label, runs

@@ -20,6 +20,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase, Transform
 from torchrl.objectives import LossModule
 
+from coachable.domain import domain_names, load_domain
 from coachable.keys import STYLE_FEATURES
 from coachable.replay import EventTableBuffer
 from coachable.replay.replay_files import replay_bytes
@@ -208,14 +209,19 @@ def make_collector(run: Run, make_env: Callable[..., EnvBase], actor: nn.Module)
 
 
 def make_evaluation(run: Run, make_env: Callable[..., EnvBase], actor: nn.Module) -> Callable[[], dict[str, float]]:
-    """Return a function that evaluates the actor on the same starts and styles every time."""
+    """Return a function that evaluates the actor on the same starts and styles every time.
+
+    The style is measured where the domain is registered.
+    """
     settings = run.settings
     seed = settings.seed + 10_000
     env = make_env(seed, num_envs=settings.eval.num_envs)
+    known = settings.domain in domain_names()
+    measures = load_domain(settings.domain, run.config).measures if known else None
 
     def evaluate() -> dict[str, float]:
         env.set_seed(seed)
-        return evaluate_policy(env, actor, max_steps=settings.eval.max_steps, device=run.device)
+        return evaluate_policy(env, actor, max_steps=settings.eval.max_steps, measures=measures, device=run.device)
 
     return evaluate
 

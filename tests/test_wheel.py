@@ -25,7 +25,12 @@ def test_the_wheel_holds_everything_that_the_package_reads():
     package = (path for path in (REPOSITORY / "coachable").rglob("*") if path.is_file())
     present = {str(path.relative_to(REPOSITORY)) for path in package if "__pycache__" not in path.parts}
     assert present - shipped == set()
-    assert {"coachable/py.typed", "coachable/fast/kernels.c", "coachable/fast/sac.c", "coachable/envs/racing/cars/gt3.toml"} <= shipped
+    assert {
+        "coachable/py.typed",
+        "coachable/fast/kernels.c",
+        "coachable/fast/sac.c",
+        "coachable/envs/racing/cars/gt3.toml",
+    } <= shipped
     assert {"coachable/envs/combat/data/styles.csv", "coachable/pretrained/humanoid/weights.pt"} <= shipped
     assert all(name.startswith("coachable/") for name in shipped)
     assert set(wheel.metadata.core.license_files) == {"LICENSE", "NOTICE"}

@@ -19,6 +19,8 @@ _POINTS = 100
 def read_metric(run: Path, x: str, y: str) -> tuple[np.ndarray, np.ndarray]:
     """Read two columns of a run's `metrics.csv`, from the rows that have both.
 
+    The stages of a run follow one another: each begins where the one before ended.
+
     Args:
         run: The run's folder.
         x: Column of the horizontal axis.
@@ -30,7 +32,24 @@ def read_metric(run: Path, x: str, y: str) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         ValueError: If the file is damaged, there is no such column, or no row has both values.
     """
-    table = run / "metrics.csv"
+    pairs: list[tuple[float, float]] = []
+    for table in metrics_files(run):
+        start = pairs[-1][0] if pairs else 0.0
+        pairs += [(start + at, value) for at, value in _read(table, x, y)]
+    if not pairs:
+        raise ValueError(f"{run} has no row with both {x!r} and {y!r}")
+    points = np.array(pairs)
+    return points[:, 0], points[:, 1]
+
+
+def metrics_files(run: Path) -> list[Path]:
+    """Return the `metrics.csv` of a run, or of its stages in order; nothing if there is none."""
+    stages = (run / "stages").glob("*_*/metrics.csv")
+    in_order = sorted(stages, key=lambda file: (file.parent.name.index("_"), file.parent.name))  # 10_end after 9_middle
+    return in_order or [file for file in (run / "metrics.csv",) if file.is_file()]
+
+
+def _read(table: Path, x: str, y: str) -> list[tuple[float, float]]:
     try:
         with table.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
@@ -39,17 +58,14 @@ def read_metric(run: Path, x: str, y: str) -> tuple[np.ndarray, np.ndarray]:
     columns = list(rows[0]) if rows else []
     for name in (x, y):
         if name not in columns:
-            raise ValueError(f"{run} has no metric {name!r}: expected one of {columns}")
+            raise ValueError(f"{table.parent} has no metric {name!r}: expected one of {columns}")
     try:
         pairs = [(float(row[x]), float(row[y])) for row in rows if row[x] and row[y]]
     except ValueError as error:
         raise ValueError(f"{table} is damaged: {error} in {x!r} or {y!r}, expected numbers") from error
     if not all(math.isfinite(at) for at, _ in pairs):
         raise ValueError(f"{table} has values of {x!r} that are not finite: choose another x")
-    if not pairs:
-        raise ValueError(f"{run} has no row with both {x!r} and {y!r}")
-    points = np.array(pairs)
-    return points[:, 0], points[:, 1]
+    return pairs
 
 
 def summarise_runs(runs: Sequence[Path], x: str, y: str, smooth: int = 5) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

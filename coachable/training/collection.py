@@ -207,6 +207,7 @@ def evaluate_policy(
     *,
     max_steps: int,
     keys: Iterable[str] = (),
+    measures: Any = None,
     device: torch.device | str = "cpu",
 ) -> dict[str, float]:
     """Run one episode per environment, in the policy's default action mode (`default_interaction_type`).
@@ -216,11 +217,12 @@ def evaluate_policy(
         policy: Writes `action`.
         max_steps: Number of steps after which an episode is cut.
         keys: Entries of `next`, (N, 1) each, whose averages per step are returned as well.
+        measures: Measured style, see `coachable.domain.StyleMeasures`.
         device: Device of the policy.
 
     Returns:
-        `return`, `task_return`, `length`, `survived` (share of episodes that did not terminate) and one `NAME_per_step`
-        for each key, all averaged over the episodes.
+        `return`, `task_return`, `length`, `survived` (share of episodes that did not terminate), one `NAME_per_step`
+        for each key, and the measures by their names, all averaged over the episodes that have a value.
     """
     wanted = dict.fromkeys(["reward", "task_reward", *keys])
     with preserved_rng(), torch.no_grad():
@@ -229,10 +231,14 @@ def evaluate_policy(
         fell = torch.zeros_like(running)
         length = torch.zeros_like(running, dtype=torch.float32)
         sums = {key: torch.zeros_like(length) for key in wanted}
+        measured, alive = [], []
         for _ in range(max_steps):
             acted = policy(td.to(device)).to(env.device)
             stepped, td = env.step_and_maybe_reset(acted)
             after = stepped["next"]
+            if measures is not None:
+                measured.append(measures.step(stepped))
+                alive.append(running.clone())
             length += running
             for key, total in sums.items():
                 value = after.get(key, None)
@@ -250,6 +256,10 @@ def evaluate_policy(
     }
     for key in keys:
         result[f"{key}_per_step"] = (sums[key] / length).mean().item()
+    if measured:
+        record = {name: torch.stack([row[name] for row in measured]) for name in measured[0]}
+        summary = measures.summarise(record, torch.stack(alive))
+        result |= {name: values.nanmean().item() for name, values in summary.items()}
     return result
 
 

@@ -210,7 +210,7 @@ class Trainer:
             metrics = {f"eval/{name}": value for name, value in self.evaluate().items()}
         self._evaluated_frames = self.frames
         self._latest |= metrics
-        self._write({**self._position(), **metrics})
+        self._write({**self._position(), **self._minutes(), **metrics})
 
     def _log_if_due(self) -> None:
         if time.monotonic() - self._logged >= self.settings.log_interval:
@@ -226,7 +226,7 @@ class Trainer:
                 tables = self.replay.statistics()
                 row |= {f"tables/{name}/{key}": tables[name][key] for name in tables for key in ("size", "events")}
             self._latest |= row
-            self._write({**self._position(), **row})
+            self._write({**self._position(), **self._minutes(), **row})
 
     def _write(self, row: Mapping[str, float]) -> None:
         try:
@@ -236,6 +236,10 @@ class Trainer:
 
     def _position(self) -> dict[str, float]:
         return {"frames": self.frames, "updates": self.learner.updates}
+
+    def _minutes(self) -> dict[str, float]:
+        """Return the time of training, without pauses between a stop and its resumption."""
+        return {"minutes": round(sum(self.seconds.values()) / 60, 3)}
 
     def _checkpoint_if_due(self) -> None:
         if time.monotonic() - self._saved >= self.settings.checkpoint_interval:

@@ -38,6 +38,14 @@ def test_the_common_part_of_unequal_runs_is_drawn(tmp_path):
     assert (tmp_path / "curves.png").stat().st_size > 1000
 
 
+def test_stages_follow_one_another(tmp_path):
+    for number, slope in ((10, 3.0), (9, 2.0)):
+        make_run(tmp_path / "run" / "stages" / f"{number}_name", slope, rows=3)
+    at, values = read_metric(tmp_path / "run", "updates", "episode/return")
+    np.testing.assert_allclose(at, [0, 1, 2, 2, 3, 4])
+    np.testing.assert_allclose(values, [0, 2, 4, 0, 3, 6])
+
+
 def test_unknown_and_empty_metrics_are_named(tmp_path):
     run = make_run(tmp_path / "run", 1.0)
     with pytest.raises(ValueError, match=r"no metric 'loss': expected one of \['updates', 'episode/return', 'empty'\]"):
@@ -50,6 +58,9 @@ def test_the_command(tmp_path, capsys):
     make_run(tmp_path / "bf16_0", 1.0)
     assert main(["curves", f"bf16={tmp_path}/bf16_*", "--out", str(tmp_path / "c.png"), "--smooth", "1"]) == 0
     assert "bf16: episode/return 19 at the end" in capsys.readouterr().out
+    make_run(tmp_path / "staged" / "stages" / "1_walk", 2.0)
+    assert main(["curves", f"staged={tmp_path}/staged", "--out", str(tmp_path / "c.png"), "--smooth", "1"]) == 0
+    assert "staged: episode/return 38 at the end" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         main(["curves", f"fp32={tmp_path}/fp32_*"])
     assert "no run with a metrics.csv matches" in capsys.readouterr().err

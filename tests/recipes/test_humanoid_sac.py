@@ -238,6 +238,9 @@ def test_the_command_line_from_another_folder(tmp_path):
     assert int(rows[-1]["frames"]) == 240 and any(row["eval/return"] for row in rows)
     assert [row for row in rows if row["loss/loss_qvalue"] and float(row["loss/loss_qvalue"]) > 0]
     assert [row for row in rows if row["step/style_pose"]]
+    assert all(float(row["minutes"]) > 0 for row in rows[1:])
+    measured = [float(row["eval/pose_held"]) for row in rows if row["eval/return"]]
+    assert measured and all(0 <= share <= 1 for share in measured), "from the first evaluation on"
     policy = load_policy(run)
     assert policy.metadata["frames"] == 240 and policy.space.dim == 4
     last = json.loads(done.stderr.strip().splitlines()[-1])

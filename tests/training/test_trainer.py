@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import math
 import os
 import signal
 import threading
@@ -249,16 +250,34 @@ def test_evaluation_happens_when_due_and_changes_nothing(make_train, make_echo_e
         assert torch.equal(value, dict(_tensors(train.learner.state_dict()))[name]), name
 
 
-def test_evaluation_counts_each_episode_once(make_echo_env):
-    def hold(td):
-        return td.set("action", torch.zeros(4, 1))
+def hold(td):
+    return td.set("action", torch.zeros(4, 1))
 
+
+def test_evaluation_counts_each_episode_once(make_echo_env):
     env = make_echo_env(3)
     env.hold_style(torch.tensor([0.5]))
     result = evaluate_policy(env, hold, max_steps=100, keys=["style_reward"])
     assert result["return"] == pytest.approx(-0.5 * result["length"], rel=1e-5)
     assert result["style_reward_per_step"] == pytest.approx(-0.5, rel=1e-5)
     assert 0 < result["length"] <= 20
+
+
+def test_an_evaluation_measures_the_style_while_episodes_last(make_echo_env):
+    class Measures:
+        def step(self, transition):
+            return {"theta": transition["style"].squeeze(-1), "never": torch.full((4,), torch.nan)}
+
+        def summarise(self, record, alive):
+            means = torch.where(alive, record["theta"], torch.nan).nanmean(0)
+            return {"theta": means, "never": record["never"].mean(0), "steps": alive.sum(0).float()}
+
+    env = make_echo_env(3)
+    env.hold_style(torch.tensor([0.5]))
+    result = evaluate_policy(env, hold, max_steps=100, measures=Measures())
+    assert result["theta"] == 0.5
+    assert math.isnan(result["never"])
+    assert result["steps"] == result["length"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
