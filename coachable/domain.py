@@ -155,7 +155,7 @@ class Domain:
         control_step: Duration of one env step [s]; by default from the environment's attributes, or 1.
         episode_steps: Length of a full episode; by default from the environment's attributes, or 1000.
         columns: Metrics of the published table, in order, with the format of their values; by default all.
-        units: Units of measured quantities by name, for the axes of figures.
+        units: Units of measured quantities by name, for the axes of figures and the page of `coachable coach`.
         observation_groups: Name and width of each block of the observation, in order, for explanations; by default
             every entry is a group of its own.
         controls: Live controls, which are steered while the agent acts.
