@@ -158,7 +158,7 @@ class Domain:
             episodes in the default style that survive.
         targets: Largest value of a metric that is wanted as its median over the styles, by name.
         columns: Metrics of the published table, in order, with the format of their values; by default all.
-        units: Units of measured quantities by name, for the axes of figures.
+        units: Units of measured quantities by name, for the axes of figures and the page of `coachable coach`.
         observation_groups: Name and width of each block of the observation, in order, for explanations; by default
             every entry is a group of its own.
         controls: Live controls, which are steered while the agent acts.

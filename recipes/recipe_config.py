@@ -32,6 +32,7 @@ from coachable.training.checkpoint import find_checkpoint, read_state
 from coachable.training.curriculum import Curriculum
 from coachable.training.hardware import choose_preset, detect, estimate_update_seconds, pick_device
 from coachable.training.trainer import Trainer
+from coachable.training.worker_errors import WorkerError
 
 # Settings that a resumed run must not change, because the checkpoint's weights, replay buffer and generators depend on
 # them.
@@ -94,7 +95,7 @@ def run_recipe(config_name: str, build: Callable[[dict[str, Any]], Trainer]) -> 
             raise SystemExit(f"error: {error}".split("\n\nWorker traceback:\n")[0]) from None
         try:
             train.run()
-        except (NonFiniteError, CheckpointError) as error:
+        except (NonFiniteError, CheckpointError, WorkerError) as error:
             raise SystemExit(f"error: {error}") from None
 
     main()

@@ -8,6 +8,6 @@ def readable(name: Any) -> str:
     return str(name).replace("_", " ")
 
 
-def readable_number(value: float) -> str:
-    """Return a number with three significant digits, or as a whole number from 1000 on."""
-    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+def readable_number(value: float, unit: str = "") -> str:
+    """Return a number with three significant digits, or as a whole number from 1000 on, and its unit."""
+    return f"{value:.3g} {unit}".rstrip() if abs(value) < 1000 else f"{value:.0f} {unit}".rstrip()

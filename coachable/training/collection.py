@@ -19,6 +19,7 @@ from torchrl.envs.utils import ExplorationType
 
 from coachable.training.rng import preserved_rng
 from coachable.training.simulators import ResumableEnv, UnsavableError, load_simulator, save_simulator
+from coachable.training.worker_errors import ReportingCollector
 
 __all__ = [
     "ResumableEnv",
@@ -90,11 +91,15 @@ def make_collector(
         return collector
     if backend in ("process", "ray"):
         factories = [_SeededFactory(make_env, seed + i) for i in range(num_collectors)]
-        common |= plain if backend == "process" else _ray_options(num_collectors, plain)
-        collector = Collector(factories, policy, backend=backend, num_collectors=num_collectors, sync=sync, **common)
-        if backend == "ray":
-            collector.update_policy_weights_(policy)  # RayCollector needs the weights before the first batch
-        return collector
+        receiver, sender = multiprocessing.Pipe(duplex=False)
+        reporting = plain | {"collector_class": ReportingCollector(sender)}
+        common |= reporting if backend == "process" else _ray_options(num_collectors, plain)
+        workers: Any = Collector(factories, policy, backend=backend, num_collectors=num_collectors, sync=sync, **common)
+        if backend == "process":
+            workers.worker_errors = receiver  # read by `check_workers`
+        else:
+            workers.update_policy_weights_(policy)  # RayCollector needs the weights before the first batch
+        return workers
     raise ValueError(f"collector backend must be direct, process or ray, got {backend!r}")
 
 

@@ -30,6 +30,7 @@ from coachable.training.stopping import stop_signals
 from coachable.training.throttle import Throttle
 from coachable.training.train_settings import TrainSettings
 from coachable.training.weights import require_same_agent
+from coachable.training.worker_errors import WorkerError, check_workers, worker_errors
 
 __all__ = ["REPLAY_KEYS", "Trainer", "replay_keys"]
 
@@ -129,6 +130,7 @@ class Trainer:
         Raises:
             NonFiniteError: If a number in a transition, loss or gradient is not finite, or a weight was not finite at
                 the start. Such a number is not stored, no weight is changed by it, and no checkpoint is written.
+            WorkerError: If a worker process ended with an error; no checkpoint is written.
         """
         if self.frames == 0:
             self.log.rewind(0)  # drops rows of a training that was killed before its first checkpoint
@@ -136,7 +138,7 @@ class Trainer:
         batches = iter(self.collector)
         try:
             self.learner.check_weights()
-            with stop_signals() as stop:
+            with stop_signals() as stop, worker_errors(self.collector):
                 while self.frames < self.settings.total_frames and not stop.is_set():
                     data = self._collect(batches)
                     self._store(data)
@@ -145,7 +147,7 @@ class Trainer:
                     self._log_if_due()
                     self._checkpoint_if_due()
                 self._finish(interrupted=stop.is_set())
-        except NonFiniteError as error:
+        except (NonFiniteError, WorkerError) as error:
             error.args = (f"{error} The training stopped at env-step {self.frames:,}, without another checkpoint.",)
             raise
         finally:
@@ -187,6 +189,7 @@ class Trainer:
                     self._update_once()
                     self.owed -= 1.0
             if not isinstance(self.collector, Collector):  # a single-process collector shares the learner's weights
+                check_workers(self.collector)
                 self.collector.update_policy_weights_()  # pyright: ignore[reportCallIssue]
 
     def _update_once(self) -> None:

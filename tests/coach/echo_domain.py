@@ -74,6 +74,7 @@ ECHO = Domain(
     grid={},
     control_step=0.05,
     episode_steps=20,
+    units={"pace": "m/step"},
 )
 
 

@@ -1,6 +1,5 @@
 """What every loss has to do, TorchRL's SAC included."""
 
-import math
 from typing import Any
 
 import pytest
@@ -8,22 +7,16 @@ import torch
 from scipy.stats import norm
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from torch import nn
-from torchrl.data import Bounded, OneHot, TensorDictPrioritizedReplayBuffer
-from torchrl.modules import IndependentNormal, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.data import TensorDictPrioritizedReplayBuffer
+from torchrl.modules import ProbabilisticActor, ValueOperator
 from torchrl.objectives import SoftUpdate
 
 from coachable.distributions.mixed_action import MixedAction
-from coachable.losses import CategoricalSACLoss, CatRACLoss, QRSACLoss, RACLoss
-from coachable.networks import make_critic, make_gaussian_actor
 from coachable.networks.mixed import make_mixed_actor
 from tests.losses.cases import (
     AXES,
-    BINS,
-    BUTTONS,
     CASES,
     HEADS,
-    MIXED,
     NO_ENTROPY,
     OBS,
     OURS,
@@ -350,189 +343,3 @@ def test_bfloat16_autocast(case: Case, heads: Any) -> None:
     torch.testing.assert_close(out["loss_qvalue"], exact["loss_qvalue"], rtol=0.1, atol=0.1)
     (out["loss_actor"] + out["loss_qvalue"]).backward()
     assert all(g.isfinite().all() for g in gradients(loss, ""))
-
-
-@OWN
-def test_autocast_leaves_the_numerics_alone(case: Case) -> None:
-    """With constant networks nothing is left for bfloat16 to round."""
-    loss = constant_loss(case, (10.0, 6.0)).float()
-    outputs = []
-    for enabled in (False, True):
-        batch = make_batch(AXES, (32,))
-        torch.manual_seed(0)
-        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=enabled):
-            out = loss(batch)
-        outputs.append((out["loss_actor"], out["loss_qvalue"], batch["td_error"]))
-    assert all(torch.equal(a, b) for a, b in zip(*outputs, strict=True))
-
-
-@OWN
-def test_target_uses_the_policy_as_it_is(case: Case) -> None:
-    """Stepping the policy between the parts changes the target; forward uses one set of parameters for both."""
-    heads = HEADS[case.heads[-1]]
-    loss, batch = case.loss(heads), make_batch(heads, (16,))
-    seen: list[dict[str, torch.Tensor]] = []
-    read = loss._policy.read  # type: ignore[union-attr]
-
-    def spy(td: TensorDict) -> Any:
-        policy = read(td)
-        seen.append({n: p.detach().clone() for n in ("probs", "loc") if (p := getattr(policy, n)) is not None})
-        return policy
-
-    loss._policy.read = spy  # type: ignore[method-assign, union-attr]
-    optimizer = torch.optim.SGD(list(loss.actor_network_params.parameters()), lr=0.5)
-    loss.compute_target(batch)
-    value, _ = loss.actor_loss(batch)
-    value.backward()
-    optimizer.step()
-    loss.qvalue_loss(batch)
-    before, _, after = seen
-    assert all(not torch.allclose(before[n], after[n]) for n in before)
-    torch.manual_seed(5)
-    joint = loss(batch.clone())
-    torch.manual_seed(5)
-    critic, actor = loss.qvalue_loss(batch)[0], loss.actor_loss(batch)[0]
-    assert torch.equal(joint["loss_qvalue"], critic) and torch.equal(joint["loss_actor"], actor)
-
-
-@OWN
-def test_gaussian_actors_are_served(case: Case) -> None:
-    """`make_gaussian_actor`, and bounds other than [-1, 1]."""
-    actor = make_gaussian_actor(OBS, 2, PlainSpace(), (16,))
-    loss = case.wrap(actor, [case.critic(AXES), case.critic(AXES)])
-    assert loss(make_batch(AXES))["loss_qvalue"].isfinite()
-    spec = Bounded(torch.tensor([-2.0, 0.0]), torch.tensor([2.0, 10.0]))
-    actor = ProbabilisticActor(
-        actor.module[0],
-        in_keys=["loc", "scale"],
-        spec=spec,
-        distribution_class=TanhNormal,
-        distribution_kwargs={"low": spec.low, "high": spec.high},
-    )
-    wide = case.wrap(actor, [case.critic(AXES), case.critic(AXES)], action_spec=spec)
-    policy = wide._policy_at(make_batch(AXES, (500,)))  # type: ignore[operator]
-    action, log_prob = policy.hard_sample()
-    assert action[:, 0].abs().max() > 1.5 and action[:, 1].min() >= 0 and action[:, 1].max() > 8
-    with torch.no_grad():
-        reference = actor.get_dist(make_batch(AXES, (500,)))
-    inside = (action[:, 0].abs() < 1.99) & ((action[:, 1] - 5).abs() < 4.99)
-    expected = reference.log_prob(action)
-    torch.testing.assert_close(log_prob[inside], expected[inside], rtol=1e-2, atol=1e-2)
-    assert wide(make_batch(AXES))["loss_actor"].isfinite()
-
-
-@OWN
-def test_dropout_rests_in_the_target(case: Case) -> None:
-    """Also in a batch of critics. While learning, policy and critics drop units."""
-    heads = HEADS[case.heads[-1]]
-    actor = make_mixed_actor(OBS, heads, PlainSpace(), (16,), dropout=0.5)
-    critics = [
-        make_critic(OBS, heads.action_dim, PlainSpace(), (16,), num_outputs=case.critic_width, dropout=0.5)
-        for _ in range(2)
-    ]
-    loss = case.wrap(actor, critics)
-    dropped: list[nn.Module] = []
-    for network in (actor, critics[0]):  # whose modules the loss evaluates all critics with
-        for module in network.modules():
-            if isinstance(module, nn.Dropout):
-                module.register_forward_hook(lambda m, _, __: dropped.append(m))
-    loss.compute_target(make_batch(heads))
-    assert not dropped
-    loss.actor_loss(make_batch(heads))
-    assert len(set(dropped)) == 2
-    dropped.clear()
-    critic_loss(loss, make_batch(heads))
-    assert len(set(dropped)) == 1
-
-
-@OWN
-def test_dispatch_and_key_lists(case: Case) -> None:
-    heads = HEADS[case.heads[-1]]
-    loss, batch = case.loss(heads), make_batch(heads)
-    assert set(loss.in_keys) >= {"observation", "style", "action", ("next", "reward"), ("next", "terminated")}
-    assert set(loss.out_keys) == {"loss_actor", "loss_qvalue", "alpha", "entropy"}
-    flat = {k if isinstance(k, str) else "_".join(k): batch[k] for k in loss.in_keys}
-    assert all(v.isfinite() for v in loss(**flat))
-
-
-# Bad input: one clear error each, at construction.
-
-BAD_OPTIONS = [
-    (QRSACLoss, {"num_quantiles": 0}, "num_quantiles is 0: expected a whole number of at least 1"),
-    (QRSACLoss, {"kappa": -1.0}, "kappa is -1.0: expected a number of at least 0"),
-    (RACLoss, {"entropy_samples": 0}, "entropy_samples is 0: expected a whole number of at least 1"),
-    (RACLoss, {"entropy_samples": -3}, "entropy_samples is -3: expected a whole number of at least 1"),
-    (RACLoss, {"alpha": 0.0}, "alpha is 0.0: expected a number above 0"),
-    (RACLoss, {"alpha": math.nan}, "alpha is nan: expected a number above 0"),
-    (RACLoss, {"reduction": "median"}, "reduction must be"),
-    (RACLoss, {"num_qvalue_nets": 3}, r"got 2 critic\(s\) for num_qvalue_nets=3"),
-    (RACLoss, {"num_qvalue_nets": 0}, r"num_qvalue_nets=0"),
-    (RACLoss, {"action_spec": OneHot(4)}, "cannot serve the action spec OneHot"),
-    (RACLoss, {"action_spec": MIXED.spec()}, "the environment's action is"),
-    (CatRACLoss, {"v_min": 1.0, "v_max": 1.0}, "v_min must be less than v_max"),
-    (CatRACLoss, {"v_min": 5.0, "v_max": -5.0}, "v_min must be less than v_max"),
-    (CatRACLoss, {"num_atoms": 0}, "num_atoms must be an integer of at least 2"),
-    (CatRACLoss, {"sigma_ratio": -1.0}, "sigma_ratio must be positive"),
-    (CategoricalSACLoss, {"entropy_samples": 5}, "use CatRACLoss"),
-]
-
-
-def test_the_default_support_is_the_papers() -> None:
-    critics = [make_critic(OBS, 2, PlainSpace(), (8,), num_outputs=255) for _ in range(2)]
-    bins = CatRACLoss(make_mixed_actor(OBS, AXES, PlainSpace(), (8,)), critics).bins
-    assert (bins.v_min, bins.v_max, bins.num_atoms) == (-600.0, 1000.0, 255)  # paper, Cat-RAC
-
-
-@pytest.mark.parametrize(("kind", "options", "message"), BAD_OPTIONS, ids=lambda x: str(x)[:40])
-def test_bad_options(kind: Any, options: dict[str, Any], message: str) -> None:
-    critics = [make_critic(OBS, 2, PlainSpace(), (8,)) for _ in range(2)]
-    with pytest.raises(ValueError, match=message):
-        kind(make_mixed_actor(OBS, AXES, PlainSpace(), (8,)), critics, **options)
-
-
-def test_action_spaces_that_cannot_be_served() -> None:
-    critics = [make_critic(OBS, 5, PlainSpace(), (8,)) for _ in range(2)]
-    with pytest.raises(ValueError, match=r"QRSACLoss serves continuous actions only.*\(3, 2\)"):
-        QRSACLoss(make_mixed_actor(OBS, BUTTONS, PlainSpace(), (8,)), critics)
-    with pytest.raises(ValueError, match="cannot serve the action spec"):
-        CatRACLoss(make_mixed_actor(OBS, BUTTONS, PlainSpace(), (8,)), critics, action_spec=Bounded(-1, 1, (5,)))
-    unbounded = ProbabilisticActor(
-        TensorDictModule(nn.Identity(), in_keys=["observation"], out_keys=["loc"]),
-        in_keys=["loc"],
-        distribution_class=IndependentNormal,
-        distribution_kwargs={"scale": 1.0},
-    )
-    with pytest.raises(ValueError, match="RACLoss serves positive-part categorical heads and tanh-Gaussian axes"):
-        RACLoss(unbounded, critics)
-    with pytest.raises(ValueError, match="needs a ProbabilisticActor"):
-        RACLoss(nn.Linear(2, 2), critics)  # type: ignore[arg-type]
-
-
-def test_critics_of_another_width() -> None:
-    critics = [make_critic(OBS, 2, PlainSpace(), (8,), num_outputs=5) for _ in range(2)]
-    loss = QRSACLoss(make_mixed_actor(OBS, AXES, PlainSpace(), (8,)), critics)
-    with pytest.raises(RuntimeError, match="expects critics with 32 output"):
-        loss(make_batch(AXES))
-
-
-def test_a_single_critic() -> None:
-    critic = make_critic(OBS, 2, PlainSpace(), (8,))
-    actor = make_mixed_actor(OBS, AXES, PlainSpace(), (8,))
-    with pytest.raises(ValueError, match="num_qvalue_nets=2"):
-        RACLoss(actor, critic)
-    weight = critic.module.trunk.head.weight.detach().clone()
-    loss = RACLoss(actor, [critic], num_qvalue_nets=1)
-    for params in (loss.qvalue_network_params, loss.target_qvalue_network_params):
-        assert torch.equal(params["module", "trunk", "head", "weight"][0], weight)  # not drawn again
-    loss(make_batch(AXES))["loss_qvalue"].backward()
-    critics = [p for name, p in loss.named_parameters() if name.startswith("qvalue_network_params")]
-    assert len(critics) == len(list(critic.parameters()))
-    assert all(p.grad is not None and p.grad.isfinite().all() for p in critics)
-
-
-@pytest.mark.parametrize("arguments", [{"lmbda": 0.9}, {"average_rewards": True}])
-def test_only_td0(arguments: dict[str, Any]) -> None:
-    loss = CASES[2].loss(AXES)
-    with pytest.raises(ValueError, match="takes gamma alone"):
-        loss.make_value_estimator(gamma=0.9, **arguments)
-    assert BINS["num_atoms"] == 11

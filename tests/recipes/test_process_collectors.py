@@ -2,8 +2,10 @@
 
 import multiprocessing
 import os
+import re
 import signal
 import sys
+from functools import partial
 from importlib import import_module
 
 import pytest
@@ -12,7 +14,12 @@ from recipe_config import compose_config, run_recipe
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
+from coachable.styles import StyleReward, Term
+from coachable.training.checkpoint import find_checkpoint, read_state
 from coachable.training.collection import _ray_options, make_collector
+from coachable.training.episodes import EpisodeSums
+from coachable.transforms import coachable_env
+from tests.echo import StyleEchoEnv, echo_space
 from tests.recipes.test_every_combination import RECIPES, TINY
 
 
@@ -112,6 +119,54 @@ def test_an_error_of_the_environment_in_a_worker_is_one_sentence(monkeypatch, qu
     with pytest.raises(SystemExit) as refused:
         run_recipe("rare_targets", build)
     assert refused.value.code == "error: num_envs is 2: expected a multiple of three"
+
+
+class BreakingEnv(StyleEchoEnv):
+    """Breaks in its ninth step, in the worker with the second seed."""
+
+    def __init__(self, killed: bool, seed: int) -> None:
+        super().__init__(seed=seed)
+        self.killed = killed
+
+    def _step(self, tensordict):
+        if self.steps == 8 and self.generator.initial_seed() == 1:
+            if self.killed:
+                os.kill(os.getpid(), signal.SIGKILL)
+            raise ZeroDivisionError("the pole has no length")
+        return super()._step(tensordict)
+
+
+def breaking_env(killed, seed):
+    term = Term(lambda features, style: features[..., 0], parameters=("target",))
+    reward = StyleReward(echo_space(), {"target": term})
+    return coachable_env(BreakingEnv(killed, seed), echo_space(), reward, EpisodeSums(), seed=seed)
+
+
+@pytest.mark.parametrize(
+    ("sync", "killed", "end"),
+    [
+        (True, False, "raised ZeroDivisionError: the pole has no length"),
+        (False, False, "raised ZeroDivisionError: the pole has no length"),
+        (False, True, "ended with exit status -9"),  # as by the system when memory is short
+    ],
+)
+def test_the_end_of_a_worker_in_a_later_step_is_one_sentence(
+    sync, killed, end, monkeypatch, quick_starts, make_train, tmp_path
+):
+    def build(config):
+        train = make_train(tmp_path, checkpoint_interval=0)
+        actor, workers = train.learner.loss_module.actor_network, {"num_collectors": 2, "sync": sync}
+        make_env = partial(breaking_env, killed)
+        train.collector = make_collector(make_env, actor, frames_per_batch=8, backend="process", **workers)
+        return train
+
+    monkeypatch.setattr(sys, "argv", ["rare_targets.py", "preset=smoke", f"run_dir={tmp_path}"])
+    with pytest.raises(SystemExit) as ended:
+        run_recipe("rare_targets", build)
+    stopped = r"The training stopped at env-step [1-9]\d*, without another checkpoint\."
+    assert re.fullmatch(rf"error: a worker process {end}\. {stopped}", str(ended.value.code))
+    assert not multiprocessing.active_children()
+    assert read_state(find_checkpoint(tmp_path))["loop"]["frames"] > 0  # of an earlier iteration
 
 
 def test_without_ray_the_error_names_the_extra(monkeypatch):

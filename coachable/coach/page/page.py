@@ -87,7 +87,7 @@ class CoachPage:
         with self.server.gui.add_folder("Style"):
             for parameter in self.session.space.parameters:
                 self._add_widget(parameter, self.session.style[parameter.name], self._set)
-                self.measured[parameter.name] = MeasuredText(self.server, parameter)
+                self.measured[parameter.name] = MeasuredText(self.server, parameter, self.session.domain.units)
             self.others = self.server.gui.add_markdown("")
         if self.session.domain.controls:
             with self.server.gui.add_folder("Steering"):
@@ -258,7 +258,10 @@ class CoachPage:
             for name, text in self.measured.items():
                 text.update(report, groups[name])
             rest = [m for m in groups[""] if m in report.measured]
-            others = ", ".join(f"{readable(m)} **{readable_number(report.measured[m])}**" for m in rest)
+            units = self.session.domain.units
+            others = ", ".join(
+                f"{readable(m)} **{readable_number(report.measured[m], units.get(m, ''))}**" for m in rest
+            )
             write(self.others, f"also measured: {others}" if others else "")
             self.chart.add(self.session.step_count * self.session.domain.control_step, report)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -79,16 +79,23 @@ class ParameterWidget:
 
 
 class MeasuredText:
-    """Line below a widget: the measured values, the trained range, and whether the request lay outside."""
+    """Line below a widget: the measured values, the trained range, and whether the request lay outside.
 
-    def __init__(self, server: viser.ViserServer, parameter: Parameter) -> None:
+    Args:
+        server: Server of the page.
+        parameter: The widget's parameter.
+        units: Units of measures by name; a measure that has the parameter's name has its unit.
+    """
+
+    def __init__(self, server: viser.ViserServer, parameter: Parameter, units: Mapping[str, str]) -> None:
         self.parameter = parameter
+        self._units = {parameter.name: parameter.unit, f"{parameter.name}_error": parameter.unit} | dict(units)
         self.handle = server.gui.add_markdown(trained(parameter))
 
     def update(self, report: StyleReport, measures: list[str]) -> None:
         """Show the values of the parameter's `measures` in a report, or say why there are none."""
         name, values = self.parameter.name, report.measured
-        shown = [f"{self._name(m)}**{self._value(values[m])}{self._unit(m)}**" for m in measures if m in values]
+        shown = [f"{self._name(m)}**{self._value(m, values[m])}**" for m in measures if m in values]
         found = "no measure of its own" if report.seconds and not measures else "not measured yet"
         if shown:
             found = f"measured {', '.join(shown)}"
@@ -104,13 +111,11 @@ class MeasuredText:
         rest = f"_{measure}_".replace(f"_{self.parameter.name}_", "_").strip("_")
         return f"{readable(rest)} " if rest else ""
 
-    def _value(self, value: float) -> str:
+    def _value(self, measure: str, value: float) -> str:
         """Format a value; that of a choice is the share of time in which it was met."""
-        return f"{value:.0%}" if isinstance(self.parameter, Choice) else readable_number(value)
-
-    def _unit(self, measure: str) -> str:
-        same = measure.removesuffix("_error") == self.parameter.name
-        return f" {self.parameter.unit}" if self.parameter.unit and same else ""
+        if isinstance(self.parameter, Choice):
+            return f"{value:.0%}"
+        return readable_number(value, self._units.get(measure, ""))
 
 
 class Chart:

@@ -59,6 +59,7 @@ DOMAIN = Domain(
     control_step=CONTROL_STEP,
     episode_steps=EPISODE_STEPS,
     columns={"won": ".0%", "damage": ".0f", "style_score": ".2f"},
+    units={"damage": "HP"},
     observation_groups=observation_groups("full"),
     words=WORDS,
     as_trained=_as_trained,

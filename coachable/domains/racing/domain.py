@@ -69,6 +69,7 @@ def racing_domain(
         control_step=CONTROL_STEP,
         episode_steps=EPISODE_STEPS,
         columns={"survived": ".0%", "pace": ".1f", "off": ".1%", "steering_change": ".2f"} | dict(columns),
+        units={"pace": "m/s", "speed": "m/s", "slip_angle_front": "deg", "slip_angle_rear": "deg", "fuel_per_km": "l"},
         observation_groups=observation_groups(cars > 1, pool=False),
         words=WORDS[family],
         as_trained=as_trained,

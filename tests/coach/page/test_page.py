@@ -323,6 +323,7 @@ def test_what_is_shown_is_measured_or_says_that_it_is_not(page):
     texts = {name: text.handle.content for name, text in page.measured.items()}
     assert texts["target"] == "measured **0.5 m** · trained -0.8 to 0.8 m"
     assert texts["mood"] == "no measure of its own"
+    assert "pace **0.5 m/step**" in page.others.content, "the domain declares the unit"
     do(page, lambda session: session.set(target=-0.5))
     assert "not measured yet" in page.measured["target"].handle.content, "0.5 m belongs to the request before"
 

@@ -32,6 +32,7 @@ def test_a_domain_makes_measures_and_draws(family):
     alive = torch.ones(3, 4, dtype=torch.bool)
     summary = domain.measures.summarise(record, alive)
     assert set(domain.columns) - {"survived"} <= set(summary)
+    assert set(domain.units) <= set(summary)
     assert domain.measures.complies(record).shape == (3, 4)
     renderer = domain.make_renderer(160, 120)
     image = renderer.draw(env, row=1)

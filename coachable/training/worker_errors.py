@@ -1,0 +1,86 @@
+"""Errors of worker processes, of which TorchRL tells the training process the exit status alone."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any
+
+from torchrl.collectors import Collector
+
+__all__ = ["ReportingCollector", "WorkerError", "check_workers", "worker_errors"]
+
+_LENGTH = 1000  # characters of a message: so few are written at once, so that messages of workers never mix
+_GRACE = 3.0  # [s] between a worker's message and its end, longer than the workers need to take new weights
+
+
+class WorkerError(RuntimeError):
+    """A worker process ended with an error of the environment or the policy."""
+
+
+@dataclass(eq=False)
+class ReportingCollector:
+    """Constructor of a worker's collector, which sends the error that ends a rollout to the training process.
+
+    Args:
+        sender: End of the pipe to which all workers send.
+    """
+
+    sender: Connection
+
+    def __call__(self, *args: Any, **options: Any) -> Collector:
+        """Make a collector whose errors are sent; arguments are those of `Collector`."""
+        collector = Collector(*args, **options)
+        rollout = collector.rollout
+
+        def reporting() -> Any:
+            try:
+                return rollout()
+            except Exception as error:
+                self.sender.send(f"{type(error).__name__}: {error}"[:_LENGTH])
+                time.sleep(_GRACE)
+                raise  # ends the process, which prints the traceback
+
+        collector.rollout = reporting
+        return collector
+
+
+def check_workers(collector: Any) -> None:
+    """Raise the error with which a worker process ends.
+
+    Call this before you send new weights to the workers, because TorchRL waits forever for those that ended.
+
+    Args:
+        collector: Collector made by `make_collector`, with or without worker processes.
+
+    Raises:
+        WorkerError: If a worker sent an error or ended without one.
+    """
+    receiver = vars(collector).get("worker_errors")  # TorchRL would ask the workers for an attribute that is missing
+    if receiver is None:
+        return
+    if receiver.poll():
+        raise WorkerError(f"a worker process raised {receiver.recv().rstrip('.')}.")
+    for process in collector.procs:
+        if not process._closed and not process.is_alive():
+            raise WorkerError(f"a worker process ended with exit status {process.exitcode}.")
+
+
+@contextmanager
+def worker_errors(collector: Any) -> Iterator[None]:
+    """Replace an error that follows from the end of a worker process by the error with which that process ended.
+
+    Args:
+        collector: Collector made by `make_collector`, with or without worker processes.
+
+    Raises:
+        WorkerError: If a worker sent an error or ended without one.
+    """
+    try:
+        yield
+    except WorkerError:
+        raise
+    except Exception:
+        check_workers(collector)
+        raise
