@@ -10,6 +10,7 @@ python recipes/combat_cat_rac.py impersonation.n=0
 python recipes/combat_cat_rac.py sampler=independent      or one_hot
 """
 
+from functools import partial
 from typing import Any
 
 import recipe_boxes as boxes
@@ -62,7 +63,7 @@ def build(config: dict[str, Any]) -> Trainer:
 
     # Collector, evaluation and training loop
     collector = boxes.make_collector(run, make_env, actor)
-    evaluate = boxes.make_evaluation(run, make_env, actor)
+    evaluate = boxes.make_evaluation(run, partial(make_env, components=True), actor)  # which the measured style needs
     describe = boxes.make_description(run, space, actor, loss, network)
     return boxes.make_trainer(run, example, collector, replay, learner, evaluate, describe, style_reward)
 
