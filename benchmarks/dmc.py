@@ -28,7 +28,7 @@ from coachable.evaluation.figures import MARKERS, drawing
 
 MINUTES = {"walker-walk": 30.0, "walker-run": 30.0, "quadruped-walk": 30.0, "humanoid-walk": 90.0}
 STEP_MARKS = (100_000, 200_000, 300_000, 500_000, 1_000_000, 2_000_000, 4_000_000)
-COLUMNS = ("task", "contestant", "seed", "minutes", "env_steps", "updates", "return")
+COLUMNS: tuple[str, ...] = ("task", "contestant", "seed", "minutes", "env_steps", "updates", "return")
 
 # Mean return at thousands of environment steps, counted as here: two for each decision of the policy. FlashSAC and XQC:
 # arXiv 2604.04539; SimbaV2, MR.Q and TD-MPC2: arXiv 2502.15280.
@@ -80,7 +80,7 @@ def train(out: Path, task: str, name: str, seed: int, minutes: float, args: argp
     done = subprocess.run(command, env=env, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False)
     if done.returncode:
         path.unlink(missing_ok=True)
-        print(f"{name} is left out: {' '.join(done.stderr.strip().splitlines()[-1:])}", file=sys.stderr)
+        print(f"{name} is left out: {' '.join((done.stderr or '').strip().splitlines()[-1:])}", file=sys.stderr)
 
 
 def collect(out: Path) -> dict[str, dict[str, dict[int, Rows]]]:
@@ -108,6 +108,8 @@ def median_at(seeds: dict[int, Rows], column: str, mark: float) -> float | None:
 def table(header: str, marks: Sequence[str], lines: dict[str, list[float | None]]) -> list[str]:
     """Return a markdown table, without the columns that are empty."""
     filled = [i for i in range(len(marks)) if any(values[i] is not None for values in lines.values())]
+    if not filled:
+        return []
     text = [f"| {header} | " + " | ".join(marks[i] for i in filled) + " |", "|---" * (1 + len(filled)) + "|"]
     for name, values in lines.items():
         cells = ["" if (value := values[i]) is None else f"{value:.0f}" for i in filled]
@@ -186,7 +188,9 @@ def setting(text: str) -> tuple[str, object]:
 
 def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder of the results; finished trainings are kept")
+    parser.add_argument(
+        "--out", type=Path, required=True, help="folder of the results, one for each choice of settings"
+    )
     parser.add_argument("--tasks", nargs="+", default=list(MINUTES), metavar="DOMAIN-TASK")
     parser.add_argument("--contestants", nargs="+", choices=list(CONTESTANTS), default=list(CONTESTANTS))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])

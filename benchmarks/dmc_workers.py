@@ -200,6 +200,7 @@ def suite_env(name: str, num_envs: int, seed: int, threads: int):
 def coachable(task: str, seed: int, record: Callable[[], Record], threads: int, device: str, **changed: object) -> None:
     """Train with the library's boxes, without style: space None, no relabelling, one table."""
     import torch
+    from tensordict import TensorDict
     from torchrl.envs.utils import ExplorationType, set_exploration_type
     from torchrl.objectives import SACLoss
 
@@ -245,12 +246,8 @@ def coachable(task: str, seed: int, record: Callable[[], Record], threads: int, 
 
     def act(observations: np.ndarray) -> np.ndarray:
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            return actor.get_dist(_td(torch.from_numpy(observations).to(device))).deterministic_sample.cpu().numpy()
-
-    def _td(observations):
-        from tensordict import TensorDict
-
-        return TensorDict({"observation": observations}, observations.shape[:1])
+            seen = TensorDict({"observation": torch.from_numpy(observations)}, observations.shape[:1])
+            return actor(seen.to(device))["action"].cpu().numpy()
 
     decisions, owed = 0, 0.0
     for data in collector:
@@ -259,8 +256,7 @@ def coachable(task: str, seed: int, record: Callable[[], Record], threads: int, 
         if decisions > cfg["random_steps"]:
             owed += data.numel() * cfg["utd_ratio"]
         while owed >= 1.0:
-            batch = replay.sample(cfg["batch_size"]).to(device)
-            learner.update(batch)
+            learner.update(replay.sample(cfg["batch_size"]).to(device))
             owed -= 1.0
         if clock.check(act, decisions, learner.updates):
             break
@@ -273,7 +269,17 @@ def coachable(task: str, seed: int, record: Callable[[], Record], threads: int, 
 def peer(
     library: str, algorithm: str, task: str, seed: int, record: Callable[[], Record], num_envs: int = 1, **options
 ) -> None:
-    """Train with an algorithm of Stable-Baselines3, sb3-contrib or sbx."""
+    """Train with an algorithm of Stable-Baselines3, sb3-contrib or sbx, as a user would.
+
+    Args:
+        library: Name of the module.
+        algorithm: Name of the class in it.
+        task: Name of the task.
+        seed: Seed of the training.
+        record: Starts the clock.
+        num_envs: Number of environments, stepped one after the other.
+        **options: Of the algorithm.
+    """
     from importlib import import_module
 
     import gymnasium as gym
@@ -305,19 +311,22 @@ def peer(
     model.learn(10**9, callback=Clock())
 
 
-def sb3(library: str, algorithm: str, **options):
+def setup(library: str, algorithm: str, **options: object) -> Callable[..., None]:
+    """Return a contestant that trains with these options, with the arguments of `coachable`."""
     return lambda task, seed, record, threads, device: peer(library, algorithm, task, seed, record, **options)
 
 
-# One update per decision, learning rate 3e-4, batches of 256 and networks of 2 x 256 are the defaults of all SACs here;
-# 10,000 random decisions at the start are what the training zoo of Stable-Baselines3 adds for MuJoCo.
+# One update per decision, learning rate 3e-4, batches of 256 and networks of 2 x 256 are the defaults of SAC and TQC in
+# both libraries. The random decisions at the start are what the training zoo of Stable-Baselines3 adds for MuJoCo.
+# CrossQ has its own defaults, critics of 2 x 1024 among them. The last contestant has our number of environments and
+# updates per decision.
 CONTESTANTS = {
     "coachable": coachable,
-    "sb3-sac": sb3("stable_baselines3", "SAC", learning_starts=10_000, device="cpu"),
-    "sb3-tqc": sb3("sb3_contrib", "TQC", learning_starts=10_000, device="cpu"),
-    "sbx-sac": sb3("sbx", "SAC", learning_starts=10_000),
-    "sbx-crossq": sb3("sbx", "CrossQ", learning_starts=5_000),
-    "sbx-sac-64-envs": sb3("sbx", "SAC", learning_starts=10_000, num_envs=64, gradient_steps=8),
+    "sb3-sac": setup("stable_baselines3", "SAC", learning_starts=10_000, device="cpu"),
+    "sb3-tqc": setup("sb3_contrib", "TQC", learning_starts=10_000, device="cpu"),
+    "sbx-sac": setup("sbx", "SAC", learning_starts=10_000),
+    "sbx-crossq": setup("sbx", "CrossQ", learning_starts=5_000),
+    "sbx-sac-64-envs": setup("sbx", "SAC", learning_starts=10_000, num_envs=64, gradient_steps=8),
 }
 
 
