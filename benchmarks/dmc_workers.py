@@ -25,15 +25,15 @@ EPISODE = 1000  # environment steps of every task of the suite
 EVALUATIONS = 2  # episodes of one evaluation
 SETTINGS = {  # ours, the same on all tasks
     "num_envs": 64,
-    "widths": (256, 256, 256),
+    "widths": (256, 256),
     "batch_size": 256,
     "utd_ratio": 0.125,  # updates per decision
     "n_steps": 3,
     "gamma": 0.99,
     "tau": 0.01,
-    "lr": 3e-4,
-    "alpha": 0.1,  # of the start, if it is learnt
-    "learn_alpha": True,
+    "lr": 1e-3,
+    "alpha": 0.02,  # of the start, if it is learnt
+    "learn_alpha": False,
     "target_entropy": -1.0,  # per action dimension
     "random_steps": 5_000,  # decisions
     "capacity": 1_000_000,
