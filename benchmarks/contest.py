@@ -11,6 +11,17 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 
 
+def thread_settings(threads: int) -> dict[str, str]:
+    """Environment variables of a contestant's process: threads of OpenMP, MKL and XLA, and where this package lies."""
+    return {
+        "OMP_NUM_THREADS": str(threads),
+        "MKL_NUM_THREADS": str(threads),
+        "XLA_FLAGS": "" if threads > 1 else "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
+        "JAX_PLATFORMS": "cpu",
+        "PYTHONPATH": str(HERE.parent),
+    }
+
+
 class Worker:
     """A contestant's process: `python SCRIPT NAME`, fed with numbers of rounds, answering with seconds.
 
@@ -23,14 +34,7 @@ class Worker:
 
     def __init__(self, script: str, name: str, python: str, threads: int) -> None:
         self.name = name
-        xla = "" if threads > 1 else "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-        env = os.environ | {
-            "OMP_NUM_THREADS": str(threads),
-            "MKL_NUM_THREADS": str(threads),
-            "XLA_FLAGS": xla,
-            "JAX_PLATFORMS": "cpu",
-            "PYTHONPATH": str(HERE.parent),
-        }
+        env = os.environ | thread_settings(threads)
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
         self.process = subprocess.Popen([python, str(HERE / script), name], env=env, text=True, **pipes)
 
