@@ -119,6 +119,10 @@ class Acceleration(Backend):
         self._buffers = (self._actor, self._critic, self._target)
         self._prepare()
 
+    def working(self) -> AbstractContextManager[Any]:
+        """Keep torch at one thread, because its own wait for work in a loop that takes a core from the crew."""
+        return crew(KERNEL_THREADS if load_kernels() else 1)
+
     @contextmanager
     def updating(self) -> Iterator[None]:
         """Evaluate policy and critics with the hand-written passes inside the block."""
@@ -136,7 +140,7 @@ class Acceleration(Backend):
         for name, network in self._policies.items():
             use_plan(network, self._actor_plans[name])
         try:
-            with crew(KERNEL_THREADS if load_kernels() else 1):
+            with self.working():
                 yield
         finally:
             loss._vmap_qnetworkN0 = ordinary

@@ -40,6 +40,10 @@ class Backend:
         self.target_updater = target_updater
         self._device_type = next(loss_module.parameters()).device.type
 
+    def working(self) -> AbstractContextManager[Any]:
+        """Return the context of a round of updates and of the sampling between them; an update alone needs none."""
+        return nullcontext()
+
     def updating(self) -> AbstractContextManager[Any]:
         """Return the context of an update: evaluations, backward passes and steps of the optimisers."""
         return nullcontext()

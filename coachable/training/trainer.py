@@ -177,7 +177,7 @@ class Trainer:
         warming_up = self.frames - self._filled_from <= self.settings.warmup_frames
         if warming_up or len(self.replay) < self.settings.batch_size:
             return
-        with self._timed("update"):
+        with self._timed("update"), self.learner.backend.working():
             self.learner.scale_learning_rates(self.settings.learning_rate_factor(self.frames))
             self.learner.scale_entropy_weight(self.settings.entropy_factor(self.frames))
             if self.settings.utd_ratio is None:  # update until the throttle allows the next frames
