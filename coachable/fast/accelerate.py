@@ -232,11 +232,11 @@ class Acceleration(Backend):
         self._target_critics = _critics(critic, target_plans)
         self._ensemble = CriticEnsemble(critic, self._choose, members)
         self._direct = None
-        every = [[*plans.values()] for plans in (self._actor_plans, self._critic_plans, target_plans)]
+        every = (self._actor_plans, self._critic_plans, target_plans)
         if all(len(plans) == 1 for plans in every):
-            plans = [own for (own,) in every]
-            if has_direct_gradients(self._loss, *plans):
-                share = Share(*plans, {"actor": self._actor.grad, "critic": self._critic.grad})
+            (policy,), (own,), (target,) = (plans.values() for plans in every)
+            if has_direct_gradients(self._loss, policy, own, target):
+                share = Share(policy, own, target, {"actor": self._actor.grad, "critic": self._critic.grad})
                 self._direct = DirectGradients(self._loss, share, self._another_share)
 
     def _another_share(self) -> Share:

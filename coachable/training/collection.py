@@ -261,7 +261,7 @@ def evaluate_policy(
     }
     for key in keys:
         result[f"{key}_per_step"] = (sums[key] / length).mean().item()
-    if measured:
+    if measures is not None:
         record = {name: torch.stack([row[name] for row in measured]) for name in measured[0]}
         summary = measures.summarise(record, torch.stack(alive))
         result |= {name: values.nanmean().item() for name, values in summary.items()}
