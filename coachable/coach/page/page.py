@@ -54,7 +54,7 @@ class CoachPage:
 
     def __init__(self, server: viser.ViserServer, session: CoachSession) -> None:
         self.server, self.session = server, session
-        self.loop = LiveLoop(session, self._on_step)
+        self.loop = LiveLoop(session, self._on_step, on_stop=self._close_view)
         self._view: View | None = None
         self._reading = threading.Lock()
         self._studio = FilmStudio(session, lambda note: write(self.film_note, escaped(note)))
@@ -80,6 +80,9 @@ class CoachPage:
         """End the loop; the session stays open."""
         self.loop.stop()
         self._studio.close()
+
+    def _close_view(self) -> None:
+        """Close the view, in the loop's thread, to which its OpenGL context belongs."""
         if self._view is not None:
             self._view.close()
 

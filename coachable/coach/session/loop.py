@@ -28,6 +28,7 @@ class LiveLoop:
         session: The session, which no other thread may step.
         on_step: Called in the loop's thread after each step and after each submitted change.
         pause_at_end: How long an ended episode is shown before the next one begins [s].
+        on_stop: Called in the loop's thread when it ends.
 
     Attributes:
         speed: Simulated seconds per second, a finite number above 0.
@@ -36,9 +37,13 @@ class LiveLoop:
     """
 
     def __init__(
-        self, session: CoachSession, on_step: Callable[[], None] = lambda: None, pause_at_end: float = 1.0
+        self,
+        session: CoachSession,
+        on_step: Callable[[], None] = lambda: None,
+        pause_at_end: float = 1.0,
+        on_stop: Callable[[], None] = lambda: None,
     ) -> None:
-        self.session, self.on_step, self.pause_at_end = session, on_step, pause_at_end
+        self.session, self.on_step, self.pause_at_end, self.on_stop = session, on_step, pause_at_end, on_stop
         self._speed = 1.0
         self.paused = False
         self.problem = ""
@@ -127,6 +132,7 @@ class LiveLoop:
             if changed:
                 self._attempt(lambda _: self.on_step(), pause=False)  # the agent continues if the display fails
             time.sleep(_IDLE if self.paused else min(_IDLE, max(0.0, due - time.perf_counter())))
+        self.on_stop()
 
     def _next(self, due: float, now: float) -> float:
         """Return the time at which the next step is due."""
