@@ -255,9 +255,10 @@ def coachable(task: str, seed: int, record: Callable[[], Record], threads: int, 
         replay.extend(data.contiguous().select(*stored).reshape(-1))
         if decisions > cfg["random_steps"]:
             owed += data.numel() * cfg["utd_ratio"]
-        while owed >= 1.0:
-            learner.update(replay.sample(cfg["batch_size"]).to(device))
-            owed -= 1.0
+        with learner.backend.working():
+            while owed >= 1.0:
+                learner.update(replay.sample(cfg["batch_size"]).to(device))
+                owed -= 1.0
         if clock.check(act, decisions, learner.updates):
             break
     collector.shutdown()

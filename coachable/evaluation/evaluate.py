@@ -90,9 +90,8 @@ def evaluate_trials(domain: Domain, agent: LoadedPolicy, settings: EvaluationSet
         interval of their share.
     """
     rows = []
+    count, style = settings.trial_episodes, agent.space.describe(agent.space.default)
     for label, options in domain.trials.items():
-        count = settings.trial_episodes
-        style = agent.space.describe(agent.space.default)
         grid = evaluate_grid(
             domain, agent.actor, agent.space, episodes=count, cells=[style], env_options=options, **settings.rollout
         )

@@ -10,4 +10,5 @@ def readable(name: Any) -> str:
 
 def readable_number(value: float, unit: str = "") -> str:
     """Return a number with three significant digits, or as a whole number from 1000 on, and its unit."""
-    return f"{value:.3g} {unit}".rstrip() if abs(value) < 1000 else f"{value:.0f} {unit}".rstrip()
+    number = f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+    return f"{number} {unit}".rstrip()

@@ -7,10 +7,13 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from itertools import pairwise
 
 import torch
 
-__all__ = ["crew", "crew_size", "share_out"]
+__all__ = ["crew", "crew_size", "cut_rows", "share_out"]
+
+_FEWEST_ROWS = 32  # of a share
 
 
 class _Size(threading.local):
@@ -23,6 +26,12 @@ _size = _Size()
 def crew_size() -> int:
     """Return how many threads share the work: 1 outside of :func:`crew`, and in work that is shared out."""
     return _size.value
+
+
+def cut_rows(rows: int, shares: int) -> list[slice]:
+    """Return at most `shares` slices of nearly equal size that cover all rows; few rows are cut less often."""
+    shares = min(shares, max(1, rows // _FEWEST_ROWS))
+    return [slice(start, stop) for start, stop in pairwise(rows * i // shares for i in range(shares + 1))]
 
 
 @contextmanager

@@ -10,7 +10,6 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import pairwise
 from typing import Any
 
 import torch
@@ -20,7 +19,7 @@ from torchrl.objectives import LossModule, SACLoss
 from torchrl.objectives.value import TD0Estimator
 
 from coachable.distributions.tanh_normal import TanhGaussian
-from coachable.fast.crew import crew_size, share_out
+from coachable.fast.crew import crew_size, cut_rows, share_out
 from coachable.fast.fused import Plan
 from coachable.fast.native import load_sac
 from coachable.losses import QRSACLoss
@@ -29,7 +28,6 @@ from coachable.networks.critics import StyleCritic
 
 __all__ = ["DirectGradients", "Share", "has_direct_gradients"]
 
-_FEWEST_ROWS = 32  # of a share
 _MOST = 8  # layers of a network, or inputs; MOST in sac.c
 _I, _F, _P = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 
@@ -219,18 +217,16 @@ class DirectGradients:
 
     def _call(self, job: _Job, count: int, critic: bool, actor: bool) -> None:
         """Share the rows out among the threads, and add up their gradients."""
-        threads = min(crew_size(), max(1, count // _FEWEST_ROWS))
-        while len(self._shares) < threads:
+        slices = cut_rows(count, crew_size())
+        while len(self._shares) < len(slices):
             self._shares.append(self._make_share())
-        function, calls = load_sac(), []
-        for share, (start, stop) in zip(
-            self._shares, pairwise(count * i // threads for i in range(threads + 1)), strict=False
-        ):
+        shares, function, calls = self._shares[: len(slices)], load_sac(), []
+        for share, rows in zip(shares, slices, strict=True):
             own = _Job.from_buffer_copy(job)
             own.actor, own.own, own.target = map(ctypes.addressof, share.networks)
-            calls.append(partial(function, ctypes.byref(own), start, stop - start, critic, actor))
+            calls.append(partial(function, ctypes.byref(own), rows.start, rows.stop - rows.start, critic, actor))
         share_out(calls)
-        first, *others = self._shares[:threads]
+        first, *others = shares
         for name, wanted in (("actor", actor), ("critic", critic)):
             for other in others if wanted else ():
                 first.gradients[name].add_(other.gradients[name])

@@ -39,6 +39,7 @@ class Products:
     weight_gradient: Any
     wide_head_forward: Any
     wide_head_backward: Any
+    sac_gradients: Any
 
 
 @dataclass(frozen=True)
@@ -51,13 +52,12 @@ class Kernels:
     head_backward: Any
     adam: Any
     products: Products | None
-    sac_gradients: Any = None
 
 
 def load_sac() -> Any:
     """Return the function `sac_gradients` of `sac.c`, or `None` where it was not built; see `direct.py`."""
     kernels = load_kernels().get(torch.bfloat16)
-    return None if kernels is None else kernels.sac_gradients
+    return None if kernels is None or kernels.products is None else kernels.products.sac_gradients
 
 
 @functools.cache
@@ -150,6 +150,7 @@ def _products(library: ctypes.CDLL) -> Products | None:
         "weight_gradient": [p, i, p, i, i, i, flag, p],
         "wide_head_forward": [p, p, p, i, i, i, p],
         "wide_head_backward": [p, p, p, i, i, i, flag, flag, p, p, p],
+        "sac_gradients": [p, i, i, flag, flag],
     }
     functions = {name: library[name] for name in arguments}
     for name, function in functions.items():
@@ -172,8 +173,5 @@ def _bind(library: ctypes.CDLL) -> dict[torch.dtype, Kernels]:
         head_backward.argtypes = [p, p, p, i, i, i, flag, flag, p, p, p, p]
         forward.restype = backward.restype = head.restype = head_backward.restype = None
         products = _products(library) if dtype == torch.bfloat16 else None
-        sac = library.sac_gradients if products is not None else None
-        if sac is not None:
-            sac.argtypes, sac.restype = [p, i, i, flag, flag], None
-        kernels[dtype] = Kernels(forward, backward, head, head_backward, adam, products, sac)
+        kernels[dtype] = Kernels(forward, backward, head, head_backward, adam, products)
     return kernels

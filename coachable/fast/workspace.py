@@ -9,17 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from itertools import pairwise
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from coachable.fast.crew import crew_size, share_out
+from coachable.fast.crew import crew_size, cut_rows, share_out
 from coachable.fast.native import Kernels, Products
 from coachable.fast.passes import Layer, Member, active_rows
 
-_FEWEST_ROWS = 32  # of a part
 _FEW_OUTPUTS = 4  # of a head; beyond, products of matrices are faster than the kernels of small heads
 
 
@@ -51,9 +49,7 @@ class Workspace:
         dtype = members[0].products[0].dtype
         self._input = torch.zeros(rows, width + width % 2, dtype=dtype)[:, :width]
         self._slots = self._input.split(list(widths), -1)
-        shares = min(-(-crew_size() // len(members)), max(1, rows // _FEWEST_ROWS))
-        cuts = [rows * i // shares for i in range(shares + 1)]
-        self._slices = [slice(start, stop) for start, stop in pairwise(cuts)]
+        self._slices = cut_rows(rows, -(-crew_size() // len(members)))
         self._parts: list[list[_MemberSpace]] = []
         for member in members:
             # The first part writes the gradients, the others write their own, which are added.

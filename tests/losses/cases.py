@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
@@ -97,6 +98,7 @@ CASES = [
     Case("cat-SAC", CategoricalSACLoss, ("axes", "categorical", "mixed"), 11, BINS),
 ]
 OURS = [case for case in CASES if case.ours]
+OWN = pytest.mark.parametrize("case", OURS, ids=lambda c: c.name)
 
 
 class ConstantCritic(nn.Module):

@@ -19,7 +19,7 @@ from tests.losses.cases import (
     HEADS,
     NO_ENTROPY,
     OBS,
-    OURS,
+    OWN,
     Case,
     PlainSpace,
     constant_loss,
@@ -33,7 +33,6 @@ F64 = torch.float64
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 
 ALL = pytest.mark.parametrize("case", CASES, ids=lambda c: c.name)
-OWN = pytest.mark.parametrize("case", OURS, ids=lambda c: c.name)
 WITH_HEADS = pytest.mark.parametrize(
     ("case", "heads"),
     [pytest.param(c, HEADS[h], id=f"{c.name}-{h}") for c in CASES for h in c.heads],

@@ -15,7 +15,7 @@ from tests.losses.cases import (
     AXES,
     HEADS,
     OBS,
-    OURS,
+    OWN,
     Case,
     PlainSpace,
     constant_loss,
@@ -24,8 +24,6 @@ from tests.losses.cases import (
 )
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
-
-OWN = pytest.mark.parametrize("case", OURS, ids=lambda c: c.name)
 
 
 @OWN
