@@ -74,13 +74,14 @@ def _bearing(head_height: np.ndarray, upright: np.ndarray, facing: np.ndarray, c
     return standing, np.mean(tolerance(controls, margin=1, value_at_margin=0, sigmoid="quadratic"), axis=1)
 
 
-COSTS = ("power", "impact", "clearance", "toe_strike", "drift")
+COSTS = ("power", "impact", "clearance", "strike_pitch", "drift")
 """What a walk costs besides, see `walk_costs`."""
 _WORST = 3.0  # of any of them in a control step
 _POWER = 1000.0  # [W] that cost 1
 _SOFT, _HARD = 1.5, 6.5  # forces under a foot [body weights] that cost 0 and 1
 _LOW, _HIGH = 0.06, 0.21  # clearances [m] that cost 0 and 1
-_TOE_STRIKE = np.deg2rad(20)  # pitch that costs 1; a foot that lands flat or heel first costs nothing
+_TOES_UP = np.deg2rad(25)  # pitch of a foot at a heel strike, up to which it costs nothing, as of one that lands flat
+_TILTED = np.deg2rad(20)  # pitch beyond that, or toes first, that costs 1
 _DRIFT = 0.10  # [m] to either side over a stride that cost 1
 
 
@@ -105,8 +106,8 @@ def walk_costs(
         "power": power / _POWER,
         "impact": (forces.max(axis=1) - _SOFT) / (_HARD - _SOFT),
         "clearance": (clearance.max(axis=1) - _LOW) / (_HIGH - _LOW),
-        "toe_strike": report.pitch / _TOE_STRIKE,
+        "strike_pitch": np.maximum(report.pitch, -report.pitch - _TOES_UP) / _TILTED,
         "drift": np.abs(report.drift) / _DRIFT,
     }
     costs = {name: np.clip(cost, 0.0, _WORST) for name, cost in costs.items()}
-    return costs | {name: steps * costs[name] for name in ("toe_strike", "drift")}
+    return costs | {name: steps * costs[name] for name in ("strike_pitch", "drift")}

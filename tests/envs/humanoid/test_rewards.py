@@ -73,8 +73,9 @@ def costs(power=0.0, forces=(0.0, 0.0), clearance=(0.0, 0.0), steps=0, **report)
         ({"forces": (30.0, 0.0)}, {"impact": 3.0}),
         ({"clearance": (0.06, -0.01)}, {}),
         ({"clearance": (0.135, 0.0)}, {"clearance": 0.5}),
-        ({"steps": 20, "pitch": np.deg2rad(5.0)}, {"toe_strike": 5.0}),  # paid for each control step of the step
-        ({"steps": 20, "pitch": -0.2}, {}),  # heel first
+        ({"steps": 20, "pitch": np.deg2rad(5.0)}, {"strike_pitch": 5.0}),  # paid for each control step of the step
+        ({"steps": 20, "pitch": -np.deg2rad(25.0)}, {}),  # heel first
+        ({"steps": 10, "pitch": -np.deg2rad(45.0)}, {"strike_pitch": 10.0}),  # on the heels
         ({"steps": 10, "drift": -0.05}, {"drift": 5.0}),
         ({"steps": 10, "drift": 0.5}, {"drift": 30.0}),
     ],
