@@ -2,7 +2,6 @@
 
 import platform
 import zlib
-from functools import cache
 from pathlib import Path
 
 from coachable import __version__
@@ -14,7 +13,6 @@ RECIPES = str(next(p for p in (_PACKAGE / "recipes", _PACKAGE.parent / "recipes"
 """Folder of the recipes: in the installed package, or beside it in a clone."""
 
 
-@cache
 def code_version() -> str:
     """Return the versions of Python and coachable, with a checksum of coachable's source, in words."""
     checksum = 0

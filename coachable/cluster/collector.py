@@ -99,9 +99,10 @@ class ClusterCollector(AsyncCollector):
         self._closed: list[Tensor] = []
         self._staleness: list[int] = []
         self._connection = Connection(address, num_collectors, cpus_per_worker, patience)
+        code = code_version()
 
         def settings(worker: int, start: int) -> WorkerSettings:
-            return WorkerSettings(worker, start, seed, steps_per_batch, worker_throttle, code_version())
+            return WorkerSettings(worker, start, seed, steps_per_batch, worker_throttle, code)
 
         self.workers = Workers(
             self._connection.ray,

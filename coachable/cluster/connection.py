@@ -113,6 +113,7 @@ class Connection:
 
     def _check_code(self, patience: float) -> None:
         """Compare Python and coachable on every node that may get a worker."""
+        expected = code_version()
         nodes = [node for node in self.ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
         here = self.ray.get_runtime_context().get_node_id()
         asked = {}
@@ -133,10 +134,10 @@ class Connection:
                 raise ClusterError(
                     f"collector=ray: node {name} ({address}) cannot run coachable: {_last_line(error)}"
                 ) from None
-            if found != code_version():
+            if found != expected:
                 raise ClusterError(
-                    f"collector=ray: node {name} ({address}) has {found}, the learner has {code_version()}: expected "
-                    "the same on every node"
+                    f"collector=ray: node {name} ({address}) has {found}, the learner has {expected}: expected the "
+                    "same on every node"
                 )
 
 
