@@ -45,8 +45,8 @@ class ClusterCollector(AsyncCollector):
         weights_every: Number of updates between two offers of weights to the workers.
         queue_size: Number of batches that wait for the learner before workers are no longer asked for more.
         worker_throttle: Highest rate of each worker [env-steps/s]; None for no limit.
-        patience: Time without any batch after which the training ends [s]; a single worker that does not answer for
-            half of it is replaced.
+        patience: Time without any batch after which the training ends [s]. A single worker that does not start within
+            it, or does not answer for half of it, is replaced.
 
     Raises:
         ImportError: If Ray is not installed.
@@ -196,10 +196,10 @@ class ClusterCollector(AsyncCollector):
         data = TensorDict(entries, batch_size=batch.shape)  # pyright: ignore[reportArgumentType]
         numbers = {"worker": item.worker, "restart": item.start, "serial": batch.serial, "version": batch.version}
         for name, number in numbers.items():
-            data["collector", name] = torch.full(batch.shape, number)
-        last = data[:, -1]
-        running = ~last["next", "done"].reshape(len(last), -1).any(-1)
-        self._open[item.worker] = last["collector", "traj_ids"].reshape(-1)[running]
+            data.set(("collector", name), torch.full(batch.shape, number))
+        last: Any = data[:, -1]
+        running = ~last.get(("next", "done")).reshape(len(last), -1).any(-1)
+        self._open[item.worker] = last.get(("collector", "traj_ids")).reshape(-1)[running]
         self._frames += data.numel()
         self._staleness.append(self._updates - batch.version)
         return data

@@ -113,16 +113,13 @@ class RolloutWorker:
             env = env if isinstance(env, TransformedEnv) else TransformedEnv(env)
             env.append_transform(_Paced(Throttle(settings.throttle, _BURST)))
         self.settings = settings
-        self.collector = Collector(
-            env,
-            self.policy,
-            frames_per_batch=env.numel() * settings.steps_per_batch,
-            total_frames=-1,
-            exploration_type=ExplorationType.RANDOM,
-            use_buffers=False,
-            trust_policy=True,
-            auto_register_policy_transforms=False,
-        )
+        options: dict[str, Any] = {  # typed too narrowly in TorchRL
+            "frames_per_batch": env.numel() * settings.steps_per_batch,
+            "total_frames": -1,
+            "exploration_type": ExplorationType.RANDOM,
+        }
+        plain: dict[str, Any] = {"use_buffers": False, "trust_policy": True, "auto_register_policy_transforms": False}
+        self.collector = Collector(env, self.policy, **options, **plain)
         simulation = simulation_env(self.collector.env)
         if isinstance(simulation, SelfPlayEnv):
             simulation.follow(self.policy)
@@ -143,9 +140,9 @@ class RolloutWorker:
         self._take((version, weights[0]))
         self.collector.init_random_frames = sys.maxsize if random else 0
         data = next(self._batches).contiguous()
-        key = ("collector", "traj_ids")
         number = self.settings.start * MAX_WORKERS + self.settings.worker
-        data.set(key, data.get(key) + (number << 32))
+        key: Any = ("collector", "traj_ids")
+        data[key] = data[key] + (number << 32)
         entries = {
             key if isinstance(key, tuple) else (key,): value.numpy()
             for key, value in data.items(True, leaves_only=True)

@@ -80,8 +80,8 @@ class Workers:
     """Workers and the thread that serves them.
 
     Every worker owes at most one answer. While fewer than `queue_size` batches wait for the learner, an idle worker is
-    asked for the next one, with the newest weights. A worker that dies, raises an error or does not answer for half of
-    `patience` is replaced by a new actor, after a pause that doubles with every failure.
+    asked for the next one, with the newest weights. A worker that dies, raises an error, does not answer for half of
+    `patience` or does not start within it is replaced by a new actor, after a pause that doubles with every failure.
 
     Args:
         ray: The module of Ray.
@@ -90,7 +90,7 @@ class Workers:
         settings: Returns the settings of a worker from its number and start.
         cpus_per_worker: Number of cores that each reserves.
         queue_size: Number of batches that wait before workers are no longer asked.
-        patience: Time without any batch after which the training ends [s].
+        patience: Time without any batch or start after which the training ends [s].
         starts_at_once: Number of workers that may start at the same time, because each keeps a core busy for seconds.
         is_random: Returns whether the next batch is collected with random actions.
     """
@@ -150,12 +150,16 @@ class Workers:
                     if slot.actor is None and slot.retry <= now and starting < self.starts_at_once:
                         self._launch(slot)
                         starting += 1
-                    elif slot.call is not None and now - slot.since > self.patience / 2:
-                        self._lose(slot, f"it did not answer for {self.patience / 2:g} s, half of collector.patience")
+                    elif slot.call is not None and now - slot.since > self._limit(slot):
+                        self._lose(slot, f"it did not answer for {self._limit(slot):g} s (see collector.patience)")
                 self._ask()
                 self._check_patience()
         except BaseException as error:
             self.error = error
+
+    def _limit(self, slot: Slot) -> float:
+        """Return the time for an answer [s]: all of the patience for a start, which needs cores and imports."""
+        return self.patience / 2 if slot.is_ready else self.patience
 
     def _launch(self, slot: Slot) -> None:
         actor = self.ray.remote(RolloutWorker).options(
@@ -186,6 +190,7 @@ class Workers:
             if not slot.is_ready:
                 slot.is_ready = True
                 slot.pid, slot.host = answer
+                self._last = time.monotonic()
                 continue
             slot.failures = 0
             self._last, self._delivered = time.monotonic(), True
