@@ -172,9 +172,9 @@ def _rates(train: Trainer, batches: Any, seconds: float) -> tuple[float, float]:
 
 
 def _push(train: Trainer) -> None:
-    """Sends the weights, as often as the loop does it; of Ray, up to where the workers can fetch them."""
+    """Sends the weights: to the workers, or with `coachable-ray` to the object store, from which they fetch them."""
     if hasattr(train.collector, "after_update"):
-        train.collector.after_update(train.learner.updates + 1_000_000)
+        train.collector.after_update(train.collector._updates + train.collector.weights_every)
         train.collector.workers._stored_weights()
     else:
         train.collector.update_policy_weights_()

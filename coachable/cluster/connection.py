@@ -58,7 +58,8 @@ class Connection:
             elif self._is_ours:
                 self._start()
             self._check_cores(num_workers, cpus_per_worker)
-            self._check_code(patience)
+            if self._folder is None:  # a Ray that was started here runs the code of this process
+                self._check_code(patience)
         except BaseException:
             self.close()
             raise
@@ -87,10 +88,10 @@ class Connection:
         said = f"collector.address={address}"
         if "://" in address:
             raise ClusterError(
-                f"{said}: expected HOST:PORT of a cluster that this host belongs to (ray start), or auto"
+                f"{said}: expected auto, or HOST:PORT of a cluster that this host has joined (ray start)"
             )
         host, _, port = address.rpartition(":")
-        if address not in ("auto", "local"):
+        if address != "auto":
             try:
                 socket.create_connection((host, int(port)), _ANSWER).close()
             except (OSError, ValueError) as error:
@@ -115,15 +116,13 @@ class Connection:
         """Compare Python and coachable on every node that may get a worker."""
         expected = code_version()
         nodes = [node for node in self.ray.nodes() if node["Alive"] and node["Resources"].get("CPU")]
-        here = self.ray.get_runtime_context().get_node_id()
         asked = {}
         for node in nodes:
-            if node["NodeID"] != here:
-                there = self.ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
-                task = self.ray.remote(code_version).options(num_cpus=0, scheduling_strategy=there, max_retries=0)
-                asked[node["NodeManagerHostname"], node["NodeManagerAddress"]] = task.remote()
+            there = self.ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+            task = self.ray.remote(code_version).options(num_cpus=0, scheduling_strategy=there, max_retries=0)
+            asked[node["NodeID"], node["NodeManagerHostname"], node["NodeManagerAddress"]] = task.remote()
         self.ray.wait([*asked.values(), self.ray.put(None)], num_returns=len(asked) + 1, timeout=patience)
-        for (name, address), reference in asked.items():
+        for (_, name, address), reference in asked.items():
             try:
                 found = self.ray.get(reference, timeout=0)
             except self.ray.exceptions.GetTimeoutError:

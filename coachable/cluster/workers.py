@@ -113,7 +113,7 @@ class Workers:
         self._offer = _Offer()
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
-        self._last = 0.0  # time of the last batch, or since when the queue has been full [s]
+        self._last = 0.0  # when a batch arrived, a worker started, or the queue was full [s]
         self._raised: set[int] = set()  # workers that raised an error before any batch arrived
         self._delivered = False
         self._reason = "none has started"
@@ -190,7 +190,8 @@ class Workers:
             if not slot.is_ready:
                 slot.is_ready = True
                 slot.pid, slot.host = answer
-                self._last = time.monotonic()
+                if not slot.failures:  # one that dies after every start does not count
+                    self._last = time.monotonic()
                 continue
             slot.failures = 0
             self._last, self._delivered = time.monotonic(), True

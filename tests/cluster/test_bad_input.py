@@ -1,8 +1,11 @@
 """What collection on Ray refuses, in one sentence that names the setting, before training starts."""
 
 import os
+import re
 import shutil
 import socket
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -66,16 +69,20 @@ def test_fewer_cores_than_workers(cluster):
 @pytest.mark.ray
 def test_a_node_with_another_coachable(cluster, tmp_path):
     """The node's processes find a changed copy of the package first."""
-    shutil.copytree(ROOT / "coachable", tmp_path / "coachable", ignore=shutil.ignore_patterns("__pycache__", "*.pt"))
-    with (tmp_path / "coachable" / "keys.py").open("a") as file:
+    other = tmp_path / "other"
+    shutil.copytree(ROOT / "coachable", other / "coachable", ignore=shutil.ignore_patterns("__pycache__", "*.pt"))
+    with (other / "coachable" / "keys.py").open("a") as file:
         file.write("# changed\n")
-    other = cluster.add(env_vars={"PYTHONPATH": str(tmp_path)})
+    node = cluster.add(env_vars={"PYTHONPATH": str(other)})
     try:
-        with pytest.raises(ClusterError, match=r"^collector=ray: node .* has Python .*, the learner has ") as refused:
-            Connection(None, 1, 1.0, 120.0)
-        assert code_version() in str(refused.value)
+        # In a folder without the package: Ray's processes look into the driver's folder first.
+        connect = "from coachable.cluster.connection import Connection; Connection(None, 1, 1.0, 120.0)"
+        ended = subprocess.run([sys.executable, "-c", connect], cwd=tmp_path, capture_output=True, text=True)
     finally:
-        cluster.remove(other)
+        cluster.remove(node)
+    said = ended.stderr.strip().splitlines()[-1]
+    assert re.search(r"ClusterError: collector=ray: node .* has Python .*, the learner has ", said), ended.stderr
+    assert said.endswith(f"{code_version()}: expected the same on every node")
 
 
 @pytest.mark.ray
@@ -92,8 +99,7 @@ def test_a_local_ray_leaves_nothing_behind(monkeypatch, tmp_path):
     pytest.importorskip("ray")
     import tempfile
 
-    import psutil
-
+    psutil = pytest.importorskip("psutil")
     monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     with tempfile.TemporaryDirectory(prefix="r", dir="/tmp") as folder:  # sockets need a short path
