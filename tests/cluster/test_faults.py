@@ -13,7 +13,7 @@ import torch
 from coachable.cluster import ClusterError
 from coachable.cluster.flat_weights import load_flat_weights, portable_copy
 from coachable.training.checkpoint import find_checkpoint, read_state
-from tests.cluster.workers_of_tests import NUM_ENVS, STEPS, Watch, cluster_train
+from tests.cluster.workers_of_tests import Watch, cluster_train
 
 pytestmark = [pytest.mark.ray, pytest.mark.filterwarnings("ignore:a Ray worker was lost")]
 
