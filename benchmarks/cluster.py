@@ -44,7 +44,7 @@ QUICK += [
 FLEET = {
     "humanoid": ("humanoid_sac", ["preset=cpu"]),
     "combat": ("combat_cat_rac", ["preset=small"]),
-    "pendulum": ("cheetah_speed", ["preset=cpu", "env={_target_: cluster_pendulum.pendulum, num_envs: 1}"]),
+    "pendulum": ("cheetah_speed", ["preset=cpu", "env._target_=cluster_pendulum.pendulum", "~env.seconds"]),
 }
 RATE = 5.0  # [env-steps/s] of a worker, as a game console gives them
 
