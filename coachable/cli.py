@@ -5,6 +5,7 @@ import glob
 import math
 import runpy
 import sys
+import time
 import zipfile
 from collections.abc import Callable, Sequence
 from importlib import import_module
@@ -69,7 +70,9 @@ def _parser() -> argparse.ArgumentParser:
 
     train = command("train", _train, "train an agent with a recipe, as python recipes/RECIPE.py does")
     train.add_argument("recipe", choices=sorted(_recipes()), help="one of %(choices)s")
-    train.add_argument("arguments", nargs=argparse.REMAINDER, help="KEY=VALUE ..., or --help for all of them")
+    train.add_argument(
+        "arguments", nargs=argparse.REMAINDER, help="KEY=VALUE ... seeds=0,1,2, or --help for all of them"
+    )
 
     evaluate = command("evaluate", _measure, "measure every style of an agent: tables and a figure", _SOURCE_HELP)
     _add_out(evaluate, "evaluation", "folder")
@@ -153,10 +156,29 @@ def _recipes() -> dict[str, Path]:
 
 def _train(options: argparse.Namespace) -> int:
     file = _recipes()[options.recipe]
+    if many := [argument for argument in options.arguments if argument.startswith("seeds=")]:
+        return _train_seeds(file, [argument for argument in options.arguments if argument not in many], many[-1])
     sys.path.insert(0, str(file.parent))  # as python does for a script
     sys.argv = [str(file), *options.arguments]
     runpy.run_path(str(file), run_name="__main__")
     return 0
+
+
+def _train_seeds(file: Path, arguments: list[str], seeds: str) -> int:
+    from coachable.evaluation.many_seeds import parse_seeds, seed_table, train_seeds
+
+    given = [argument.partition("=") for argument in arguments]
+    for key in ("seed", "resume", "stage"):
+        if any(name == key for name, _, _ in given):
+            raise ValueError(f"{seeds} with {key}=...: expected one of them; the same command continues all seeds")
+    folders = [value for name, _, value in given if name == "run_dir"]
+    folder = Path(folders[-1] if folders else f"runs/{file.stem}/seeds_{time.strftime('%Y-%m-%d_%H-%M-%S')}")
+    arguments = [argument for argument in arguments if not argument.startswith("run_dir=")]
+    chosen = parse_seeds(seeds.partition("=")[2])
+    print(f"Writing to {folder}; run_dir={folder} continues what Ctrl-C interrupts", flush=True)
+    failed = train_seeds(file, arguments, chosen, folder)
+    print(seed_table(folder, chosen, failed))
+    return 1 if failed else 0
 
 
 def _measure(options: argparse.Namespace) -> int:

@@ -2,6 +2,7 @@
 
 import os
 import platform
+import socket
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,6 +16,8 @@ __all__ = ["Check", "examine"]
 Verdict = Literal["ok", "note", "problem"]
 _SHOWN = ("torch", "torchrl", "tensordict", "mujoco", "dm_control", "numpy", "hydra-core", "wandb")
 PYTHON = ((3, 11), (3, 12))  # first and last version for which all dependencies have files
+RAY = ((2, 50), (3, 0))  # first version that works, and the first that is not known to
+_RAY_PORTS = {6379: "cluster", 8265: "dashboard and jobs", 10001: "clients"}  # of `ray start --head`
 _REINSTALL = "pip install coachable (in a clone: pip install -e .) in a fresh environment"
 
 
@@ -34,8 +37,8 @@ class Check:
 
 
 def examine() -> list[Check]:
-    """Check versions, MuJoCo, rendering, precision, threads and extras, without changing anything."""
-    parts: tuple[Callable[[], list[Check]], ...] = (_versions, _mujoco, _rendering, _hardware, _extras)
+    """Check versions, MuJoCo, rendering, precision, threads, extras and Ray, without changing anything."""
+    parts: tuple[Callable[[], list[Check]], ...] = (_versions, _mujoco, _rendering, _hardware, _extras, _ray)
     return [check for part in parts for check in part()]
 
 
@@ -120,6 +123,28 @@ def _extras() -> list[Check]:
         finding = f"not installed ({', '.join(missing)}): {how_to_install(extra)}" if missing else "installed"
         checks.append(Check(f"[{extra}]", "note" if missing else "ok", finding))
     return checks
+
+
+def _ray() -> list[Check]:
+    """Check Ray's version and the ports that `ray start --head` listens at, if Ray is installed."""
+    version = installed("ray")
+    if version is None:
+        return []
+    if not RAY[0] <= tuple(map(int, version.split(".")[:2])) < RAY[1]:
+        first, end = (".".join(map(str, bound)) for bound in RAY)
+        return [Check("ray", "problem", f"{version}: expected at least {first} and less than {end}")]
+    taken = [port for port in _RAY_PORTS if _is_taken(port)]
+    if taken:
+        named = ", ".join(f"{port} ({_RAY_PORTS[port]})" for port in taken)
+        finding = f"{version}; a program listens at {named}: a cluster of this host, or ray start --head needs others"
+        return [Check("ray", "note", finding)]
+    return [Check("ray", "ok", f"{version}; its ports {', '.join(map(str, _RAY_PORTS))} are free on this host")]
+
+
+def _is_taken(port: int) -> bool:
+    with socket.socket() as tried:
+        tried.settimeout(0.5)
+        return tried.connect_ex(("127.0.0.1", port)) == 0
 
 
 def _major(version: str) -> int:

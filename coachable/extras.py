@@ -9,6 +9,7 @@ EXTRAS = {
     "export": ("onnx", "onnxruntime", "onnxscript"),
     "explain": ("captum",),
     "gym": ("gymnasium",),
+    "cluster": ("ray",),
 }
 
 

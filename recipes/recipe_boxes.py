@@ -25,6 +25,7 @@ from coachable.keys import STYLE_FEATURES
 from coachable.replay import EventTableBuffer
 from coachable.replay.replay_files import replay_bytes
 from coachable.styles import StyleReward, StyleSpace
+from coachable.training.async_collector import AsyncCollector
 from coachable.training.checkpoint import CheckpointStore, check_unused, check_writable
 from coachable.training.collection import evaluate_policy, simulation_env
 from coachable.training.hardware import pick_device, share_threads
@@ -74,6 +75,8 @@ def start_run(config: dict[str, Any]) -> Run:
     seed_everything(settings.seed)
     device = pick_device(settings.device)
     per_simulator = max(1, threads.simulator // settings.collector["num_collectors"])
+    if "cpus_per_worker" in settings.collector:  # of machines that may be others than this one
+        per_simulator = max(1, int(settings.collector["cpus_per_worker"]))
     return Run(config, typed_settings(config), device, per_simulator, threads.learner)
 
 
@@ -195,7 +198,7 @@ def make_replay(run: Run, env: EnvBase, *transforms: Transform) -> ReplayBuffer:
     return replay
 
 
-def make_collector(run: Run, make_env: Callable[..., EnvBase], actor: nn.Module) -> BaseCollector:
+def make_collector(run: Run, make_env: Callable[..., EnvBase], actor: nn.Module) -> BaseCollector | AsyncCollector:
     """Make the collector of the group `collector`: in this process, in several processes, or on several hosts."""
     settings = run.settings
     return make(settings.collector)(
@@ -276,7 +279,7 @@ def _has_scenario_tables(settings: Settings) -> bool:
 def make_trainer(
     run: Run,
     env: EnvBase,
-    collector: BaseCollector,
+    collector: BaseCollector | AsyncCollector,
     replay: ReplayBuffer,
     learner: Learner,
     evaluate: Callable[[], dict[str, float]],

@@ -44,6 +44,12 @@ RANGES: dict[str, Range] = {entry.name: entry.metadata["range"] for entry in fie
     "check_every": AMOUNT,
     # collector, env and style_reward
     "num_collectors": COUNT,
+    "steps_per_batch": COUNT,
+    "cpus_per_worker": POSITIVE,
+    "weights_every": COUNT,
+    "queue_size": COUNT,
+    "worker_throttle": Range("(0, inf)", optional=True),
+    "patience": POSITIVE,
     "num_envs": COUNT,
     "episode_steps": COUNT,
     "seconds": POSITIVE,

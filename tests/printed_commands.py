@@ -29,6 +29,7 @@ NOT_RUN = {
     r"^\S+ -m (venv|pip) |^pip ": "installs packages, which .ci/run does",
     r"pytest": "the tests, which .ci/run runs, and benchmarks",
     r"^coachable (coach|evaluate|explain|export|report|train RECIPE)$": "the name of a command, not one to be typed",
+    r"collector=ray": "needs the extra [cluster], and most of them a cluster",
     r"preset=smoke|--help": "",  # is run
     r"runs/": "needs a training of minutes to hours, or is one",
     r"^python recipes/": "a training of minutes to hours",

@@ -17,7 +17,7 @@ FILES = {
 }
 
 # Small modules at the top level that know no room.
-BASE = {"extras", "files", "finite", "gl", "keys", "offscreen", "ranges", "third_party"}
+BASE = {"code_version", "extras", "files", "finite", "gl", "keys", "offscreen", "ranges", "third_party"}
 
 # Of each room, the rooms below it that it may import; what these may import it may, too.
 ROOMS = {
@@ -31,6 +31,7 @@ ROOMS = {
     "domain": {"defaults"},  # the type of a declaration
     "training": {"domain", "losses", "replay"},
     "fast": {"losses", "training"},
+    "cluster": {"training"},
     "gym": {"transforms"},
     "export": {"training"},
     "evaluation": {"training", "export"},

@@ -1,6 +1,7 @@
 """The `coachable` command and its doctor."""
 
 import re
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -183,6 +184,21 @@ def test_the_doctor_finds_a_broken_mujoco(monkeypatch, capsys, versions, message
     monkeypatch.setattr(doctor, "installed", lambda name: versions.get(name, real(name)))
     assert main(["doctor"]) == 1
     assert re.search(rf"^problem .*{re.escape(message)}", capsys.readouterr().out, re.MULTILINE)
+
+
+@pytest.mark.parametrize("version, verdict", [("2.60.0", "ok"), ("2.49.1", "problem"), ("3.0.0", "problem")])
+def test_the_doctor_checks_ray_and_its_ports(monkeypatch, version, verdict):
+    real = doctor.installed
+    monkeypatch.setattr(doctor, "installed", lambda name: version if name == "ray" else real(name))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        free = {}
+        monkeypatch.setattr(doctor, "_RAY_PORTS", free)
+        assert [check.verdict for check in doctor._ray()] == [verdict]
+        port = server.getsockname()[1]
+        free[port] = "cluster"
+        (check,) = doctor._ray()
+        assert check.verdict == ("note" if verdict == "ok" else verdict)
+        assert verdict != "ok" or f"a program listens at {port} (cluster)" in check.finding
 
 
 def test_the_doctor_finds_what_is_missing(monkeypatch, capsys):

@@ -222,17 +222,20 @@ class EventTableBuffer(TensorDictReplayBuffer):
         """Add one step; see `extend`."""
         return self.extend(data.unsqueeze(0))
 
-    def finish(self) -> Tensor:
-        """End every open episode at its last step, for instance because the environments are going to be reset.
+    def finish(self, trajectories: Tensor | None = None) -> Tensor:
+        """End open episodes at their last step, for instance because the environments are going to be reset.
 
         Unfinished n-step sums are written and bootstrap from the last state. Later windows do not include earlier
         steps. Also call this after loading a checkpoint, unless the environments were restored with it.
+
+        Args:
+            trajectories: Trajectory numbers of the episodes to end; None ends all.
 
         Returns:
             Slots `(slots,)` of the written records.
         """
         with self._replay_lock, self._write_lock:
-            index = self._writer.finish()
+            index = self._writer.finish(None if trajectories is None else trajectories.cpu().numpy())
             self._sampler.extend(index)
         return index
 

@@ -66,11 +66,27 @@ class NStep:
             steps = Steps.cat([self._steps, steps])
         return self._emit(data, steps, finish=False)
 
-    def flush(self) -> tuple[TensorDictBase, Steps] | None:
-        """Return the steps that are held back, with their sums ended at the last step, or None without such steps."""
+    def flush(self, streams: np.ndarray | None = None) -> tuple[TensorDictBase, Steps] | None:
+        """Return steps that are held back, with their sums ended at the last step.
+
+        Args:
+            streams: The streams whose steps to return; None returns all.
+
+        Returns:
+            The transitions and their bookkeeping, or None without such steps.
+        """
         if self._data is None or self._steps is None:
             return None
-        return self._emit(self._data, self._steps, finish=True)
+        if streams is None:
+            return self._emit(self._data, self._steps, finish=True)
+        ending = np.isin(self._steps.stream, streams)
+        if not ending.any():
+            return None
+        data, steps = self._data, self._steps
+        emitted = self._emit(data[torch.from_numpy(ending)], steps[ending], finish=True)
+        if not ending.all():
+            self._data, self._steps = data[torch.from_numpy(~ending)], steps[~ending]
+        return emitted
 
     def _emit(self, data: TensorDictBase, steps: Steps, finish: bool) -> tuple[TensorDictBase, Steps]:
         cut = steps.in_episodes()

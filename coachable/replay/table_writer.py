@@ -101,12 +101,12 @@ class TableWriter(Writer):
             rows, steps = self.n_step.push(rows, steps)
         return self._write(rows, steps)
 
-    def finish(self) -> Tensor:
-        """End every open episode at its last step; see `EventTableBuffer.finish`."""
-        rest = self.n_step.flush() if self.n_step is not None else None
+    def finish(self, streams: np.ndarray | None = None) -> Tensor:
+        """End the open episodes of some streams, or of all; see `EventTableBuffer.finish`."""
+        rest = self.n_step.flush(streams) if self.n_step is not None else None
         slots = self._write(*rest) if rest is not None else torch.zeros(0, dtype=torch.long)
         if self.history is not None:
-            self.history.clear()
+            self.history.clear(streams)
         return slots
 
     def _write(self, rows: TensorDictBase, steps: Steps) -> Tensor:

@@ -44,9 +44,14 @@ class WindowHistory:
         self.patience = patience
         self.clear()
 
-    def clear(self) -> None:
-        """Drop every open episode."""
-        self._allocate(1)
+    def clear(self, streams: Array | None = None) -> None:
+        """Drop the open episodes of some streams, or all."""
+        if streams is None:
+            self._allocate(1)
+            return
+        rows = self._find(streams)
+        self.key[rows[rows >= 0]] = -1
+        self._sorted = None
 
     def __len__(self) -> int:
         """Return the number of open episodes."""

@@ -1,13 +1,10 @@
 """Construction of collectors, saving and restoring their state, and a short evaluation of a policy."""
 
 import multiprocessing
-import os
 import signal
-import sys
 import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from importlib.util import find_spec
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -17,6 +14,7 @@ from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 
+from coachable.training.async_collector import AsyncCollector
 from coachable.training.rng import preserved_rng
 from coachable.training.simulators import ResumableEnv, UnsavableError, load_simulator, save_simulator
 from coachable.training.worker_errors import ReportingCollector
@@ -30,6 +28,9 @@ __all__ = [
     "make_collector",
     "simulation_env",
 ]
+
+
+_ELSEWHERE = "environments in other processes cannot be saved (collector=direct saves its own)"
 
 
 @runtime_checkable
@@ -61,15 +62,14 @@ def make_collector(
         policy: The actor. With `backend="direct"` the collector shares it, so that updates need no copy.
         frames_per_batch: Number of env-steps per iteration, a multiple of N.
         init_random_frames: Number of env-steps with uniformly random actions at the start.
-        backend: "direct" (this process), "process" (one host) or "ray" (several hosts).
-        num_collectors: Number of workers with "process" and "ray".
+        backend: "direct" (this process) or "process" (one host); for several hosts see `coachable.cluster`.
+        num_collectors: Number of workers with "process".
         sync: Whether an iteration waits for all workers.
         seed: Seed of the first worker; worker i gets `seed + i`.
         policy_device: Device of the policy; None for the device of the environment.
 
     Raises:
         ValueError: If the backend is unknown.
-        ImportError: If the backend is "ray" and Ray is not installed.
     """
     common: dict[str, Any] = {
         "frames_per_batch": frames_per_batch,
@@ -89,41 +89,14 @@ def make_collector(
         if isinstance(simulation, SelfPlayEnv):
             simulation.follow(policy)
         return collector
-    if backend in ("process", "ray"):
+    if backend == "process":
         factories = [_SeededFactory(make_env, seed + i) for i in range(num_collectors)]
         receiver, sender = multiprocessing.Pipe(duplex=False)
-        reporting = plain | {"collector_class": ReportingCollector(sender)}
-        common |= reporting if backend == "process" else _ray_options(num_collectors, plain)
+        common |= plain | {"collector_class": ReportingCollector(sender)}
         workers: Any = Collector(factories, policy, backend=backend, num_collectors=num_collectors, sync=sync, **common)
-        if backend == "process":
-            workers.worker_errors = receiver  # read by `check_workers`
-        else:
-            workers.update_policy_weights_(policy)  # RayCollector needs the weights before the first batch
+        workers.worker_errors = receiver  # read by `check_workers`
         return workers
-    raise ValueError(f"collector backend must be direct, process or ray, got {backend!r}")
-
-
-def _ray_options(num_collectors: int, plain: dict[str, Any]) -> dict[str, Any]:
-    if find_spec("ray") is None:
-        raise ImportError("collector=ray needs Ray: pip install 'coachable[cluster]', or choose collector=process")
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray reports its use over the network otherwise
-    return {
-        "total_frames": sys.maxsize,  # RayCollector has no value for "no limit"
-        "collector_kwargs": [plain | {"postproc": _OwnTrajectories(i, num_collectors)} for i in range(num_collectors)],
-        "ray_init_config": {"include_dashboard": False, "log_to_driver": False, "logging_level": "warning"},
-    }
-
-
-@dataclass(eq=False)
-class _OwnTrajectories:
-    """Postprocessor that makes a worker's trajectory numbers, which start at 0, unique among all workers."""
-
-    worker: int
-    workers: int
-
-    def __call__(self, data: TensorDictBase) -> TensorDictBase:
-        key = ("collector", "traj_ids")
-        return data.set(key, data.get(key) * self.workers + self.worker)
+    raise ValueError(f"collector backend must be direct or process, got {backend!r}")
 
 
 @dataclass(eq=False)
@@ -147,7 +120,7 @@ def simulation_env(env: EnvBase) -> EnvBase:
     return env
 
 
-def collector_state(collector: BaseCollector) -> dict[str, Any]:
+def collector_state(collector: BaseCollector | AsyncCollector) -> dict[str, Any]:
     """Return everything that a collector's next iteration depends on, except the policy and the global generators.
 
     Returns:
@@ -155,6 +128,8 @@ def collector_state(collector: BaseCollector) -> dict[str, Any]:
         the tensordict from which the next step starts. `not_saved` is the reason if the latter two are missing. If the
         workers run in other processes, only the counts are returned.
     """
+    if isinstance(collector, AsyncCollector):
+        return collector.state_dict()
     counts: Any = collector  # typed too narrowly in TorchRL
     state: dict[str, Any] = {
         "frames": int(getattr(counts, "_frames", 0)),
@@ -173,7 +148,7 @@ def collector_state(collector: BaseCollector) -> dict[str, Any]:
     return state
 
 
-def load_collector_state(collector: BaseCollector, state: dict[str, Any]) -> None:
+def load_collector_state(collector: BaseCollector | AsyncCollector, state: dict[str, Any]) -> None:
     """Restore what `collector_state` returned.
 
     Args:
@@ -183,11 +158,14 @@ def load_collector_state(collector: BaseCollector, state: dict[str, Any]) -> Non
     Raises:
         UnsavableError: If the running episodes cannot be continued. They restart, and everything else is restored.
     """
+    if isinstance(collector, AsyncCollector):
+        collector.load_state_dict(state)
+        raise UnsavableError(_ELSEWHERE)
     counts: Any = collector  # typed too narrowly in TorchRL
     counts._frames, counts._iter = int(state.get("frames", 0)), int(state.get("iterations", 0))
     if not isinstance(collector, Collector):
         counts.update_policy_weights_()  # before the first step
-        raise UnsavableError("environments in other processes cannot be saved (collector=direct saves its own)")
+        raise UnsavableError(_ELSEWHERE)
     env = collector.env
     if isinstance(env, TransformedEnv):
         env.load_state_dict(state["transforms"])

@@ -19,6 +19,7 @@ from coachable.finite import NonFiniteError, require_finite
 from coachable.keys import EVENTS, SCENARIO, STYLE, STYLE_FEATURES, TASK_REWARD
 from coachable.replay import EventTableBuffer
 from coachable.replay.replay_files import read_replay
+from coachable.training.async_collector import AsyncCollector
 from coachable.training.checkpoint import CheckpointStore, find_checkpoint, read_state
 from coachable.training.collection import collector_state, load_collector_state, simulation_env
 from coachable.training.episodes import EpisodeStatistics, Means
@@ -68,7 +69,7 @@ class Trainer:
     """Training loop that runs until `total_frames`, a stop signal or an error.
 
     Args:
-        collector: TorchRL collector.
+        collector: TorchRL collector, or an `AsyncCollector`.
         replay: Replay buffer whose `sample(batch_size)` returns batches for the learner.
         learner: Learner that makes the updates.
         settings: Settings of the loop, see `TrainSettings`.
@@ -84,7 +85,7 @@ class Trainer:
     def __init__(
         self,
         *,
-        collector: BaseCollector,
+        collector: BaseCollector | AsyncCollector,
         replay: ReplayBuffer,
         learner: Learner,
         settings: TrainSettings,
@@ -130,7 +131,7 @@ class Trainer:
         Raises:
             NonFiniteError: If a number in a transition, loss or gradient is not finite, or a weight was not finite at
                 the start. Such a number is not stored, no weight is changed by it, and no checkpoint is written.
-            WorkerError: If a worker process ended with an error; no checkpoint is written.
+            WorkerError: If a worker process ended with an error, or no worker can be had; no checkpoint is written.
         """
         if self.frames == 0:
             self.log.rewind(0)  # drops rows of a training that was killed before its first checkpoint
@@ -160,6 +161,8 @@ class Trainer:
             self._throttle.wait()
         with self._timed("collect"):
             data = next(batches)
+        if isinstance(self.collector, AsyncCollector) and isinstance(self.replay, EventTableBuffer):
+            self.replay.finish(self.collector.interrupted())
         self.frames += data.numel()
         self._throttle.add(data.numel())
         return data
@@ -180,15 +183,16 @@ class Trainer:
         with self._timed("update"), self.learner.backend.working():
             self.learner.scale_learning_rates(self.settings.learning_rate_factor(self.frames))
             self.learner.scale_entropy_weight(self.settings.entropy_factor(self.frames))
-            if self.settings.utd_ratio is None:  # update until the throttle allows the next frames
-                while self._throttle.remaining() > 0 and not stop.is_set():
+            if self.settings.utd_ratio is None:  # update until the next frames are allowed and, from workers, here
+                while (self._throttle.remaining() > 0 or self._waits_for_workers()) and not stop.is_set():
                     self._update_once()
             else:
                 self.owed += new_frames * self.settings.utd_ratio
                 while self.owed >= 1.0:
                     self._update_once()
                     self.owed -= 1.0
-            if not isinstance(self.collector, Collector):  # a single-process collector shares the learner's weights
+            # A single-process collector shares the learner's weights, and an `AsyncCollector` hears of every update.
+            if not isinstance(self.collector, Collector | AsyncCollector):
                 check_workers(self.collector)
                 self.collector.update_policy_weights_()  # pyright: ignore[reportCallIssue]
 
@@ -199,6 +203,11 @@ class Trainer:
         self._losses.add(self.learner.update(batch))
         if isinstance(self.replay, EventTableBuffer):
             self.replay.update_tensordict_priority(batch)
+        if isinstance(self.collector, AsyncCollector):
+            self.collector.after_update(self.learner.updates)
+
+    def _waits_for_workers(self) -> bool:
+        return isinstance(self.collector, AsyncCollector) and not self.collector.has_batch()
 
     def _evaluate_if_due(self) -> None:
         interval = self.settings.eval_interval
@@ -228,6 +237,8 @@ class Trainer:
             if isinstance(self.replay, EventTableBuffer):
                 tables = self.replay.statistics()
                 row |= {f"tables/{name}/{key}": tables[name][key] for name in tables for key in ("size", "events")}
+            if isinstance(self.collector, AsyncCollector):
+                row |= self.collector.metrics()
             self._latest |= row
             self._write({**self._position(), **self._minutes(), **row})
 

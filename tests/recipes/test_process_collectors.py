@@ -1,4 +1,4 @@
-"""Every recipe with its simulators in processes of their own, and one on Ray."""
+"""Every recipe with its simulators in processes of their own."""
 
 import multiprocessing
 import os
@@ -11,12 +11,11 @@ from importlib import import_module
 import pytest
 import torch
 from recipe_config import compose_config, run_recipe
-from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 from coachable.styles import StyleReward, Term
 from coachable.training.checkpoint import find_checkpoint, read_state
-from coachable.training.collection import _ray_options, make_collector
+from coachable.training.collection import make_collector
 from coachable.training.episodes import EpisodeSums
 from coachable.transforms import coachable_env
 from tests.echo import StyleEchoEnv, echo_space
@@ -167,44 +166,3 @@ def test_the_end_of_a_worker_in_a_later_step_is_one_sentence(
     assert re.fullmatch(rf"error: a worker process {end}\. {stopped}", str(ended.value.code))
     assert not multiprocessing.active_children()
     assert read_state(find_checkpoint(tmp_path))["loop"]["frames"] > 0  # of an earlier iteration
-
-
-def test_without_ray_the_error_names_the_extra(monkeypatch):
-    monkeypatch.setattr("coachable.training.collection.find_spec", lambda name: None)
-    with pytest.raises(ImportError, match=r"collector=ray needs Ray: pip install 'coachable\[cluster\]'"):
-        make_collector(lambda seed: None, None, frames_per_batch=4, backend="ray")
-
-
-def test_ray_workers_number_their_trajectories_apart(monkeypatch):
-    """And `RayCollector`, which stops at a number of frames, is given one that nobody reaches."""
-    monkeypatch.setattr("coachable.training.collection.find_spec", lambda name: name)  # Ray need not be installed
-    options = _ray_options(3, {"auto_register_policy_transforms": False})
-    assert options["total_frames"] > 10**15
-    numbers = []
-    for worker in options["collector_kwargs"]:
-        assert worker["auto_register_policy_transforms"] is False
-        data = TensorDict({"collector": {"traj_ids": torch.tensor([0, 1, 5])}}, [3])
-        numbers += worker["postproc"](data)["collector", "traj_ids"].tolist()
-    assert len(set(numbers)) == 9
-
-
-@pytest.mark.ray
-def test_ray_workers_train(tmp_path):
-    """Two local workers: every batch comes from both, with the weights of the last update."""
-    ray = pytest.importorskip("ray")
-    train = build("humanoid_sac", tmp_path, "collector=ray", "collector.num_collectors=2", "train.total_frames=80")
-    trajectories = []
-    store = train._store
-
-    def keep(data):
-        trajectories.append(data["collector", "traj_ids"].flatten(1).unique(dim=1))
-        store(data)
-
-    train._store = keep
-    distances = watch_actions(train)
-    train.run()
-    assert train.frames == 80
-    require_trained(train, distances)
-    first, second = torch.cat(trajectories, 1)
-    assert not set(first.tolist()) & set(second.tolist()), "a trajectory belongs to one worker"
-    assert not ray.is_initialized()

@@ -3,7 +3,7 @@
 import torch
 from tensordict import TensorDict
 
-from coachable.replay import EventTableBuffer, KeyRoute
+from coachable.replay import EventTableBuffer, KeyEvents, KeyRoute
 
 
 def test_n_step_closed_forms():
@@ -62,3 +62,35 @@ def test_n_step_is_assembled_before_routing():
     buffer.extend(TensorDict({"scenario": torch.tensor([0, 1, 0]), "next": nxt}, [3]))
     assert buffer.table("a")["next", "reward"].tolist() == [[11.0]]
     assert buffer.table("b")["next", "reward"].tolist() == [[110.0]]
+
+
+def test_trajectories_that_were_interrupted_are_ended_alone():
+    """The sums of their last steps are written without termination, and later events do not look back to them."""
+    buffer = EventTableBuffer(
+        {"default": 20, "hit": 20}, events=KeyEvents(["hit"]), event_horizon=4, n_steps=3, gamma=0.5
+    )
+
+    def step(numbers, reward, hit=False):
+        flags = torch.zeros(len(numbers), 1, dtype=torch.bool)
+        nxt = {"reward": torch.full((len(numbers), 1), reward), "done": flags, "terminated": flags}
+        nxt["events"] = torch.full((len(numbers), 1), hit)
+        numbers = torch.tensor(numbers)
+        return TensorDict({"collector": {"traj_ids": numbers}, "next": nxt}, [len(numbers)])
+
+    buffer.extend(step([7, 8], 1.0))
+    buffer.extend(step([7, 8], 2.0))
+    assert len(buffer) == 0
+    buffer.finish(torch.tensor([], dtype=torch.long))
+    buffer.finish(torch.tensor([8, 5]))
+    table = buffer.table("default")
+    assert table["collector", "traj_ids"].tolist() == [8, 8]
+    assert table["next", "reward"].flatten().tolist() == [2.0, 2.0]
+    assert table["discount"].flatten().tolist() == [0.25, 0.5] and not table["next", "terminated"].any()
+    buffer.extend(step([7, 9], 4.0))  # 9 is the environment of 8 after the interruption
+    buffer.extend(step([7, 9], 8.0, hit=True))
+    buffer.finish()
+    table = buffer.table("default")
+    of = {number: table[table["collector", "traj_ids"] == number] for number in (7, 8, 9)}
+    assert of[7]["next", "reward"].flatten().tolist() == [3.0, 6.0, 8.0, 8.0]
+    assert of[9]["next", "reward"].flatten().tolist() == [8.0, 8.0]
+    assert buffer.table("hit")["collector", "traj_ids"].tolist() == [7, 7, 7, 7, 9, 9]

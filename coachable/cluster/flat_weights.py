@@ -1,0 +1,41 @@
+"""A policy's weights as one flat vector, and a copy of the policy that can be sent to another machine."""
+
+from copy import deepcopy
+
+import torch
+from torch import Tensor, nn
+
+__all__ = ["flat_weights", "load_flat_weights", "portable_copy"]
+
+
+def flat_weights(policy: nn.Module) -> Tensor:
+    """Return all parameters and buffers of floating point as one new vector (float32) in the CPU's memory."""
+    return torch.cat([value.detach().reshape(-1).float() for value in _values(policy)]).cpu()
+
+
+def load_flat_weights(policy: nn.Module, flat: Tensor) -> None:
+    """Copy what `flat_weights` returned into a policy of the same shape.
+
+    Raises:
+        ValueError: If the number of weights differs.
+    """
+    values = _values(policy)
+    expected = sum(value.numel() for value in values)
+    if flat.numel() != expected:
+        raise ValueError(f"got {flat.numel()} weights: expected {expected}")
+    with torch.no_grad():
+        for value, part in zip(values, flat.split([value.numel() for value in values]), strict=True):
+            value.copy_(part.view_as(value))
+
+
+def portable_copy(policy: nn.Module) -> nn.Module:
+    """Return a copy of a policy on the CPU that shares no memory with it and has no gradients."""
+    copy = deepcopy(policy).cpu().requires_grad_(False)
+    for value in (*copy.parameters(), *copy.buffers()):
+        value.data = value.data.clone()  # parameters may be views of one vector, all of which would be pickled
+        value.grad = None
+    return copy
+
+
+def _values(policy: nn.Module) -> list[Tensor]:
+    return [value for value in (*policy.parameters(), *policy.buffers()) if value.is_floating_point()]

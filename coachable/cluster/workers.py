@@ -1,0 +1,260 @@
+"""Driver's side of the workers: a thread that asks them for batches and replaces those that die."""
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from torch import Tensor
+
+from coachable.cluster.connection import ClusterError
+from coachable.cluster.worker import Batch, RolloutWorker, WorkerSettings
+
+__all__ = ["Arrival", "Loss", "Slot", "Workers"]
+
+_LONGEST_PAUSE = 60.0  # [s] before a worker that fails again and again is started anew
+_WAIT = 0.1  # [s] of one wait for answers, after which everything else is looked at
+_WAIT_FOR_ROOM = 0.01  # [s] the same while workers are idle because the queue is full
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """Batch of a worker, in the queue."""
+
+    worker: int
+    start: int
+    batch: Batch
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Notice in the queue that a worker was lost, after all its batches."""
+
+    worker: int
+    text: str
+
+
+@dataclass(eq=False)
+class Slot:
+    """Place of a worker, which is filled again when the worker is lost.
+
+    Attributes:
+        worker: Number of the worker.
+        starts: How often it was started in the whole run.
+        actor: Its Ray actor, or None until it is started again.
+        call: Reference of the answer that it owes, or None while it is idle.
+        is_ready: Whether it has started, so that `call` is a batch.
+        since: Time of the call [s].
+        failures: Number of losses since its last batch.
+        retry: Time at which it is started again [s].
+        pid: Its process.
+        host: Its host.
+    """
+
+    worker: int
+    starts: int = 0
+    actor: Any = None
+    call: Any = None
+    is_ready: bool = False
+    since: float = 0.0
+    failures: int = 0
+    retry: float = 0.0
+    pid: int = 0
+    host: str = ""
+
+
+@dataclass
+class _Offer:
+    """Weights for the workers: the newest vector, and the reference of what was put into the object store."""
+
+    version: int = -1
+    flat: Tensor | None = None
+    stored: int = -1
+    reference: Any = None
+
+
+@dataclass
+class Workers:
+    """Workers and the thread that serves them.
+
+    Every worker owes at most one answer. While fewer than `queue_size` batches wait for the learner, an idle worker is
+    asked for the next one, with the newest weights. A worker that dies, raises an error, does not answer for half of
+    `patience` or does not start within it is replaced by a new actor, after a pause that doubles with every failure.
+
+    Args:
+        ray: The module of Ray.
+        task: `(make_env, policy)`, pickled.
+        count: Number of workers.
+        settings: Returns the settings of a worker from its number and start.
+        cpus_per_worker: Number of cores that each reserves.
+        queue_size: Number of batches that wait before workers are no longer asked.
+        patience: Time without any batch or start after which the training ends [s].
+        starts_at_once: Number of workers that may start at the same time, because each keeps a core busy for seconds.
+        is_random: Returns whether the next batch is collected with random actions.
+    """
+
+    ray: Any
+    task: bytes
+    count: int
+    settings: Callable[[int, int], WorkerSettings]
+    cpus_per_worker: float
+    queue_size: int
+    patience: float
+    starts_at_once: int
+    is_random: Callable[[], bool]
+    arrivals: queue.SimpleQueue[Arrival | Loss] = field(default_factory=queue.SimpleQueue)
+    error: BaseException | None = None
+    restarts: int = 0
+
+    def __post_init__(self) -> None:
+        self.slots = [Slot(number) for number in range(self.count)]
+        self._offer = _Offer()
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._last = 0.0  # when a batch arrived, a worker started, or the queue was full [s]
+        self._raised: set[int] = set()  # workers that raised an error before any batch arrived
+        self._delivered = False
+        self._reason = "none has started"
+
+    def offer(self, version: int, flat: Tensor) -> None:
+        """Offer new weights, which workers get when they are asked for their next batch."""
+        self._offer = _Offer(version, flat, self._offer.stored, self._offer.reference)
+
+    def start(self) -> None:
+        """Start the workers and the thread."""
+        self._last = time.monotonic()
+        self._thread = threading.Thread(target=self._serve, name="ray workers", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread and the workers."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+        for slot in self.slots:
+            self._kill(slot)
+
+    def alive(self) -> int:
+        """Return the number of workers that have started and were not lost."""
+        return sum(slot.is_ready for slot in self.slots)
+
+    def _serve(self) -> None:
+        try:
+            while not self._stop.is_set():
+                self._receive()
+                now = time.monotonic()
+                starting = sum(slot.actor is not None and not slot.is_ready for slot in self.slots)
+                for slot in self.slots:
+                    if slot.actor is None and slot.retry <= now and starting < self.starts_at_once:
+                        self._launch(slot)
+                        starting += 1
+                    elif slot.call is not None and now - slot.since > self._limit(slot):
+                        self._lose(slot, f"it did not answer for {self._limit(slot):g} s (see collector.patience)")
+                self._ask()
+                self._check_patience()
+        except BaseException as error:
+            self.error = error
+
+    def _limit(self, slot: Slot) -> float:
+        """Return the time for an answer [s]: all of the patience for a start, which needs cores and imports."""
+        return self.patience / 2 if slot.is_ready else self.patience
+
+    def _launch(self, slot: Slot) -> None:
+        actor = self.ray.remote(RolloutWorker).options(
+            num_cpus=self.cpus_per_worker, scheduling_strategy="SPREAD", max_restarts=0, max_task_retries=0
+        )
+        slot.actor = actor.remote()
+        slot.call = slot.actor.start.remote(self.task, self.settings(slot.worker, slot.starts))
+        slot.starts += 1
+        slot.since = time.monotonic()
+
+    def _receive(self) -> None:
+        slots = {slot.call: slot for slot in self.slots if slot.call is not None}
+        has_idle = len(slots) < sum(slot.actor is not None for slot in self.slots)
+        if not slots:
+            self._stop.wait(_WAIT_FOR_ROOM if has_idle else _WAIT)
+            return
+        ready, _ = self.ray.wait(list(slots), num_returns=1, timeout=_WAIT_FOR_ROOM if has_idle else _WAIT)
+        if ready and len(slots) > 1:
+            ready, _ = self.ray.wait(list(slots), num_returns=len(slots), timeout=0)
+        for reference in ready:
+            slot = slots[reference]
+            try:
+                answer = self.ray.get(reference)
+            except self.ray.exceptions.RayError as error:
+                self._lose(slot, self._reason_of(error), raised=isinstance(error, self.ray.exceptions.RayTaskError))
+                continue
+            slot.call = None
+            if not slot.is_ready:
+                slot.is_ready = True
+                slot.pid, slot.host = answer
+                if not slot.failures:  # one that dies after every start does not count
+                    self._last = time.monotonic()
+                continue
+            slot.failures = 0
+            self._last, self._delivered = time.monotonic(), True
+            self.arrivals.put(Arrival(slot.worker, slot.starts - 1, answer))
+
+    def _ask(self) -> None:
+        idle = [slot for slot in self.slots if slot.is_ready and slot.call is None]
+        for slot in sorted(idle, key=lambda slot: slot.since):  # whoever was asked longest ago comes first
+            if self.arrivals.qsize() >= self.queue_size:
+                self._last = time.monotonic()  # the workers wait for the learner, not the other way round
+                return
+            version, reference = self._stored_weights()
+            slot.call = slot.actor.collect.remote(version, [reference], self.is_random())
+            slot.since = time.monotonic()
+
+    def _stored_weights(self) -> tuple[int, Any]:
+        """Return the version and the reference of the newest weights, which are put into the object store if new."""
+        offer = self._offer
+        if offer.version > offer.stored and offer.flat is not None:
+            try:
+                offer.reference = self.ray.put(offer.flat.numpy())
+                offer.stored = offer.version
+            except (self.ray.exceptions.ObjectStoreFullError, self.ray.exceptions.OutOfDiskError) as error:
+                if offer.reference is None:
+                    raise ClusterError(
+                        f"collector=ray: the weights ({offer.flat.numel() * 4 / 1e6:.0f} MB) do not fit into Ray's "
+                        "object store: start Ray with a larger --object-store-memory"
+                    ) from error
+        return offer.stored, offer.reference
+
+    def _lose(self, slot: Slot, reason: str, raised: bool = False) -> None:
+        """Give a worker up, and plan its replacement."""
+        self._kill(slot)
+        pause = min(_LONGEST_PAUSE, 2.0**slot.failures)
+        slot.failures += 1
+        slot.retry = time.monotonic() + pause
+        self.restarts += 1
+        where = f" on {slot.host}" if slot.host else ""
+        self._reason = f"worker {slot.worker}{where}: {reason}"
+        self.arrivals.put(Loss(slot.worker, f"{self._reason}. It is started again in {pause:g} s"))
+        if raised and not self._delivered:
+            self._raised.add(slot.worker)
+            if len(self._raised) == self.count:
+                raise ClusterError(f"every Ray worker fails before its first batch; {self._reason}.")
+
+    def _kill(self, slot: Slot) -> None:
+        if slot.actor is not None:
+            self.ray.kill(slot.actor, no_restart=True)
+        slot.actor = slot.call = None
+        slot.is_ready = False
+
+    def _check_patience(self) -> None:
+        if time.monotonic() - self._last > self.patience:
+            raise ClusterError(
+                f"no Ray worker delivered a batch for {self.patience:g} s (collector.patience); {self._reason}."
+            )
+
+    def _reason_of(self, error: Any) -> str:
+        exceptions = self.ray.exceptions
+        if isinstance(error, exceptions.RayTaskError):
+            cause = error.cause if isinstance(error.cause, BaseException) else error
+            lines = [line.strip() for line in str(cause).splitlines() if line.strip()] or [""]
+            return f"{type(cause).__name__}: {lines[-1] if cause is error else lines[0]}".rstrip(".")
+        if isinstance(error, exceptions.RayActorError):
+            return "its node was lost" if "node" in str(error).lower() and "died" in str(error) else "its process died"
+        return type(error).__name__

@@ -1,0 +1,137 @@
+"""Training of one recipe with several seeds, side by side in processes of their own, and a table of the results."""
+
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from coachable.evaluation.curves import metrics_files, read_metric
+from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
+from coachable.training.hardware import detect
+
+__all__ = ["parse_seeds", "seed_table", "train_seeds"]
+
+_SHOWN = ("frames", "updates", "minutes", "episode/return", "eval/return")
+
+
+def parse_seeds(text: str) -> list[int]:
+    """Return the seeds of a list such as "0,1,2".
+
+    Raises:
+        ValueError: If an entry is not a whole number of at least 0, or repeats.
+
+    Example:
+        >>> parse_seeds("0,1,2")
+        [0, 1, 2]
+    """
+    entries = text.split(",")
+    if not all(entry.strip().isdecimal() for entry in entries) or len(set(map(int, entries))) < len(entries):
+        raise ValueError(f"seeds={text}: expected different whole numbers, such as seeds=0,1,2")
+    return [int(entry) for entry in entries]
+
+
+def train_seeds(script: Path, arguments: Sequence[str], seeds: Sequence[int], folder: Path) -> dict[int, str]:
+    """Train a recipe with several seeds, as many side by side as there are free cores.
+
+    The training with seed S writes to `folder/seed_S`, and what it prints to `folder/seed_S.log`. One that has ended is
+    not trained again, and one that was interrupted is continued with the settings that it had.
+
+    Args:
+        script: The recipe.
+        arguments: KEY=VALUE for all trainings.
+        seeds: The seeds.
+        folder: Folder of the trainings.
+
+    Returns:
+        What is wrong with the trainings that did not end, by seed.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    hardware = detect()
+    free = max(1, hardware.cores - round(hardware.busy))
+    at_once = min(len(seeds), free)
+    threads = [f"threads.{part}={free // at_once}" for part in ("simulator", "learner")]
+    threads = [text for text in threads if not any(said.startswith("threads.") for said in arguments)]
+    waiting = [seed for seed in seeds if not _has_ended(folder / f"seed_{seed}")]
+    running: dict[int, subprocess.Popen[bytes]] = {}
+    failed: dict[int, str] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < at_once:
+                seed = waiting.pop(0)
+                running[seed] = _start(script, [*arguments, *threads], seed, folder)
+            for seed in [seed for seed, process in running.items() if process.poll() is not None]:
+                if running.pop(seed).returncode:
+                    failed[seed] = _last_line(folder / f"seed_{seed}.log")
+            time.sleep(0.2)
+    except KeyboardInterrupt:  # reaches the trainings, too, which save a checkpoint
+        for process in running.values():
+            process.wait()
+    unfinished = [seed for seed in seeds if seed not in failed and not _has_ended(folder / f"seed_{seed}")]
+    return failed | dict.fromkeys(unfinished, "interrupted: the same command continues")
+
+
+def seed_table(folder: Path, seeds: Sequence[int], failed: Mapping[int, str]) -> str:
+    """Return the last metrics of the trainings as a table, with the mean and the standard deviation over the seeds.
+
+    Args:
+        folder: Folder of the trainings.
+        seeds: The seeds.
+        failed: From `train_seeds`.
+    """
+    columns = {name: [_last(folder / f"seed_{seed}", name) for seed in seeds] for name in _SHOWN}
+    columns = {name: values for name, values in columns.items() if any(value is not None for value in values)}
+    lines = [["seed", *columns, ""]]
+    for row, seed in enumerate(seeds):
+        lines.append([str(seed), *(_short(values[row]) for values in columns.values()), failed.get(seed, "")])
+    known = [[value for value in values if value is not None] for values in columns.values()]
+    lines.append(["mean", *(_short(statistics.mean(values)) for values in known), ""])
+    lines.append(["std", *(_short(statistics.stdev(values) if len(values) > 1 else None) for values in known), ""])
+    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
+    return "\n".join(
+        "  ".join(cell.rjust(width) for cell, width in zip(line[:-1], widths, strict=False)) + f"  {line[-1]}".rstrip()
+        for line in lines
+    )
+
+
+def _start(script: Path, arguments: Sequence[str], seed: int, folder: Path) -> "subprocess.Popen[bytes]":
+    run = folder / f"seed_{seed}"
+    try:
+        find_checkpoint(run)
+        chosen = [f"resume={run}"]
+    except CheckpointError:
+        chosen = [*arguments, f"seed={seed}", f"run_dir={run}"]
+    with (folder / f"seed_{seed}.log").open("ab") as log:
+        return subprocess.Popen(
+            [sys.executable, str(script), *chosen], stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=os.environ
+        )
+
+
+def _has_ended(run: Path) -> bool:
+    try:
+        state = read_state(find_checkpoint(run))
+    except CheckpointError:
+        return False
+    config = state["config"]
+    is_last = not config.get("stages") or config["stages"][-1]["stage"] == config["stage"]
+    return is_last and state["loop"]["frames"] >= config["train"]["total_frames"]
+
+
+def _last(run: Path, name: str) -> float | None:
+    if not metrics_files(run):
+        return None
+    try:
+        return float(read_metric(run, "frames", name)[1][-1])
+    except ValueError:  # there is no such column, or no row has it
+        return None
+
+
+def _last_line(log: Path) -> str:
+    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    return lines[-1] if lines else "ended without a word"
+
+
+def _short(value: float | None) -> str:
+    return "" if value is None else f"{value:.6g}"

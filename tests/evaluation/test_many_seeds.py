@@ -1,0 +1,72 @@
+"""Several trainings with different seeds: side by side, continued where they were interrupted, one table."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+from recipe_config import compose_config
+
+from coachable.cli import main
+from coachable.evaluation.many_seeds import parse_seeds
+from coachable.training.checkpoint import find_checkpoint, read_state
+
+TINY = ["preset=smoke", "train.total_frames=200", "threads.simulator=1", "threads.learner=1"]
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.mark.parametrize("text", ["", "1,", "1,1", "-1", "0.5", "1 2"])
+def test_seeds_that_are_no_list_of_seeds(text, capsys):
+    assert main(["train", "rare_targets", f"seeds={text}"]) == 2
+    assert f"seeds={text}: expected different whole numbers" in capsys.readouterr().err
+
+
+def test_seeds_are_not_given_twice(capsys):
+    assert parse_seeds("2,0") == [2, 0]
+    assert main(["train", "rare_targets", "seed=3", "seeds=0,1"]) == 2
+    assert "seeds=0,1 with seed=...: expected one of them" in capsys.readouterr().err
+
+
+def test_finished_trainings_are_shown_and_not_repeated(tmp_path, capsys):
+    for seed in (0, 1):
+        arguments = [*TINY, f"seed={seed}", f"run_dir={tmp_path / f'seed_{seed}'}"]
+        import_module("rare_targets").build(compose_config("rare_targets", arguments)).run()
+    before = [(tmp_path / f"seed_{seed}" / "metrics.csv").read_text() for seed in (0, 1)]
+    capsys.readouterr()
+    assert main(["train", "rare_targets", *TINY, "seeds=0,1", f"run_dir={tmp_path}"]) == 0
+    table = capsys.readouterr().out
+    rows = {line.split()[0]: [float(cell) for cell in line.split()[1:]] for line in table.splitlines()[-4:]}
+    assert rows.keys() == {"0", "1", "mean", "std"} and rows["0"][0] == rows["mean"][0] == 200
+    for zero, one, mean in zip(rows["0"], rows["1"], rows["mean"], strict=True):
+        assert mean == pytest.approx((zero + one) / 2, rel=1e-3)
+    assert not list(tmp_path.glob("*.log"))
+    assert [(tmp_path / f"seed_{seed}" / "metrics.csv").read_text() for seed in (0, 1)] == before
+
+
+@pytest.mark.slow
+def test_the_same_command_continues_what_ctrl_c_interrupted(tmp_path):
+    total = 4_000
+    arguments = ["train", "rare_targets", *TINY, f"train.total_frames={total}", "train.checkpoint_interval=0"]
+    command = [sys.executable, "-m", "coachable.cli", *arguments, "seeds=3,5", f"run_dir={tmp_path}"]
+
+    def start():
+        return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, start_new_session=True)
+
+    process = start()
+    while not (tmp_path / "seed_3" / "checkpoints" / "LATEST").exists() and process.poll() is None:
+        time.sleep(0.1)
+    os.killpg(process.pid, signal.SIGINT)
+    said, _ = process.communicate()
+    assert process.returncode == 1 and "interrupted: the same command continues" in said
+    assert 0 < read_state(find_checkpoint(tmp_path / "seed_3"))["loop"]["frames"] < total
+    process = start()
+    said, _ = process.communicate()
+    assert process.returncode == 0
+    assert re.search(rf"^\s*mean\s+{total} ", said, re.MULTILINE)
+    assert "resumed" in (tmp_path / "seed_3.log").read_text()
+    assert {read_state(find_checkpoint(tmp_path / f"seed_{s}"))["config"]["seed"] for s in (3, 5)} == {3, 5}
