@@ -24,16 +24,16 @@ from coachable.domain import Domain
 from coachable.domains.combat import apex_fight, paper_figures, paper_tables
 from coachable.domains.combat.coached_fight import SOURCES, STATES, draw_timeline
 from coachable.domains.combat.fight_queue import fight_grid
-from coachable.domains.combat.fights import composed_styles, style_label
+from coachable.domains.combat.fights import PAIRS, composed_styles, style_label
 from coachable.domains.combat.reference_tables import reference_tables
 from coachable.domains.combat.request_odds import odds_rows
 from coachable.domains.combat.styles import single_styles
 from coachable.envs.combat.tables import MACHINES, UNSEEN_MACHINES
 from coachable.evaluation.statistics import bootstrap_interval, wilson_interval
 from coachable.evaluation.style_grid import write_csv
+from coachable.evaluation.video import write_video
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
-PAIRS = ("Apex Thunderjaw", "Slaughterspine")  # two of these at once are out of distribution (paper)
 PARETO = ("melee", "sunscourge", "icestorm_boltblaster", "frost", "plasma", "carjas_bane")  # ours; the paper names none
 POINTS = 6  # weights of a curve
 COMPOSED = [("corrosive_blastsling", element) for element in ("acid", "plasma", "adhesive")]
@@ -141,7 +141,7 @@ def apex(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
         tables["brittle"] = apex_fight.brittle_rows(frost)
     write_tables(tables, out)
     draw_timeline(timeline, out / "apex_timeline.png")
-    apex_fight.film_fight(frames, out / "apex.webp", domain.control_step)
+    write_video(frames, out / "apex.webp", round(1 / domain.control_step))
     print(f"{int(log.won.sum())} of {fights} fights under {', '.join(names)} won; number {chosen} is drawn")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,13 +15,13 @@ from coachable.envs.combat.env import COMPONENTS_KEY
 from coachable.envs.combat.rewards import COMPONENT_SLICES
 from coachable.envs.combat.tables import ELEMENTS
 from coachable.evaluation.rollouts import Rollout
-from coachable.evaluation.video import asked_line, caption, write_video
+from coachable.evaluation.video import asked_line, caption
 
 if TYPE_CHECKING:
     from coachable.domain import Domain
     from coachable.training.weights import LoadedPolicy
 
-__all__ = ["APEX", "FightLog", "brittle_rows", "film_fight", "log_fights", "requests_in_turn"]
+__all__ = ["APEX", "FightLog", "brittle_rows", "log_fights", "requests_in_turn"]
 
 APEX = "Apex Thunderjaw"
 _WISHED = (
@@ -154,11 +153,6 @@ def _frame(
     hits = [f"{source} {hp:.0f} HP" for source, hp in zip(SOURCES, damage[fight].tolist(), strict=True) if hp > 0]
     asked = asked_line(agent.space, wish, agent.space.make(strict=True, **wish))
     return caption(renderer.draw(env, fight), (asked, f"hits: {', '.join(hits) or 'none'}".replace("_", " ")))
-
-
-def film_fight(frames: Sequence[np.ndarray], out: Path, control_step: float) -> None:
-    """Write frames in real time, as MP4, GIF or WebP."""
-    write_video(frames, out, round(1 / control_step))
 
 
 def brittle_rows(log: FightLog) -> list[dict[str, Any]]:

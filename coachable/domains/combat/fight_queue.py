@@ -22,9 +22,8 @@ if TYPE_CHECKING:
     from coachable.domain import Domain
     from coachable.training.weights import LoadedPolicy
 
-__all__ = ["OUTCOMES", "damage_by_source_and_state", "fight_grid", "run_fights", "source_damage"]
+__all__ = ["damage_by_source_and_state", "fight_grid", "run_fights", "source_damage"]
 
-OUTCOMES = ("won", "died", "out_of_bounds", "timeout")
 _REFILL = 10  # steps between the starts of new fights, because a reset of one fight costs as much as one of all
 _SOURCE_COUNTS = style_counts(SOURCES)  # (8, 44)
 

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from coachable.domains.combat.coached_fight import SOURCES, STATES
-from coachable.domains.combat.fight_queue import OUTCOMES
-from coachable.envs.combat.tables import AMMO, ELEMENTS, STYLES, WEAPONS, load_table
+from coachable.domains.combat.fights import OUTCOMES, PARTS
+from coachable.envs.combat.rewards import WEAPON_OF
+from coachable.envs.combat.tables import AMMO, ELEMENTS, WEAPONS, load_table
 from coachable.evaluation.statistics import wilson_interval
 
 __all__ = [
     "KINDS",
-    "PARTS",
     "WEAPON_STYLES",
     "implied_kinds",
     "matrix_rows",
@@ -28,16 +28,7 @@ __all__ = [
 KINDS = (*SOURCES, *STATES)
 """Kinds of damage, the rows of the matrix: sources, then elemental states."""
 
-PARTS = STYLES[8:11]
 WEAPON_STYLES = SOURCES[2:]
-_NAMES = {  # weapon of each weapon style
-    "ancestors_return": "Ancestor's Return",
-    "corrosive_blastsling": "Corrosive Blastsling",
-    "carjas_bane": "Carja's Bane",
-    "sunscourge": "Sunscourge",
-    "icestorm_boltblaster": "Icestorm",
-    "skykiller": "Skykiller",
-}
 _RESAMPLES = 1000
 
 Grids = Sequence[Mapping[str, np.ndarray]]
@@ -53,7 +44,7 @@ def implied_kinds() -> dict[str, frozenset[str]]:
     table = load_table("weapons")
     elements = {
         style: [set(table.words(ammo, "element", ELEMENTS)) for ammo in AMMO[WEAPONS.index(weapon)]]
-        for style, weapon in _NAMES.items()
+        for style, weapon in WEAPON_OF.items()
     }
     implied = {kind: set[str]() for kind in KINDS}
     for style, ammo in elements.items():
