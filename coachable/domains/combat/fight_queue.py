@@ -91,7 +91,7 @@ def run_fights(
     assert isinstance(measures, CombatMeasures)
     fight = torch.arange(size)  # number of the fight in each row
     waiting, running = size, torch.ones(size, dtype=torch.bool)
-    simulation.assign([opponents[i] for i in fight], [sites[i] for i in fight])
+    simulation.assign([opponents[i] for i in fight.tolist()], [sites[i] for i in fight.tolist()])
     rollout = Rollout(env, seed)
     rollout.begin(theta[fight])
     sums: dict[str, Tensor] = {}
@@ -117,7 +117,7 @@ def run_fights(
                 fresh = idle[: count - waiting]
                 fight[fresh] = torch.arange(waiting, waiting + len(fresh))
                 waiting += len(fresh)
-                simulation.assign([opponents[i] for i in fight], [sites[i] for i in fight])
+                simulation.assign([opponents[i] for i in fight.tolist()], [sites[i] for i in fight.tolist()])
                 begun = torch.zeros(size, dtype=torch.bool)
                 begun[fresh] = True
                 rollout.begin_rows(begun)

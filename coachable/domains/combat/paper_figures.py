@@ -83,7 +83,7 @@ def draw_radars(rows: Rows, path: Path) -> None:
     agents = list(dict.fromkeys(row["agent"] for row in rows))
     angles = np.linspace(0.0, 2 * np.pi, len(WEAPON_STYLES), endpoint=False)
     closed = np.append(angles, angles[0])
-    options = {"subplot_kw": {"projection": "polar"}}
+    options: dict[str, Any] = {"subplot_kw": {"projection": "polar"}}
     with drawing(path, 1, len(agents), size=(0.8 + 4.2 * len(agents), 4.6), **options) as panels:
         for panel, agent in zip(panels[0], agents, strict=True):
             for number, row in enumerate(row for row in rows if row["agent"] == agent):
