@@ -22,7 +22,7 @@ import recipe_boxes as boxes
 from recipe_config import compose_config
 
 from coachable.domains.combat import combat_style_reward, combat_style_space
-from coachable.envs.combat.bots import BOTS, Bot
+from coachable.envs.combat.bots import BOTS
 from coachable.envs.combat.env import CombatEnv
 from coachable.envs.combat.tables import MACHINES
 from coachable.evaluation.style_grid import markdown_table
@@ -71,19 +71,21 @@ def batch_row(config: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def fight(bot: Bot, config: dict[str, Any], fights: int, steps: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Task rewards (T, N), style features (T, N, m) and whether steps belong to the fight (T, N)."""
-    machines = list(config["env"]["machines"] or MACHINES)
-    rows = [machine for machine in machines for _ in range(fights)]
+def fight(config: dict[str, Any], fights: int, steps: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Task rewards (T, N), style features (T, N, m) and whether steps belong to the fight (T, N), of all players."""
+    machines = [name for name in config["env"]["machines"] or MACHINES for _ in range(fights)]
     options = {name: config["env"][name] for name in ("styles", "reward_scale", "assist")}
+    rows = machines * len(PLAYERS)
     env = CombatEnv(len(rows), seed=0, episode_steps=steps, traps=0, **options)
     env.assign(rows, ["Ice-lake"] * len(rows))
     env.reset()
     generator = torch.Generator().manual_seed(0)
+    row = torch.arange(len(rows))
     alive = torch.ones(len(rows), dtype=torch.bool)
     task, features, lives = [], [], []
     for _ in range(steps):
-        after = env._step(TensorDict({"action": bot.act(env, generator)}, [len(rows)]))
+        actions = torch.stack([BOTS[name].act(env, generator) for name in PLAYERS])
+        after = env._step(TensorDict({"action": actions[row // len(machines), row]}, [len(rows)]))
         task.append(after["task_reward"][:, 0] * alive)
         features.append(after["style_features"] * alive[:, None])
         lives.append(alive)
@@ -109,18 +111,14 @@ def return_rows(config: dict[str, Any], fights: int, steps: int) -> list[dict[st
     gamma, support = config["gamma"], config["critic_support"]
     count = (theta != 0).sum(-1)
     chosen = {"neutral": count == 0, "one weight": count == 1, "several weights": count > 1}
-    found: dict[str, list[torch.Tensor]] = {kind: [] for kind in KINDS}
     generator = torch.Generator().manual_seed(0)
-    for bot in (BOTS[name] for name in PLAYERS):
-        task, features, alive = fight(bot, config, fights, steps)
-        base, gains = discounted(task, gamma)[alive], discounted(features, gamma)[alive]
-        for kind, mask in chosen.items():
-            pool = theta[mask]
-            drawn = pool[torch.randint(len(pool), (len(base),), generator=generator)]
-            found[kind].append(base + reward(gains, drawn)[:, 0])
+    task, features, alive = fight(config, fights, steps)
+    base, gains = discounted(task, gamma)[alive], discounted(features, gamma)[alive]
     rows = []
     for kind in KINDS:
-        values = torch.cat(found[kind])
+        pool = theta[chosen[kind]]
+        drawn = pool[torch.randint(len(pool), (len(base),), generator=generator)]
+        values = base + reward(gains, drawn)[:, 0]
         clipped = (values > support["v_max"]) | (values < support["v_min"])
         row = {"preset": name_of(config), "labels": kind, "share": float(chosen[kind].float().mean())}
         row |= {"mean": float(values.mean()), "spread": float(values.std())}

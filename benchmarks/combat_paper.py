@@ -24,7 +24,7 @@ from coachable.domain import Domain
 from coachable.domains.combat import apex_fight, paper_figures, paper_tables
 from coachable.domains.combat.coached_fight import SOURCES, STATES, draw_timeline
 from coachable.domains.combat.fight_queue import fight_grid
-from coachable.domains.combat.fights import PAIRS, composed_styles, style_label
+from coachable.domains.combat.fights import PAIRS, PARTS, composed_styles, style_label
 from coachable.domains.combat.reference_tables import reference_tables
 from coachable.domains.combat.request_odds import odds_rows
 from coachable.domains.combat.styles import single_styles
@@ -82,7 +82,8 @@ def grid(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
         "parts": paper_tables.part_rows(found[0], labels),
     }
     write_tables(tables, out)
-    paper_figures.draw_matrix(tables["matrix"], out / "matrix.png")
+    damage = [row for row in tables["matrix"] if row["requested"] not in PARTS]  # parts have a figure of their own
+    paper_figures.draw_matrix(damage, out / "matrix.png")
     paper_figures.draw_wins(wins, out / "wins.png", len(machines))
     if tables["radars"]:
         paper_figures.draw_radars(tables["radars"], out / "radars.png")

@@ -30,6 +30,7 @@ KINDS = (*SOURCES, *STATES)
 
 WEAPON_STYLES = SOURCES[2:]
 _RESAMPLES = 1000
+_LEAST, _LEAST_PARTS = 1.0, 0.01  # HP and units per fight: what ratios are divided by, if there is less
 
 Grids = Sequence[Mapping[str, np.ndarray]]
 """Results of `fight_grid` (styles, opponents, fights), one per training seed."""
@@ -60,8 +61,8 @@ def implied_kinds() -> dict[str, frozenset[str]]:
 def matrix_rows(grids: Grids, labels: Sequence[str]) -> list[dict[str, Any]]:
     """Return the mean damage per fight by kind, for each request, with 95 % bootstrap intervals.
 
-    The intervals are those over training seeds, or over the fights of a single seed. `share` is the share of all
-    damage.
+    The intervals are those over training seeds, or over the fights of a single seed, by opponent. `share` is the share
+    of all damage.
     """
     rows = []
     for index, label in enumerate(labels):
@@ -81,7 +82,7 @@ def obedience_rows(grids: Grids, labels: Sequence[str]) -> list[dict[str, Any]]:
     `over_requests` is the damage of the requested kind over the largest one under another single request, or none, that
     does not imply the kind: a kind that is there anyway does not count as obeying. `over_kinds` is the damage of the
     requested kind over that of the largest other kind of its group, sources or states, under the same request.
-    Intervals are as in `matrix_rows`.
+    Less than 1 HP counts as 1 HP. Intervals are as in `matrix_rows`.
     """
     implied = implied_kinds()
     draws = {label: _resampled(grids, index, KINDS) for index, label in enumerate(labels)}
@@ -105,9 +106,9 @@ def obedience_rows(grids: Grids, labels: Sequence[str]) -> list[dict[str, Any]]:
             ("over_requests", largest, means[largest][number], draws[largest][:, number]),
             ("over_kinds", KINDS[beside], means[label][beside], draws[label][:, beside]),
         ):
-            ratios = draws[label][:, number] / np.maximum(spread, 1e-9)
+            ratios = draws[label][:, number] / np.maximum(spread, _LEAST)
             low, high = np.percentile(ratios, [2.5, 97.5])
-            row |= {name: float(means[label][number] / max(base, 1e-9)), f"{name}_largest": what}
+            row |= {name: float(means[label][number] / max(base, _LEAST)), f"{name}_largest": what}
             row |= {f"{name}_low": float(low), f"{name}_high": float(high)}
         rows.append(row)
     return rows
@@ -174,8 +175,12 @@ def part_rows(grids: Grids, labels: Sequence[str]) -> list[dict[str, Any]]:
         beside = np.mean([_resampled(grids, i, (part,))[:, 0] for i in others], 0)
         mean = float(np.mean([grid[part][labels.index(part)].mean() for grid in grids]))
         base = float(np.mean([grid[part][others].mean() for grid in grids]))
-        row = {"part": part, "requested": mean, "others": base, "ratio": mean / max(base, 1e-9)}
-        for name, draws in (("requested", asked), ("others", beside), ("ratio", asked / np.maximum(beside, 1e-9))):
+        row = {"part": part, "requested": mean, "others": base, "ratio": mean / max(base, _LEAST_PARTS)}
+        for name, draws in (
+            ("requested", asked),
+            ("others", beside),
+            ("ratio", asked / np.maximum(beside, _LEAST_PARTS)),
+        ):
             low, high = np.percentile(draws, [2.5, 97.5])
             row |= {f"{name}_low": float(low), f"{name}_high": float(high)}
         rows.append(row)
@@ -183,11 +188,15 @@ def part_rows(grids: Grids, labels: Sequence[str]) -> list[dict[str, Any]]:
 
 
 def _resampled(grids: Grids, index: int, kinds: Sequence[str]) -> np.ndarray:
-    """Return bootstrap means of measures under a request, (resamples, kinds): over seeds, or over a seed's fights."""
+    """Return bootstrap means of measures under a request, (resamples, kinds).
+
+    Several seeds are drawn again as a whole, the fights of a single seed within each opponent.
+    """
     if len(grids) > 1:
-        units = np.array([[grid[kind][index].mean() for kind in kinds] for grid in grids])
+        units = np.array([[[grid[kind][index].mean() for kind in kinds] for grid in grids]])
     else:
-        units = np.stack([grids[0][kind][index].reshape(-1) for kind in kinds], -1)
+        units = np.stack([grids[0][kind][index] for kind in kinds], -1)
+    opponents, count = units.shape[:2]
     random = np.random.default_rng(index)
-    weights = random.multinomial(len(units), np.full(len(units), 1.0 / len(units)), _RESAMPLES)
-    return weights @ units / len(units)
+    weights = random.multinomial(count, np.full(count, 1.0 / count), (_RESAMPLES, opponents))
+    return np.tensordot(weights, units, 2) / (opponents * count)
