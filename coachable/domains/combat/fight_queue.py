@@ -112,9 +112,8 @@ def run_fights(
             bar.update(int(done.sum()))
             running &= ~done
             step += 1
-            idle = (~running).nonzero()[:, 0]
-            if step % _REFILL == 0 and waiting < count and len(idle):
-                fresh = idle[: count - waiting]
+            fresh = (~running).nonzero()[:, 0][: count - waiting]
+            if len(fresh) and (step % _REFILL == 0 or not running.any()):
                 fight[fresh] = torch.arange(waiting, waiting + len(fresh))
                 waiting += len(fresh)
                 simulation.assign([opponents[i] for i in fight.tolist()], [sites[i] for i in fight.tolist()])

@@ -63,6 +63,8 @@ def test_more_fights_than_rows_are_all_fought_to_their_end(domain):
     np.testing.assert_allclose(found["damage"][won], health[won], rtol=1e-4)  # each fight has its own machine
     assert (found["seconds"] <= 60 * 0.2 + 1e-6).all() and (found["seconds"] > 0).all()
     np.testing.assert_allclose(sum(found[name] for name in SOURCES), found["damage"], rtol=1e-4)
+    alone = run_fights(domain, agent, theta[:3], machines[:3], ["Arena"] * 3, seed=0, batch=1)
+    assert (alone["seconds"] > 0).all() and (alone["damage"] > 0).all()  # also where no other fight goes on meanwhile
 
 
 def test_damage_in_a_state_is_divided_among_the_sources(domain):
