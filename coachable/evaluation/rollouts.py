@@ -79,6 +79,10 @@ class Rollout:
         """Begin new episodes where the last step ended one."""
         self._current = self.env.maybe_reset(self._current)
 
+    def begin_rows(self, rows: Tensor) -> None:
+        """Begin new episodes in some environments, rows (N,) bool, at least one of them."""
+        self._current = self.env.reset(self._current.set("_reset", rows.unsqueeze(-1)))
+
 
 @dataclass(frozen=True)
 class EpisodeRecord:

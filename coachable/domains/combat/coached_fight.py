@@ -185,7 +185,7 @@ def draw_timeline(rows: Sequence[Mapping[str, Any]], path: Path, *, bin_seconds:
     """Draw damage by source and health over time, under bands of the requested style (paper, timeline of a fight).
 
     Args:
-        rows: Result of `CoachedFights.timeline`.
+        rows: Result of `CoachedFights.timeline`; steps in which a row says `brittle` are hatched.
         path: PNG file to write.
         bin_seconds: Width of the bars [s].
     """
@@ -241,6 +241,10 @@ def _mark(rows: Sequence[Mapping[str, Any]], colours: Mapping[str, Any], panels:
         style = {"transform": panels[0].get_xaxis_transform(), "ha": "center", "va": "top", "fontsize": 8}
         panels[0].text((left + right) / 2, 0.99, readable(name), **style)
     for row in rows:
+        if row.get("brittle"):
+            panels[0].axvspan(
+                row["seconds"] - step, row["seconds"], facecolor="none", edgecolor="0.7", hatch="//", lw=0
+            )
         if row["ended"]:
             for panel in panels:
                 panel.axvline(row["seconds"], color="0.3", lw=0.8, ls=":")

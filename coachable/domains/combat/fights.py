@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 PARTS = STYLES[8:11]
 _COMPOSED_WEAPON = "corrosive_blastsling"  # its ammunition has several elements
-_PAIRS = ("Apex Thunderjaw", "Slaughterspine")  # two of these at once are out of distribution
-_OUTCOMES = ("won", "died", "out_of_bounds", "timeout")
+PAIRS = ("Apex Thunderjaw", "Slaughterspine")  # two of these at once are out of distribution
+OUTCOMES = ("won", "died", "out_of_bounds", "timeout")
 
 
 def composed_styles(space: StyleSpace) -> list[dict[str, float]]:
@@ -84,8 +84,8 @@ def evaluate_fights(domain: Domain, agent: LoadedPolicy, out: Path, settings: Ev
     damage, wins = damage_rows(fights, labels), _win_rows(fights, labels, machines)
     outcomes = _outcomes(fights, machines)
     alone = fight_matrix(domain, agent, cells, [(name,) for name in UNSEEN_MACHINES], **options)
-    pairs = fight_matrix(domain, agent, cells, [(name, name) for name in _PAIRS], **options)
-    twice = _win_rows(pairs, labels, [f"two {name}" for name in _PAIRS])
+    pairs = fight_matrix(domain, agent, cells, [(name, name) for name in PAIRS], **options)
+    twice = _win_rows(pairs, labels, [f"two {name}" for name in PAIRS])
     unseen = [one | two for one, two in zip(_win_rows(alone, labels, list(UNSEEN_MACHINES)), twice, strict=True)]
     sweeps = settings.sweeps
     if sweeps is None:
@@ -183,7 +183,7 @@ def _win_rows(fights: Mapping[str, np.ndarray], labels: Sequence[str], machines:
 
 def _outcomes(fights: Mapping[str, np.ndarray], machines: Sequence[str]) -> list[dict[str, Any]]:
     return [
-        {"machine": machine, **{name: int(fights[name][:, index].sum()) for name in _OUTCOMES}}
+        {"machine": machine, **{name: int(fights[name][:, index].sum()) for name in OUTCOMES}}
         for index, machine in enumerate(machines)
     ]
 

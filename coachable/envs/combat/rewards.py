@@ -36,8 +36,7 @@ for _name, _width in COMPONENTS.items():
     COMPONENT_SLICES[_name] = slice(_first, _first + _width)
 NUM_COMPONENTS = sum(COMPONENTS.values())
 
-# Weapon of each weapon style.
-_WEAPON_OF = {
+WEAPON_OF = {
     "ancestors_return": "Ancestor's Return",
     "corrosive_blastsling": "Corrosive Blastsling",
     "carjas_bane": "Carja's Bane",
@@ -45,6 +44,8 @@ _WEAPON_OF = {
     "icestorm_boltblaster": "Icestorm",
     "skykiller": "Skykiller",
 }
+"""Weapon of each weapon style."""
+
 _GENEROUS = ("fire", "adhesive")  # the elements whose build-up counts 35, not 15
 
 REWARD_SCALES = ("sim", "paper")
@@ -107,8 +108,8 @@ def style_weights(reward_scale: str) -> Tensor:
                 (at("proximity"), weight("trap proximity")),
                 (at("lure"), weight("trap lure")),
             ]
-        elif style in _WEAPON_OF:
-            entries = [(at("weapon_damage", WEAPONS.index(_WEAPON_OF[style])), weight("weapon damage"))]
+        elif style in WEAPON_OF:
+            entries = [(at("weapon_damage", WEAPONS.index(WEAPON_OF[style])), weight("weapon damage"))]
         elif style in ELEMENTS:
             e = ELEMENTS.index(style)
             buildup = "build-up of fire and adhesive" if style in _GENEROUS else "build-up"

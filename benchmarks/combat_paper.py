@@ -1,0 +1,185 @@
+"""The paper's figures and tables of fights, from one agent per training seed.
+
+    python benchmarks/combat_paper.py grid AGENT...        damage matrix, wins, records, radars, parts removed
+    python benchmarks/combat_paper.py pareto AGENT...      style score against wins as six weights fall
+    python benchmarks/combat_paper.py apex AGENT           timeline and film under four requests, and brittle phases
+    python benchmarks/combat_paper.py requests AGENT       how rare composed requests were in training
+    python benchmarks/combat_paper.py tables               machines, weapons, heads and rewards beside the paper's
+    coachable explain AGENT                                SHAP and saliency over 100 trajectories
+
+AGENT is what `coachable evaluate` takes. An agent gets the part of a figure that its styles and machines allow. The
+paper fights 10 times per style, machine and site. A thousand fights run at a time, in one process and one thread.
+"""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from coachable.domain import Domain
+from coachable.domains.combat import apex_fight, paper_figures, paper_tables
+from coachable.domains.combat.coached_fight import SOURCES, STATES, draw_timeline
+from coachable.domains.combat.fight_queue import fight_grid
+from coachable.domains.combat.fights import PAIRS, PARTS, composed_styles, style_label
+from coachable.domains.combat.reference_tables import reference_tables
+from coachable.domains.combat.request_odds import odds_rows
+from coachable.domains.combat.styles import single_styles
+from coachable.envs.combat.tables import MACHINES, UNSEEN_MACHINES
+from coachable.evaluation.statistics import bootstrap_interval, wilson_interval
+from coachable.evaluation.style_grid import write_csv
+from coachable.evaluation.video import write_video
+from coachable.training.weights import LoadedPolicy, domain_of, load_policy
+
+PARETO = ("melee", "sunscourge", "icestorm_boltblaster", "frost", "plasma", "carjas_bane")  # ours; the paper names none
+POINTS = 6  # weights of a curve
+COMPOSED = [("corrosive_blastsling", element) for element in ("acid", "plasma", "adhesive")]
+
+Agents = Mapping[str, LoadedPolicy]
+Rows = list[dict[str, Any]]
+
+
+def load(sources: Sequence[str]) -> tuple[Domain, dict[str, LoadedPolicy]]:
+    """The agents by name, which must be of the same styles and machines."""
+    agents = {f"seed {number}": load_policy(source) for number, source in enumerate(sources)}
+    first, *others = agents.values()
+    for other in others:
+        if other.space != first.space or other.config["env"] != first.config["env"]:
+            raise SystemExit("the agents differ in styles or environment: give one agent per training seed")
+    return domain_of(first), agents
+
+
+def machines_of(agents: Agents) -> list[str]:
+    return list(next(iter(agents.values())).config["env"].get("machines") or MACHINES)
+
+
+def grid(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
+    """Fights in every style against every machine, the unseen ones and pairs."""
+    space = next(iter(agents.values())).space
+    cells = single_styles(space) + composed_styles(space)
+    labels = [style_label(cell) for cell in cells]
+    machines = machines_of(agents)
+    known = [(name,) for name in machines]
+    alone, twice = [(name,) for name in UNSEEN_MACHINES], [(name, name) for name in PAIRS]
+    found: list[list[Mapping[str, np.ndarray]]] = [[], [], []]
+    for seed, (name, agent) in enumerate(agents.items()):
+        for results, opponents, what in zip(found, (known, alone, twice), ("machines", "unseen", "pairs"), strict=True):
+            results.append(
+                fight_grid(domain, agent, cells, opponents, fights=fights, seed=seed, progress=f"{name}: {what}")
+            )
+    wins = paper_tables.win_rows(found[0], labels, machines)
+    wins += paper_tables.win_rows(found[1], labels, list(UNSEEN_MACHINES))
+    wins += paper_tables.win_rows(found[2], labels, [f"two {name}" for name in PAIRS])
+    tables: dict[str, Rows] = {
+        "matrix": paper_tables.matrix_rows(found[0], labels),
+        "obedience": paper_tables.obedience_rows(found[0], labels),
+        "wins": wins,
+        "records": paper_tables.record_rows(found[0], labels, machines),
+        "radars": paper_tables.radar_rows(found[0], labels, list(agents)),
+        "parts": paper_tables.part_rows(found[0], labels),
+    }
+    write_tables(tables, out)
+    damage = [row for row in tables["matrix"] if row["requested"] not in PARTS]  # parts have a figure of their own
+    paper_figures.draw_matrix(damage, out / "matrix.png")
+    paper_figures.draw_wins(wins, out / "wins.png", len(machines))
+    if tables["radars"]:
+        paper_figures.draw_radars(tables["radars"], out / "radars.png")
+    if tables["parts"]:
+        paper_figures.draw_parts(tables["parts"], out / "parts.png")
+
+
+def pareto(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
+    """Fights at weights from 0 to the maximum, against every machine."""
+    space = next(iter(agents.values())).space
+    measured = [name for name in space.names if name in (*SOURCES, *STATES)]
+    styles = [name for name in PARETO if name in measured]
+    styles += [name for name in measured if name not in styles][: len(PARETO) - len(styles)]
+    neutral = dict.fromkeys(space.names, 0.0)
+    shares = np.linspace(0.0, 1.0, POINTS)
+    cells = [neutral | {name: float(share * space[name].high)} for name in styles for share in shares]
+    opponents = [(name,) for name in machines_of(agents)]
+    results = [
+        fight_grid(domain, agent, cells, opponents, fights=fights, seed=seed, progress=f"{name}: weights")
+        for seed, (name, agent) in enumerate(agents.items())
+    ]
+    rows: Rows = []
+    for index, cell in enumerate(cells):
+        style = styles[index // POINTS]
+        done = np.concatenate([result[style][index].reshape(-1) for result in results])
+        total = np.concatenate([result["damage"][index].reshape(-1) for result in results])
+        won = np.concatenate([result["won"][index].reshape(-1) for result in results])
+        order = np.arange(len(done))  # fights are drawn again, so that their two numbers stay together
+        low, high = bootstrap_interval(order, partial(share_of, done, total), resamples=500)
+        row: dict[str, Any] = {"style": style, "weight": cell[style], "style_score": share_of(done, total, order)}
+        row |= {"style_score_low": low, "style_score_high": high, "won": float(won.mean())}
+        row["won_low"], row["won_high"] = wilson_interval(int(won.sum()), len(won))
+        rows.append(row)
+    write_tables({"pareto": rows}, out)
+    paper_figures.draw_pareto(rows, out / "pareto.png")
+
+
+def share_of(done: np.ndarray, total: np.ndarray, drawn: np.ndarray, axis: int = -1) -> Any:
+    share = done[drawn].sum(axis) / np.maximum(total[drawn].sum(axis), 1e-9)
+    return share if np.ndim(share) else float(share)
+
+
+def apex(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
+    """Fights under four requests, of which one that was won is drawn and filmed, and fights for frost."""
+    agent = next(iter(agents.values()))
+    names = apex_fight.requests_in_turn(agent.space.names)
+    log, _ = apex_fight.log_fights(domain, agent, names, fights=fights, seed=0, draw=None)
+    chosen = int(log.won.argmax())
+    renderer = domain.make_renderer(640, 436)
+    _, frames = apex_fight.log_fights(domain, agent, names, fights=fights, seed=0, draw=(renderer, chosen))
+    renderer.close()
+    timeline = log.timeline(chosen)
+    tables: dict[str, Rows] = {"apex_timeline": timeline}
+    if "frost" in agent.space.names:
+        frost, _ = apex_fight.log_fights(domain, agent, ("frost",), fights=fights, seed=1, draw=None)
+        tables["brittle"] = apex_fight.brittle_rows(frost)
+    write_tables(tables, out)
+    draw_timeline(timeline, out / "apex_timeline.png")
+    write_video(frames, out / "apex.webp", round(1 / domain.control_step))
+    print(f"{int(log.won.sum())} of {fights} fights under {', '.join(names)} won; number {chosen} is drawn")
+
+
+def requests(_domain: Domain, agents: Agents, out: Path, _fights: int) -> None:
+    space = next(iter(agents.values())).space
+    pairs = [pair for pair in COMPOSED if set(pair) <= set(space.names)]
+    write_tables({"requests": odds_rows(space, pairs, draws=1_000_000)}, out)
+
+
+def write_tables(tables: Mapping[str, Rows], out: Path) -> None:
+    for name, rows in tables.items():
+        if rows:
+            write_csv(rows, out / f"{name}.csv")
+            print(f"{out / name}.csv: {len(rows)} rows")
+        else:
+            print(f"{name}: nothing that this agent has")
+
+
+FIGURES = {"grid": grid, "pareto": pareto, "apex": apex, "requests": requests}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("figure", choices=[*FIGURES, "tables"])
+    parser.add_argument("agents", nargs="*", metavar="AGENT", help="one per training seed")
+    parser.add_argument("--fights", type=int, default=10, help="per style, machine and site; of apex, in all")
+    parser.add_argument("--out", type=Path, default=Path("docs/results/combat/paper"))
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    args.out.mkdir(parents=True, exist_ok=True)
+    if args.figure == "tables":
+        write_tables(reference_tables(), args.out)
+        return
+    if not args.agents:
+        parser.error(f"{args.figure} needs at least one agent")
+    FIGURES[args.figure](*load(args.agents), args.out, args.fights)
+
+
+if __name__ == "__main__":
+    main()
