@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 from coachable.domain import Domain
-from coachable.domains.racing.families import racing_family
+from coachable.domains.racing.families import home_track, racing_family
 from coachable.domains.racing.metrics import RacingMeasures
 from coachable.domains.racing.render import RacingRenderer
 from coachable.domains.racing.words import WORDS
@@ -42,9 +42,12 @@ def racing_domain(
     make_env, make_space, make_reward = racing_family(family)
 
     def as_trained(settings: Mapping[str, Any]) -> Domain:
-        """Return the domain with the track, car, observation and episode length of a training."""
+        """Return the domain with the track, car, observation and episode length of a training.
+
+        A driver of several circuits is shown and measured on its family's.
+        """
         chosen = {name: value for name, value in settings.items() if name not in _OF_TRAINING}
-        chosen |= {"compiled": False, "device": "cpu", **options}
+        chosen |= {"compiled": False, "device": "cpu", "track": home_track(family, settings), **options}
         chosen.setdefault("opponents", chosen.get("cars", cars) > 1)
         coached = {}
         if cars == 1 and (met := chosen.pop("cars", 1)) > 1:  # agents trained in traffic are measured alone, too
@@ -55,7 +58,7 @@ def racing_domain(
             make_env=partial(make_env, **chosen),
             coached=coached,
             episode_steps=chosen.get("episode_steps", domain.episode_steps),
-            observation_groups=observation_groups(chosen["opponents"], pool, points),
+            observation_groups=observation_groups(chosen["opponents"], pool, points, chosen.get("curvature", False)),
         )
 
     domain = Domain(

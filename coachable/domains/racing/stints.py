@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from coachable.domains.racing.families import home_track
 from coachable.domains.racing.frontier import TANK, WORN, sweep
 from coachable.domains.racing.metrics import TelemetryMeasures
 from coachable.domains.racing.traffic import draw_traffic, race_in_traffic, traffic_report, traffic_response
@@ -80,7 +81,7 @@ def evaluate_resources(domain: Domain, agent: LoadedPolicy, out: Path, settings:
     """
     out.mkdir(parents=True, exist_ok=True)
     trained, episodes, seed = agent.config.get("env", {}), settings.episodes, settings.seed
-    car, track = trained.get("car", "x2019"), trained.get("track", "lakeside")
+    car, track = trained.get("car", "x2019"), home_track("resources", trained)
     rates, length = Resources.calibrated(car), load_track(track).length
     options: dict[str, Any] = {**settings.rollout, "steps": settings.steps or STINT_STEPS}
     rows: list[dict[str, Any]] = []

@@ -85,7 +85,7 @@ def test_a_domain_is_as_its_training_made_it():
     settings |= {"scenarios": [{"_target_": "x"}], "conditions": {"_target_": "x"}, "weights": {"_target_": "x"}}
     domain = load_domain("racing_resources", {"env": {**settings, "episode_steps": 20, "course_points": 5}})
     env = domain.make_env(num_envs=2, seed=0)
-    assert (env.track.name, env.num_envs, domain.episode_steps) == ("ring", 2, 20)
+    assert (env.tracks[0].name, env.num_envs, domain.episode_steps) == ("ring", 2, 20)
     assert sum(width for _, width in domain.observation_groups) == env.observation_size
 
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from coachable.envs.racing.circuit.circuits import CIRCUITS, generate_track, load_track, oval, ring
+from coachable.envs.racing.circuit.circuits import CIRCUITS, load_track, oval, ring
+from coachable.envs.racing.circuit.generator import generate_track
 from coachable.envs.racing.circuit.line import minimum_curvature_line
 from coachable.envs.racing.circuit.profile import Envelope, cornering_speed, lap_time, speed_profile
 from coachable.envs.racing.circuit.track import Course, Track, clearance

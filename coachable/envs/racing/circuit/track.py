@@ -149,7 +149,7 @@ class Track:
             straights = _close(turns, straights, solve, name)
         pieces = []
         for straight, (_, angle, radius) in zip(straights, turns, strict=True):
-            pieces += [(straight, 0.0, 0.0), *_turn(angle, radius)]
+            pieces += [(straight, 0.0, 0.0), *turn_pieces(angle, radius)]
         points, headings, curvatures, arc = _integrate(pieces)
         if np.linalg.norm(points[-1] - points[0]) > 1e-3:
             gap = np.linalg.norm(points[-1] - points[0])
@@ -164,7 +164,7 @@ class Track:
         return cls(name, torch.from_numpy(np.stack(columns, axis=1)), float(arc[-1] / count))
 
 
-def _turn(angle: float, radius: float) -> list[tuple[float, float, float]]:
+def turn_pieces(angle: float, radius: float) -> list[tuple[float, float, float]]:
     """Return ramp, arc and ramp of a turn as (length, curvature at the start, curvature at the end)."""
     arc = radius * math.radians(abs(angle))
     ramp = min(0.45 * arc, 45.0)
@@ -204,7 +204,7 @@ def _close(
     pieces, headings, heading = [], [], 0.0
     for index, (_, angle, radius) in enumerate(turns):
         headings.append(heading)
-        pieces += [(0.0 if index in solve else straights[index], 0.0, 0.0), *_turn(angle, radius)]
+        pieces += [(0.0 if index in solve else straights[index], 0.0, 0.0), *turn_pieces(angle, radius)]
         heading += math.radians(angle)
     gap = _integrate(pieces)[0][-1]
     directions = np.array([[math.cos(headings[i]), math.sin(headings[i])] for i in solve]).T
@@ -261,23 +261,61 @@ def _check(track: Track) -> None:
 
 
 class Course(torch.nn.Module):
-    """The table of a track on a device, with conversions between positions and distances along the track.
+    """Tables of one or several circuits on a device, with conversions between positions and distances along the track.
+
+    With several circuits, each of N cars is on one of them, and the methods take tensors whose last dimension is N.
+    With one circuit they take tensors of any shape. Nodes are rows of the joint table.
 
     Args:
-        track: Circuit.
+        tracks: Circuit, or several of them.
         device: Device of the table.
         dtype: Type of the table.
+
+    Attributes:
+        tracks: The circuits.
+        length: Length of the circuit [m], or of each car's circuit (N,).
     """
 
-    def __init__(self, track: Track, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
+    def __init__(
+        self,
+        tracks: Track | Sequence[Track],
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
         super().__init__()
-        self.length, self.spacing, self.count = track.length, track.spacing, len(track.table)
-        self.register_buffer("table", track.table.to(device, dtype).contiguous())
+        tracks = (tracks,) if isinstance(tracks, Track) else tuple(tracks)
+        self.tracks = tracks
+        self.register_buffer("table", torch.cat([track.table for track in tracks]).to(device, dtype).contiguous())
         self.table: Tensor
+        counts = torch.tensor([len(track.table) for track in tracks], device=device)
+        lengths = torch.tensor([track.length for track in tracks], device=device, dtype=dtype)
+        spacings = torch.tensor([track.spacing for track in tracks], device=device, dtype=dtype)
+        self._each = (lengths, spacings, counts, counts.cumsum(0) - counts)
+        self.length: float | Tensor = tracks[0].length
+        self.spacing: float | Tensor = tracks[0].spacing
+        self.count: int | Tensor = len(tracks[0].table)
+        self.first: int | Tensor = 0
+
+    def assign(self, circuit: Tensor) -> None:
+        """Put each of N cars on one of several circuits.
+
+        Args:
+            circuit: Number of the circuit of each car (N,) int64.
+        """
+        if len(self.tracks) > 1:
+            self.length, self.spacing, self.count, self.first = (values[circuit] for values in self._each)
+
+    def race_length(self, cars: int) -> float | Tensor:
+        """Return the length of the circuit of each race (B,) [m], or of the only circuit, for races of `cars` cars."""
+        return self.length[: len(self.length) // cars] if isinstance(self.length, Tensor) else self.length
 
     def node(self, s: Tensor) -> Tensor:
-        """Return the index of the node nearest to a distance along the track [m]."""
-        return torch.remainder(torch.round(s / self.spacing).to(torch.int64), self.count)
+        """Return the node nearest to a distance along the track [m]."""
+        return torch.remainder(torch.round(s / self.spacing).to(torch.int64), self.count) + self.first
+
+    def distance(self, node: Tensor) -> Tensor:
+        """Return the distance of a node along its track [m]."""
+        return (node - self.first) * self.spacing
 
     def frame(self, node: Tensor) -> Tensor:
         """Return the rows of the table at nodes (...), as (8, ...)."""
@@ -300,16 +338,19 @@ class Course(torch.nn.Module):
         node = self.node(s)
         frame = self.frame(node)
         arc = locate(x, y, *frame[:5].unbind(0))
-        node = self.node(node * self.spacing + arc.ahead.clamp(-40.0, 40.0))
+        node = self.node(self.distance(node) + arc.ahead.clamp(-40.0, 40.0))
         frame = self.frame(node)
         arc = locate(x, y, *frame[:5].unbind(0))
-        s = torch.remainder(node * self.spacing + arc.ahead.clamp(-self.spacing, self.spacing), self.length)
-        return s, arc, frame
+        ahead = torch.clamp(arc.ahead, -self.spacing, self.spacing)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        return torch.remainder(self.distance(node) + ahead, self.length), arc, frame
 
     def find(self, x: Tensor, y: Tensor) -> tuple[Tensor, Arc, Tensor]:
-        """Project points (N,) on the centre line like `project`, without an estimate, by comparing all nodes."""
+        """Project points (N,) on the centre line of one circuit like `project`, without an estimate.
+
+        All nodes are compared.
+        """
         distance = (x[..., None] - self.table[:, 0]) ** 2 + (y[..., None] - self.table[:, 1]) ** 2
-        return self.project(x, y, distance.argmin(-1) * self.spacing)
+        return self.project(x, y, self.distance(distance.argmin(-1)))
 
     def place(self, s: Tensor, offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the positions of points beside the centre line, and the direction of the track there.
@@ -323,7 +364,7 @@ class Course(torch.nn.Module):
         """
         node = self.node(s)
         x, y, tx, ty, curvature = self.frame(node)[:5].unbind(0)
-        ahead = torch.remainder(s - node * self.spacing + self.length / 2, self.length) - self.length / 2
+        ahead = self.past(node, s)
         angle = curvature * ahead
         # Along the arc: chord by the series of sine and versine, which is exact enough within half a spacing.
         forward = ahead * (1 - angle * angle / 6)
@@ -331,3 +372,8 @@ class Course(torch.nn.Module):
         cos, sin = torch.cos(angle), torch.sin(angle)
         dx, dy = forward - offset * sin, side + offset * cos
         return x + dx * tx - dy * ty, y + dx * ty + dy * tx, torch.atan2(ty, tx) + angle
+
+    def past(self, node: Tensor, s: Tensor) -> Tensor:
+        """Return how far distances along the track are past nodes near them, negative before [m]."""
+        half = self.length / 2
+        return torch.remainder(s - self.distance(node) + half, self.length) - half

@@ -80,6 +80,7 @@ class Referee:
         course_points: Number of points of each edge of the track in the observation.
         pool: Whether cars differ, in which case the observation describes the car.
         opponents: Whether the observation has columns for opponents.
+        curvature: Whether the observation has the curvature of the track ahead instead of the place on the lap.
         wrong_way_time: Time of driving backwards that ends an episode [s].
     """
 
@@ -90,6 +91,7 @@ class Referee:
     course_points: int = COURSE_POINTS
     pool: bool = False
     opponents: bool = False
+    curvature: bool = False
     wrong_way_time: float = WRONG_WAY_TIME
 
     def command(self, packed: Tensor, packed_run: Tensor, action: Tensor, compound: Tensor) -> tuple[Tensor, Tensor]:
@@ -158,8 +160,8 @@ class Referee:
         others, bodies, tow = None, None, torch.zeros_like(s.x)
         if group is not None and impact is not None:
             bodies = bodies_of(new, car, self.cars)
-            others = look_around(self._split(place), self._split(arc.offset), group, self.course.length)
-            earlier = look_around(self._split(before.s), self._split(before.offset), group, self.course.length)
+            others = self._around(place, arc.offset, group)
+            earlier = self._around(before.s, before.offset, group)
             ahead, behind = metres_gained(earlier, others)
             touched, rear_end = contacts(impact, earlier, self.cars)
             outcome = Outcome(progress, *(value.reshape(-1) for value in (ahead, behind, touched, rear_end)))
@@ -211,13 +213,14 @@ class Referee:
         """Return the observations (N, D); the arguments are those of `judge`."""
         run = Run(*packed_run.unbind(0))
         tyres = tyre_view(car, wheels, packed, compound[0])
-        parts = [torch.stack(own_car(car, wheels, packed, run, tyres, self.course.length), dim=-1), compound[2:].T]
+        length = None if self.curvature else self.course.length
+        parts = [torch.stack(own_car(car, wheels, packed, run, tyres, length), dim=-1), compound[2:].T]
         if self.pool:
             parts.append(car_columns(car))
-        parts.append(course_ahead(self.course, packed, run, self.course_points))
+        parts.append(course_ahead(self.course, packed, run, self.course_points, self.curvature))
         if group is not None:
             bodies = bodies_of(packed, car, self.cars)
-            others = look_around(self._split(run.s), self._split(run.offset), group, self.course.length)
+            others = self._around(run.s, run.offset, group)
             parts += [opponents_seen(bodies, others), run.slipstream[:, None]]
         elif self.opponents:
             parts.append(run.slipstream.new_zeros(len(run.slipstream), OPPONENT_COLUMNS))
@@ -239,7 +242,7 @@ class Referee:
         nothing = torch.zeros_like(place)
         tow = nothing
         if group is not None:
-            tow = self._tow(look_around(self._split(place), self._split(arc.offset), group, self.course.length), car)
+            tow = self._tow(self._around(place, arc.offset, group), car)
         return torch.stack(
             [
                 place,
@@ -256,6 +259,10 @@ class Referee:
 
     def _split(self, values: Tensor) -> Tensor:
         return values.reshape(self.cars, -1)
+
+    def _around(self, s: Tensor, offset: Tensor, group: Tensor) -> Others:
+        length = self.course.race_length(self.cars)
+        return look_around(self._split(s), self._split(offset), group, length)
 
     def _tow(self, others: Others, car: Car) -> Tensor:
         length = self._split(car.length) if isinstance(car.length, Tensor) else car.length
