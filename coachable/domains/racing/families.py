@@ -19,6 +19,7 @@ from coachable.envs.racing.circuit.track import Track
 from coachable.envs.racing.env import RacingEnv
 from coachable.envs.racing.physics.cars import Resources, load_car
 from coachable.envs.racing.race.driver import LineFollower
+from coachable.envs.racing.race.garage import POOL
 from coachable.envs.racing.race.rivals import Rivals
 from coachable.envs.racing.race.scenarios import Conditions, drift_scenarios, race_scenarios
 from coachable.envs.racing.race.task import TaskWeights
@@ -27,6 +28,7 @@ from coachable.styles import StyleReward, StyleSpace
 RIVALS_GRIP = 0.97  # of the fastest scripted opponents; the slowest use 0.8
 TYRE_HEAT = 900.0  # [m], progress that all grip is worth during the minute in which heat dissipates
 AGENTS, CARS = 3, 5  # in a race of the aggressiveness family
+CAR = {"drift": "street", "resources": "x2019", "aggressiveness": "gt3"}  # of each family
 HOME = {"drift": "ridge", "resources": "lakeside", "aggressiveness": "endurance"}  # circuit of each family
 
 
@@ -41,7 +43,7 @@ def drift_env(num_envs: int = 64, **options: Any) -> RacingEnv:
     """
     options = {
         "track": HOME["drift"],
-        "car": "street",
+        "car": CAR["drift"],
         "scenarios": drift_scenarios(),
         "wrong_way_time": 10.0,
     } | options
@@ -58,10 +60,10 @@ def resource_env(num_envs: int = 64, **options: Any) -> RacingEnv:
     """
     cars = options.get("cars", 1)
     if num_envs % cars:
-        options = {"controlled": 1, "driver": _line_follower(options, HOME["resources"], "x2019")[1]} | options
+        options = {"controlled": 1, "driver": _line_follower(options, HOME["resources"], CAR["resources"])[1]} | options
     defaults: dict[str, Any] = {
         "track": HOME["resources"],
-        "car": "x2019",
+        "car": CAR["resources"],
         "conditions": Conditions.resources(),
         "resources": Resources.calibrated("gt3" if options.get("car") == "gt3" else "x2019"),
         "weights": TaskWeights(tyre_heat=TYRE_HEAT),
@@ -77,13 +79,13 @@ def rival_env(num_envs: int = AGENTS * 21, **options: Any) -> RacingEnv:
             multiple of three.
         **options: Options of `RacingEnv`.
     """
-    tracks, driver = _line_follower(options, HOME["aggressiveness"], "gt3")
+    tracks, driver = _line_follower(options, HOME["aggressiveness"], CAR["aggressiveness"])
     space = aggressiveness_style_space()
     defaults: dict[str, Any] = {
         "cars": CARS,
         "controlled": AGENTS if num_envs % AGENTS == 0 else 1,
         "driver": Rivals(driver, (space.low, space.high), slowest=0.8 / RIVALS_GRIP),
-        "car": "gt3",
+        "car": CAR["aggressiveness"],
         "scenarios": race_scenarios(CARS),
     }
     return RacingEnv(num_envs, **{**defaults, **options, "track": tracks})
@@ -143,8 +145,20 @@ def home_track(family: str, settings: Mapping[str, Any]) -> str:
         family: Name of the family.
         settings: Options of the environment that the agent was trained in.
     """
+    tracks = training_tracks(family, settings)
+    return tracks[0] if len(tracks) == 1 else HOME[family]
+
+
+def training_tracks(family: str, settings: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the names of the circuits that an agent was trained on; the arguments are those of `home_track`."""
     track = settings.get("track", HOME[family])
-    return track if isinstance(track, str) and track not in SETS else HOME[family]
+    return SETS.get(track, (track,)) if isinstance(track, str) else tuple(track)
+
+
+def typical_car(family: str, settings: Mapping[str, Any]) -> str:
+    """Return the shipped car that an agent drove, or the one after which its pool is made, as in `home_track`."""
+    car = settings.get("car", CAR[family])
+    return "gt3" if car == POOL else car
 
 
 def family_style(family: str) -> tuple[StyleSpace, Callable[..., StyleReward]]:

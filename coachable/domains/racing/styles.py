@@ -7,7 +7,16 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from coachable.envs.racing.race.features import DEFEND, DRIFT, DRIFT_NAMES, FUEL, OVERTAKE, TIRE, gap_columns
+from coachable.envs.racing.race.features import (
+    CORNER_DRIFT,
+    DEFEND,
+    DRIFT,
+    DRIFT_NAMES,
+    FUEL,
+    OVERTAKE,
+    TIRE,
+    gap_columns,
+)
 from coachable.styles import (
     Mixture,
     PointMass,
@@ -74,9 +83,29 @@ def aggressiveness_style_space(cars: int = 1) -> StyleSpace:
     return StyleSpace(parameters, law if cars == 1 else Shared(law, cars), name="racing_aggressiveness")
 
 
-def drift_style_reward(space: StyleSpace) -> StyleReward:
-    """Return the reward Σ w_i g_i of mean slip angles [rad] and slip ratios of the axles."""
-    return StyleReward(space, {"drift": WeightedSum(DRIFT_NAMES, DRIFT)})
+def drift_style_reward(space: StyleSpace, *, in_corners: bool = False) -> StyleReward:
+    """Return the reward Σ w_i g_i of mean slip angles [rad] and slip ratios of the axles.
+
+    Args:
+        space: Result of `drift_style_space`.
+        in_corners: Whether a positive weight of the rear slip angle counts `corner_drift` instead (our choice): only
+            what the car drifts in corners, while it makes way. False is the paper's literal reward, which spinning
+            anywhere earns most of.
+    """
+    if not in_corners:
+        return StyleReward(space, {"drift": WeightedSum(DRIFT_NAMES, DRIFT)})
+    front, rear, *ratios = DRIFT_NAMES
+
+    def rear_angle(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
+        weight = style[rear]
+        return weight * torch.where(weight > 0.0, features[..., CORNER_DRIFT], features[..., DRIFT_NAMES.index(rear)])
+
+    terms = {
+        "front_angle": WeightedSum((front,), slice(0, 1)),
+        "rear_angle": Term(rear_angle, parameters=(rear,)),
+        "ratios": WeightedSum(tuple(ratios), slice(2, 4)),
+    }
+    return StyleReward(space, terms)
 
 
 def resource_style_reward(space: StyleSpace, *, gained: float = 1.0, defended: float | None = None) -> StyleReward:

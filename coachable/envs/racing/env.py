@@ -83,7 +83,7 @@ class RacingEnv(EnvBase):
         seed: Seed of the starts; each race, up to `copies`, has a random stream of its own.
         num_threads: Ignored; torch's own threads are used.
 
-    Keys written: `observation` (N, D), `task_reward` (N, 1), `style_features` (N, 8 + 3 (A - 1)), `telemetry` (N, 12),
+    Keys written: `observation` (N, D), `task_reward` (N, 1), `style_features` (N, 9 + 3 (A - 1)), `telemetry` (N, 13),
     `scenario` (N, 1) int64, `done`, `terminated`, `truncated` (N, 1).
 
     Raises:
@@ -92,7 +92,7 @@ class RacingEnv(EnvBase):
     Example:
         >>> env = RacingEnv(num_envs=2, track="ring", seed=0)
         >>> env.rollout(3)["next", "style_features"].shape
-        torch.Size([2, 3, 8])
+        torch.Size([2, 3, 9])
     """
 
     def __init__(

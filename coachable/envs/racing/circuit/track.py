@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +18,9 @@ WIDTH_MIN = 3.0  # [m], half-width, below which cars do not fit
 COLUMNS = ("x", "y", "tx", "ty", "curvature", "left", "right", "margin")
 _CLOSURE = 1.0  # [m], gap between the ends of a centre line that still counts as closed
 _FINE = 0.25  # [m], step of the integration
+_LENGTHS = (100.0, 30_000.0)  # [m]; the checks compare all points with each other
+_MARGIN_MIN = 1.0  # [m]
+_FAR = 1e6  # [m], beyond which single precision does not resolve centimetres
 
 
 @dataclass(frozen=True)
@@ -57,24 +59,27 @@ class Track:
             margin: Distance from the edge of the track to the wall [m].
 
         Raises:
-            ValueError: If a line does not hold four finite numbers, or if the track is open, crosses itself or is too
-                narrow.
+            ValueError: If the file is no text, a line does not hold four finite numbers, or the track is open, crosses
+                itself, is too narrow or too long.
         """
         path = Path(path)
+        try:
+            lines = path.read_text(encoding="utf-8-sig").splitlines()
+        except UnicodeDecodeError:
+            raise ValueError(f"{path} is no text: expected lines of x, y, w_right, w_left in metres") from None
         rows = []
-        with path.open(newline="") as file:
-            for number, row in enumerate(csv.reader(file), start=1):
-                if not row or row[0].lstrip().startswith("#"):
+        for number, line in enumerate(lines, start=1):
+            if not line.strip() or line.lstrip().startswith("#"):
+                continue
+            try:
+                values = [float(value) for value in line.split(",")[:4]]
+            except ValueError:
+                if not rows:  # a header
                     continue
-                try:
-                    values = [float(value) for value in row[:4]]
-                except ValueError:
-                    if not rows:  # a header
-                        continue
-                    values = []
-                if len(values) != 4 or not all(math.isfinite(v) for v in values):
-                    raise ValueError(f"{path}, line {number}: got {row}, expected x, y, w_right, w_left in metres")
-                rows.append(values)
+                values = []
+            if len(values) != 4 or not all(abs(v) < _FAR for v in values):
+                raise ValueError(f"{path}, line {number}: got {line[:80]!r}, expected x, y, w_right, w_left in metres")
+            rows.append(values)
         if len(rows) < 8:
             raise ValueError(f"{path} has {len(rows)} points: expected at least 8 on a closed centre line")
         points = np.array(rows)
@@ -91,10 +96,11 @@ class Track:
             left: Distances (n,) from the centre line to the left edge [m].
             right: Distances (n,) from the centre line to the right edge [m].
             name: Name of the circuit.
-            margin: Distance from the edge of the track to the wall [m].
+            margin: Distance from the edge of the track to the wall [m]; it is less inside tight corners, where the wall
+                would otherwise lie beyond the centre of the turn.
 
         Raises:
-            ValueError: If the track is open, crosses itself or is too narrow.
+            ValueError: If the track is open, crosses itself, is too narrow, too short or too long.
         """
         from scipy.interpolate import CubicSpline  # slow to import, and needed here only
 
@@ -104,6 +110,14 @@ class Track:
             points, left, right = points[:-1], left[:-1], right[:-1]
         elif ends > max(3.0 * steps.max(), _CLOSURE):
             raise ValueError(f"track {name!r} is open: {ends:.1f} m between its ends, expected a closed centre line")
+        if not steps[: len(points) - 1].all():
+            twice = int(steps.argmin())
+            raise ValueError(
+                f"track {name!r}: points {twice + 1} and {twice + 2} are the same, expected different ones"
+            )
+        low, high = _LENGTHS
+        if not low <= steps.sum() + ends <= high:
+            raise ValueError(f"track {name!r} is {steps.sum() + ends:.0f} m long: expected {low:.0f} to {high:.0f} m")
         closed = np.vstack([points, points[:1]])
         knots = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
         spline = CubicSpline(knots, closed, bc_type="periodic")
@@ -115,7 +129,10 @@ class Track:
         speed = np.linalg.norm(velocity, axis=1)
         curvature = (velocity[:, 0] * bend[:, 1] - velocity[:, 1] * bend[:, 0]) / speed**3
         widths = [np.interp(at, knots, np.append(w, w[:1])) for w in (left, right)]
-        columns = [*spline(at).T, *(velocity / speed[:, None]).T, curvature, *widths, np.full(count, margin)]
+        inner = np.where(curvature > 0, *widths)
+        room = 0.94 / np.maximum(np.abs(curvature), 1e-9) - inner
+        margins = np.clip(room, min(_MARGIN_MIN, margin), margin)
+        columns = [*spline(at).T, *(velocity / speed[:, None]).T, curvature, *widths, margins]
         return cls(name, torch.from_numpy(np.stack(columns, axis=1)), float(arc[-1] / count))
 
     @classmethod

@@ -15,6 +15,7 @@ from coachable.envs.racing.physics.simulation import CONTROL_STEP, bodies_of
 from coachable.envs.racing.physics.state import HEATS, ROW, WEARS, CarInputs, CarState
 from coachable.envs.racing.physics.surface import beyond
 from coachable.envs.racing.physics.tyres import heat_loss
+from coachable.envs.racing.race.features import sideslip
 from coachable.envs.racing.race.observation import (
     COURSE_POINTS,
     OPPONENT_COLUMNS,
@@ -51,8 +52,9 @@ TELEMETRY = (
     "wall",
     "contact",
     "place",  # 1 is first of the group
-    "beta",  # body slip angle [rad]
+    "sideslip",  # angle from the heading to the velocity, in (-π, π] [rad]
     "heading",  # relative to the track [rad]
+    "curvature",  # of the track [1/m]
 )
 
 
@@ -64,7 +66,7 @@ class Verdict(NamedTuple):
     observation: Tensor  # (N, D)
     reward: Tensor  # (N,) of the task
     features: Tensor  # (N, F)
-    telemetry: Tensor  # (N, 12)
+    telemetry: Tensor  # (N, 13)
     terminated: Tensor  # (N,) bool
 
 
@@ -189,7 +191,7 @@ class Referee:
         )
         tyres = tyre_view(car, wheels, new, compound[0])
         reward = task_reward(self.weights, s, run, tyres, outcome)
-        features = style_features(old, new, tyres, outcome, bodies, group)
+        features = style_features(old, new, tyres, outcome, run.curvature, bodies, group)
         reward = reward - self.weights.tyre_heat * (heat_loss(new[HEATS]) - heat_loss(old[HEATS])).mean(0)
         lost = beyond(arc.offset, run.left, run.right) > run.margin + _BEHIND_WALL
         stranded = (run.wrong_time > self.wrong_way_time) | (run.stopped_time > STOPPED_TIME) | lost
@@ -288,8 +290,9 @@ class Referee:
                 run.wall,
                 run.contact,
                 rank,
-                torch.atan2(s.vy, s.vx.abs().clamp(min=1e-3)),
+                sideslip(s.vx, s.vy),
                 torch.atan2(run.across, run.along),
+                run.curvature,
             ],
             dim=-1,
         )
