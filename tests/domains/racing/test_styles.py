@@ -11,7 +11,7 @@ from coachable.domains.racing.styles import (
     resource_style_reward,
     resource_style_space,
 )
-from coachable.envs.racing.race.features import CORNER_DRIFT, GAPS, anyone_beside, corner_drift
+from coachable.envs.racing.race.features import GAPS, anyone_beside, corner_drift
 from coachable.styles import Shared, StyleSpace
 
 N = 40000
@@ -82,9 +82,12 @@ def test_drifts_in_corners_replace_a_requested_rear_angle():
     space = drift_style_space()
     features = torch.tensor([[0.1, 0.5, 0.2, 0.3, 9.0, 9.0, 9.0, 9.0, 0.7]] * 2)
     theta = torch.tensor([[1.0, 2.0, -0.4, 5.0], [1.0, -0.2, -0.4, 5.0]])
-    reward = drift_style_reward(space, in_corners=True)(features, theta)
+    reward = drift_style_reward(space, in_corners=1.0)(features, theta)
     assert reward[:, 0].tolist() == pytest.approx([0.1 + 2 * 0.7 - 0.08 + 1.5, 0.1 - 0.2 * 0.5 - 0.08 + 1.5])
-    assert CORNER_DRIFT == 8
+    half = drift_style_reward(space, in_corners=0.5)(features, theta)
+    assert half[:, 0].tolist() == pytest.approx([0.1 + 2 * 0.6 - 0.08 + 1.5, 0.1 - 0.2 * 0.5 - 0.08 + 1.5])
+    with pytest.raises(ValueError, match="in_corners is 2: expected a share"):
+        drift_style_reward(space, in_corners=2)
 
 
 @pytest.mark.parametrize(
