@@ -79,6 +79,8 @@ def _parser() -> argparse.ArgumentParser:
     _add_number(evaluate, "--episodes", 20, "per style")
     _add_number(evaluate, "--switch-episodes", 60, "with switching styles")
     _add_rollout(evaluate)
+    text = "CSV file of a circuit to drive on beside the others, for racing agents"
+    evaluate.add_argument("--track", type=Path, metavar="FILE", help=text)
 
     render = command("render", _render, "film an agent whose style is switched while it acts", _SOURCE_HELP)
     _add_out(render, "coachable.mp4", ".mp4, .gif, .webp or .png")

@@ -9,6 +9,7 @@ from functools import partial
 from importlib.metadata import entry_points
 from inspect import signature
 from itertools import product
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -165,6 +166,7 @@ class Domain:
         words: Words for the domain, for phrases and presets.
         as_trained: Function from `env` of a training's configuration to this domain with these settings (such as the
             machines or cars); None if trainings do not differ.
+        on_track: Function from the file of a circuit to this domain on that circuit; None if it has no circuits.
         coached: Options of `make_env` for coaching and films, if they differ from those of evaluations.
         evaluation: Function that replaces the grid and the switching test of `coachable evaluate`: `(domain, policy,
             folder, settings) -> report`, with the loaded policy and `coachable.evaluation.evaluation_settings`.
@@ -187,6 +189,7 @@ class Domain:
     controls: Sequence[Control] = ()
     words: Words = field(default_factory=Words)
     as_trained: Callable[[Mapping[str, Any]], Domain] | None = None
+    on_track: Callable[[Path], Domain] | None = None
     coached: Mapping[str, Any] = field(default_factory=dict)
     evaluation: Callable[..., str] | None = None
     make_scene: Callable[..., Any] | None = None
@@ -218,6 +221,16 @@ class Domain:
         simulation = self.make_env(num_envs=num_envs, **options)
         reward = self.make_reward(space) if reward is None else reward
         return coachable_env(simulation, space, reward, *transforms, seed=seed)
+
+    def moved_to(self, track: Path) -> Domain:
+        """Return this domain on the circuit of a file.
+
+        Raises:
+            ValueError: If the domain has no circuits, or if the file does not hold one.
+        """
+        if self.on_track is None:
+            raise ValueError(f"{self.name} has no circuits: --track {track} is for agents that race")
+        return self.on_track(track)
 
     def cells(self) -> list[dict[str, Any]]:
         """Return the styles of the evaluation grid, by parameter name."""

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 # Imported inside the fixtures: a test that needs none of this should not pay for it.
@@ -34,18 +35,18 @@ def pytest_collection_finish() -> None:
     for name in ("env", "race.driver"):
         module = sys.modules.get(f"coachable.envs.racing.{name}")
         if module is not None:
-            module.speed_profile = _remembering(module.speed_profile)
+            module.speed_profiles = _remembering(module.speed_profiles)
 
 
-def _remembering(speed_profile: Callable[..., Any]) -> Callable[..., Any]:
+def _remembering(speed_profiles: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function that computes the speeds of each car on each line once."""
     known: dict[Any, Any] = {}
 
-    def remember(envelope: Any, curvature: Any, spacing: Any) -> Any:
-        key = (repr(envelope), curvature.tobytes(), getattr(spacing, "tobytes", lambda: spacing)())
+    def remember(envelope: Any, curvatures: Any, spacings: Any) -> Any:
+        key = (repr(envelope), *(np.asarray(line).tobytes() for line in (*curvatures, *spacings)))
         if key not in known:
-            known[key] = speed_profile(envelope, curvature, spacing)
-        return known[key].copy()
+            known[key] = speed_profiles(envelope, curvatures, spacings)
+        return [speeds.copy() for speeds in known[key]]
 
     return remember
 

@@ -31,6 +31,7 @@ NOT_RUN = {
     r"^coachable (coach|evaluate|explain|export|report|train RECIPE)$": "the name of a command, not one to be typed",
     r"collector=ray": "needs the extra [cluster], and most of them a cluster",
     r"preset=smoke|--help": "",  # is run
+    r"my_circuit": "needs a circuit of the reader's",
     r"runs/": "needs a training of minutes to hours, or is one",
     r"^python recipes/": "a training of minutes to hours",
     r"^python benchmarks/": "a benchmark of minutes to hours",

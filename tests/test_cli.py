@@ -32,6 +32,15 @@ def test_the_command_starts_without_loading_torch():
     subprocess.run([sys.executable, "-c", code], check=True, cwd=REPOSITORY)
 
 
+def test_a_bad_circuit_is_one_sentence(capsys, tmp_path):
+    (tmp_path / "own.csv").write_text("1, 2, 3, 4\n1, 2, x, 4\n")
+    arguments = ["evaluate", "racing_resources", "--out", str(tmp_path / "out"), "--track", str(tmp_path / "own.csv")]
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert "own.csv, line 2: got '1, 2, x, 4', expected x, y, w_right, w_left in metres" in error
+    assert len(error.strip().splitlines()) == 1 and not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     "arguments", [["evaluate", "nowhere"], ["render", "nowhere", "--out", "x.gif"], ["weights", "nowhere", "w.pt"]]
 )

@@ -37,13 +37,15 @@ def evaluate(source: str | Path, out: Path, **settings: Any) -> str:
         The report as Markdown.
 
     Raises:
-        ValueError: If `episodes` is below 1.
+        ValueError: If `episodes` is below 1, or if `track` is given and is no circuit, or the domain has none.
         CheckpointError: If the source does not hold a usable policy of its domain.
     """
+    asked = EvaluationSettings(**settings)
     agent = load_policy(source)
     domain = domain_of(agent)
+    if asked.track is not None:
+        domain.moved_to(asked.track)  # raises an error if it cannot be driven on
     out.mkdir(parents=True, exist_ok=True)
-    asked = EvaluationSettings(**settings)
     if domain.evaluation is not None:
         return domain.evaluation(domain, agent, out, asked)
     return evaluate_styles(domain, agent, out, asked)[0]

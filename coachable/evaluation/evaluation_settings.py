@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ class EvaluationSettings:
         seed: Seed of initial states, styles and sampled actions. The same seed gives the same files.
         num_threads: Number of physics threads, if the simulator has its own.
         progress: Whether to show progress bars.
+        track: File of a circuit to drive on beside the domain's own, for domains with circuits (`Domain.on_track`).
         sweeps: Episodes along each weight, if a report has already recorded them (`sweep_weights`); otherwise None.
 
     Raises:
@@ -34,6 +36,7 @@ class EvaluationSettings:
     seed: int = 0
     num_threads: int | None = None
     progress: bool = True
+    track: Path | None = None
     sweeps: Sequence[WeightSweep] | None = None
 
     def __post_init__(self) -> None:

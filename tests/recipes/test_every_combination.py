@@ -153,8 +153,19 @@ def test_the_stages_of_races_are_of_their_family(stage, margins, tmp_path):
     assert sum(config["env"]["scenarios"]["shares"].values()) == pytest.approx(1.0)
     arguments = ["preset=aggressiveness", f"stage={stage}", "family=drift", f"run_dir={tmp_path}"]
     config = compose_config("racing_qr_sac", arguments)
-    with pytest.raises(ValueError, match=f"style_reward has {', '.join(sorted(margins))}: racing_drift takes none"):
+    with pytest.raises(
+        ValueError, match=f"style_reward has {', '.join(sorted(margins))}: racing_drift takes in_corners"
+    ):
         import_module("racing_qr_sac").build(config)
+
+
+@pytest.mark.parametrize("stage", ["laps", "corners"])
+def test_the_stages_of_drifting_pay_for_corners_on_many_circuits(stage):
+    config = compose_config("racing_qr_sac", ["preset=drift", f"stage={stage}"])
+    assert config["domain"] == "racing_drift" and config["style_reward"] == {"in_corners": 1.0}
+    assert config["env"]["track"] == "training" and config["env"]["curvature"] is True
+    shares = {name: config["sampler"][name] for name in ("positive", "full", "neutral")}
+    assert sum(shares.values()) < 1.0 and config["sampler"]["_target_"].endswith("with_requests")
 
 
 def test_a_driver_who_drove_alone_starts_out_blind_to_others(tmp_path):

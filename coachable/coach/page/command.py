@@ -8,6 +8,7 @@ import threading
 import webbrowser
 from collections.abc import Callable
 from contextlib import ExitStack, redirect_stdout
+from pathlib import Path
 from typing import Any
 
 
@@ -26,6 +27,7 @@ def add_parser(commands: Any, source_help: str, run: Callable[[argparse.Namespac
         "--host", default="127.0.0.1", help="address to listen on; whoever reaches it can steer (default: %(default)s)"
     )
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--track", type=Path, metavar="FILE", help="CSV file of a circuit, for racing agents")
     parser.add_argument("--open", action="store_true", dest="open_browser", help="open the page in the browser")
     parser.set_defaults(run=run)
 
@@ -37,10 +39,11 @@ def serve(source: str, *, say: Callable[[str], None], **settings: Any) -> None:
         source: The agent, see `CoachSession.open`.
         say: Called with the address of the page.
         **settings: `port`, the first port to try; `host`, the address to listen on; `seed`, the seed of the session;
-            `open_browser`, whether to open the page in your browser.
+            `track`, the file of a circuit to drive on; `open_browser`, whether to open the page in your browser.
 
     Raises:
         CheckpointError: If there is no such agent.
+        ValueError: If the track is no circuit, or the agent does not race.
         ImportError: If the extra `ui` is not installed.
         OSError: If the server cannot listen at that address.
     """
@@ -57,6 +60,7 @@ def _serve(
     host: str = "127.0.0.1",
     seed: int = 0,
     open_browser: bool = False,
+    track: Path | None = None,
 ) -> None:
     from coachable.coach.page.server import make_server, page_address
 
@@ -75,7 +79,7 @@ def _serve(
         from coachable.coach.page.page import CoachPage
         from coachable.coach.session.session import CoachSession
 
-        session = CoachSession.open(source, seed=seed)
+        session = CoachSession.open(source, seed=seed, track=track)
         closing.callback(session.close)
         page = CoachPage(server, session)
         closing.callback(page.stop)

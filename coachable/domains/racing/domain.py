@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from coachable.domain import Domain
-from coachable.domains.racing.families import racing_family
+from coachable.domains.racing.families import home_track, racing_family
 from coachable.domains.racing.metrics import RacingMeasures
 from coachable.domains.racing.render import RacingRenderer
 from coachable.domains.racing.words import WORDS
+from coachable.envs.racing.circuit.track import Track
 from coachable.envs.racing.env import EPISODE_STEPS
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
 from coachable.envs.racing.race.observation import COURSE_POINTS, observation_groups
@@ -42,22 +44,28 @@ def racing_domain(
     make_env, make_space, make_reward = racing_family(family)
 
     def as_trained(settings: Mapping[str, Any]) -> Domain:
-        """Return the domain with the track, car, observation and episode length of a training."""
+        """Return the domain with the track, car, observation and episode length of a training.
+
+        A driver of several circuits is shown and measured on its family's.
+        """
         chosen = {name: value for name, value in settings.items() if name not in _OF_TRAINING}
-        chosen |= {"compiled": False, "device": "cpu", **options}
+        chosen |= {"compiled": False, "device": "cpu", "track": home_track(family, settings), **options}
         chosen.setdefault("opponents", chosen.get("cars", cars) > 1)
         coached = {}
         if cars == 1 and (met := chosen.pop("cars", 1)) > 1:  # agents trained in traffic are measured alone, too
             coached = {"cars": met, "scenarios": rolling_start(met)}
         pool, points = chosen.get("car") == "pool", chosen.get("course_points", COURSE_POINTS)
-        return replace(
+        return _with_circuits(
             domain,
             make_env=partial(make_env, **chosen),
             coached=coached,
             episode_steps=chosen.get("episode_steps", domain.episode_steps),
-            observation_groups=observation_groups(chosen["opponents"], pool, points),
+            observation_groups=observation_groups(chosen["opponents"], pool, points, chosen.get("curvature", False)),
         )
 
+    angles = ("sideslip", "sideslip_corners", "sideslip_straights") if family == "drift" else ()
+    units = {"pace": "m/s", "speed": "m/s", "fuel_per_km": "l"}
+    units |= dict.fromkeys(("slip_angle_front", "slip_angle_rear", *angles), "deg")
     domain = Domain(
         name=f"racing_{family}",
         make_env=partial(make_env, **options),
@@ -69,10 +77,20 @@ def racing_domain(
         control_step=CONTROL_STEP,
         episode_steps=EPISODE_STEPS,
         columns={"survived": ".0%", "pace": ".1f", "off": ".1%", "steering_change": ".2f"} | dict(columns),
-        units={"pace": "m/s", "speed": "m/s", "slip_angle_front": "deg", "slip_angle_rear": "deg", "fuel_per_km": "l"},
+        units=units,
         observation_groups=observation_groups(cars > 1, pool=False),
         words=WORDS[family],
         as_trained=as_trained,
         evaluation=evaluation,
     )
-    return domain
+    return _with_circuits(domain)
+
+
+def _with_circuits(domain: Domain, **changes: Any) -> Domain:
+    """Return a domain with changed fields that can move to the circuit of a file."""
+
+    def on_track(file: Path) -> Domain:
+        return replace(moved, make_env=partial(moved.make_env, track=Track.from_csv(file)))
+
+    moved = replace(domain, **changes, on_track=on_track)
+    return moved

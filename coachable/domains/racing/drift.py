@@ -12,6 +12,6 @@ DOMAIN = racing_domain(
     "drift",
     cars=1,
     grid=[*({**_NONE, **dict.fromkeys(_REAR, weight)} for weight in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)), _ALL],
-    columns={"slip_angle_front": ".1f", "slip_angle_rear": ".1f"},
+    columns={"sideslip_corners": ".1f", "sideslip_straights": ".1f", "turned_per_km": ".2f"},
     evaluation=evaluate_drift,
 )

@@ -1,4 +1,4 @@
-"""Evaluation of drifting: the slip angle under rising weights, and its cost in pace."""
+"""Evaluation of drifting: the sideslip under rising weights, in corners and on straights, and its cost in pace."""
 
 from __future__ import annotations
 
@@ -8,34 +8,41 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coachable.domains.racing.metrics import DRIFT_ANGLE_DEG, GRIP_ANGLE_DEG
-from coachable.envs.racing.race.features import DRIFT_NAMES
+from coachable.domains.racing.laps import circuits_report, circuits_summary, drive_circuits
+from coachable.domains.racing.metrics import DRIFT_DEG, DRIFT_SPEED, GRIP_DEG
+from coachable.envs.racing.race.features import CORNER_RADIUS, DRIFT_NAMES
 from coachable.envs.racing.race.scenarios import Scenario
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import drawing
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
-from coachable.evaluation.style_grid import evaluate_grid, markdown_table, policy_sentence, write_results
+from coachable.evaluation.style_grid import evaluate_grid, markdown_table, mean_of, policy_sentence, write_results
 
 if TYPE_CHECKING:
     from coachable.domain import Domain
     from coachable.training.weights import LoadedPolicy
 
-ANGLE = "slip_angle_rear"
+ANGLE = "sideslip_corners"
 SWEEPS = {  # weights that rise together
-    "rear slip angle": (ANGLE,),
-    "rear slip angle and ratio": (ANGLE, "slip_ratio_rear"),
+    "rear slip angle": ("slip_angle_rear",),
+    "rear slip angle and ratio": ("slip_angle_rear", "slip_ratio_rear"),
     "all four": DRIFT_NAMES,
 }
 WEIGHTS = (-0.4, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
 _STARTS = (Scenario("solo", 1.0, "solo"),)
-_METRICS = ("slip_angle_rear", "slip_angle_front", "pace", "off", "turns", "survived")
+_METRICS = (
+    *("sideslip_corners", "sideslip_straights", "drift_corners", "drift_straights", "slip_angle_rear"),
+    *("pace", "off", "turned_per_km", "backwards", "turns", "survived"),
+)
+_MIDDLE = 3.0  # a middle request
+_AT_MIDDLE = ("sideslip_corners", "drift_corners", "drift_straights", "pace_kept", "turned_per_km")
 
 
 def evaluate_drift(domain: Domain, agent: LoadedPolicy, out: Path, settings: EvaluationSettings) -> str:
     """Evaluate an agent under rising drift weights, from ordinary starts, and write the results.
 
     The weights of the rear slip angle, of the rear slip angle and ratio, and of all four quantities rise in turn. The
-    files are `drift.csv` (by weight), `drift.png`, `report.md` and `summary.json`.
+    files are `drift.csv` (by weight), `circuits.csv` (laps of `drive_circuits`), `drift.png`, `report.md` and
+    `summary.json`.
 
     Args:
         domain: Domain racing_drift, as the agent was trained in.
@@ -69,28 +76,32 @@ def evaluate_drift(domain: Domain, agent: LoadedPolicy, out: Path, settings: Eva
             "angle_at_none": own[WEIGHTS.index(0.0)][ANGLE],
             "angle_at_full": own[-1][ANGLE],
             "pace_kept_at_full": own[-1]["pace_kept"],
+            "middle": {name: own[WEIGHTS.index(_MIDDLE)][name] for name in _AT_MIDDLE},
             "most_turns": max(row["most_turns"] for row in own),
         }
     summary |= {"episodes_per_weight": settings.episodes, "seed": settings.seed}
     draw_drift(rows, out / "drift.png")
-    return write_results(out, _report(agent, rows, summary, grid.steps), summary, {"drift": rows})
+    circuits = drive_circuits(domain, agent, settings)
+    summary["circuits"] = circuits_summary(circuits)
+    report = _report(agent, rows, summary, grid.steps) + circuits_report(circuits)
+    return write_results(out, report, summary, {"drift": rows, "circuits": circuits})
 
 
 def _rows(sweep: str, episodes: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
-    """Return the means of values (weights, episodes) by weight, with 95 % intervals of the angle."""
+    """Return the means of values (weights, episodes) by weight, with 95 % intervals of the sideslip in corners."""
     neutral = float(np.nanmean(episodes["pace"][WEIGHTS.index(0.0)]))
     rows = []
     for index, weight in enumerate(WEIGHTS):
         low, high = bootstrap_interval(episodes[ANGLE][index])
         row: dict[str, Any] = {"sweep": sweep, "weight": weight}
-        row |= {name: float(np.nanmean(episodes[name][index])) for name in _METRICS}
+        row |= {name: mean_of(episodes[name][index]) for name in _METRICS}
         row |= {"angle_low": low, "angle_high": high, "pace_kept": row["pace"] / max(neutral, 1e-9)}
         rows.append(row | {"most_turns": float(np.nanmax(episodes["turns"][index]))})
     return rows
 
 
 def draw_drift(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw the mean rear slip angle with its 95 % interval, and the pace, over the weight, with a line per sweep."""
+    """Draw the mean sideslip in corners with its 95 % interval, and the pace, over the weight; one line per sweep."""
     with drawing(path, 1, 2, size=(9.0, 3.8)) as ((left, right),):
         for sweep, marker in zip(SWEEPS, "ovs", strict=True):
             own = [row for row in rows if row["sweep"] == sweep]
@@ -98,9 +109,9 @@ def draw_drift(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
             error = np.abs(np.array([[row["angle_low"], row["angle_high"]] for row in own]) - angle[:, None]).T
             left.errorbar(weights, angle, error, marker=marker, capsize=3)
             right.plot(weights, [row["pace_kept"] for row in own], marker=marker, label=sweep)
-        for line in (DRIFT_ANGLE_DEG, GRIP_ANGLE_DEG):
+        for line in (*DRIFT_DEG, GRIP_DEG):
             left.axhline(line, color="0.6", lw=1, ls=":")
-        left.set(xlabel="requested weight", ylabel="slip angle of the rear tyres [deg], 95 %")
+        left.set(xlabel="requested weight", ylabel="sideslip in corners [deg], 95 %")
         right.set(xlabel="requested weight", ylabel="progress, share of that at 0")
         right.legend(fontsize=8, loc="lower left")  # for both panels: the lines of the left one leave no room
         for panel in (left, right):
@@ -111,11 +122,16 @@ def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Map
     text = "# racing, drift: requested and measured style\n\n"
     text += f"{policy_sentence(agent)}; {summary['episodes_per_weight']} episodes of "
     text += f"{steps} steps per weight, ordinary starts, the other weights 0, seed {summary['seed']}.\n\n"
-    text += "![slip angle over weight](drift.png)\n\n"
-    formats = {"sweep": "", "weight": "g", "slip_angle_rear": ".1f", "slip_angle_front": ".1f", "pace": ".1f"}
-    formats |= {"pace_kept": ".0%", "off": ".1%", "turns": ".1f", "most_turns": ".0f", "survived": ".0%"}
-    text += markdown_table(rows, formats)
-    text += "\nSlip angles in degrees (0 below 5 m/s), pace in m/s along the track, turns: largest rotation against "
-    text += "the track in one direction, in whole turns, mean and most over episodes.\n\n"
+    text += "![sideslip over weight](drift.png)\n\n"
+    formats = {"sweep": "", "weight": "g", "sideslip_corners": ".1f", "sideslip_straights": ".1f"}
+    formats |= {"drift_corners": ".0%", "drift_straights": ".0%", "slip_angle_rear": ".1f", "pace": ".1f"}
+    formats |= {"pace_kept": ".0%", "off": ".1%", "turned_per_km": ".2f", "backwards": ".0%", "turns": ".1f"}
+    text += markdown_table(rows, formats | {"most_turns": ".0f", "survived": ".0%"})
+    text += "\nSideslip: mean angle between heading and velocity [deg], 180 when driving backwards. Drift: share of "
+    text += f"the time with {DRIFT_DEG[0]:g} to {DRIFT_DEG[1]:g} degrees of it above {DRIFT_SPEED:g} m/s. Corners: "
+    text += f"where the track's radius is at most {CORNER_RADIUS:g} m. Rear slip angle in degrees (0 below 5 m/s), "
+    text += "pace in m/s along the track. Turned per km: how often the car turned to face backwards; backwards: share "
+    text += "of the time that it faced so. Turns: largest rotation against the track in one direction, in whole turns, "
+    text += "mean and most over episodes.\n\n"
     ranks = ", ".join(f"{sweep} {summary[sweep]['rank_correlation']:.2f}" for sweep in SWEEPS)
-    return text + f"Rank correlation of weight and rear slip angle: {ranks}.\n"
+    return text + f"Rank correlation of weight and sideslip in corners: {ranks}.\n"

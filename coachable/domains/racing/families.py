@@ -14,11 +14,12 @@ from coachable.domains.racing.styles import (
     resource_style_reward,
     resource_style_space,
 )
-from coachable.envs.racing.circuit.circuits import load_track
+from coachable.envs.racing.circuit.circuits import SETS, load_tracks
 from coachable.envs.racing.circuit.track import Track
 from coachable.envs.racing.env import RacingEnv
 from coachable.envs.racing.physics.cars import Resources, load_car
 from coachable.envs.racing.race.driver import LineFollower
+from coachable.envs.racing.race.garage import POOL
 from coachable.envs.racing.race.rivals import Rivals
 from coachable.envs.racing.race.scenarios import Conditions, drift_scenarios, race_scenarios
 from coachable.envs.racing.race.task import TaskWeights
@@ -27,6 +28,8 @@ from coachable.styles import StyleReward, StyleSpace
 RIVALS_GRIP = 0.97  # of the fastest scripted opponents; the slowest use 0.8
 TYRE_HEAT = 900.0  # [m], progress that all grip is worth during the minute in which heat dissipates
 AGENTS, CARS = 3, 5  # in a race of the aggressiveness family
+CAR = {"drift": "street", "resources": "x2019", "aggressiveness": "gt3"}  # of each family
+HOME = {"drift": "ridge", "resources": "lakeside", "aggressiveness": "endurance"}  # circuit of each family
 
 
 def drift_env(num_envs: int = 64, **options: Any) -> RacingEnv:
@@ -38,7 +41,12 @@ def drift_env(num_envs: int = 64, **options: Any) -> RacingEnv:
         num_envs: Number of cars that the agent drives.
         **options: Options of `RacingEnv`.
     """
-    options = {"track": "ridge", "car": "street", "scenarios": drift_scenarios(), "wrong_way_time": 10.0} | options
+    options = {
+        "track": HOME["drift"],
+        "car": CAR["drift"],
+        "scenarios": drift_scenarios(),
+        "wrong_way_time": 10.0,
+    } | options
     return RacingEnv(num_envs, **options)
 
 
@@ -52,10 +60,10 @@ def resource_env(num_envs: int = 64, **options: Any) -> RacingEnv:
     """
     cars = options.get("cars", 1)
     if num_envs % cars:
-        options = {"controlled": 1, "driver": _line_follower(options, "lakeside", "x2019")[1]} | options
+        options = {"controlled": 1, "driver": _line_follower(options, HOME["resources"], CAR["resources"])[1]} | options
     defaults: dict[str, Any] = {
-        "track": "lakeside",
-        "car": "x2019",
+        "track": HOME["resources"],
+        "car": CAR["resources"],
         "conditions": Conditions.resources(),
         "resources": Resources.calibrated("gt3" if options.get("car") == "gt3" else "x2019"),
         "weights": TaskWeights(tyre_heat=TYRE_HEAT),
@@ -71,23 +79,22 @@ def rival_env(num_envs: int = AGENTS * 21, **options: Any) -> RacingEnv:
             multiple of three.
         **options: Options of `RacingEnv`.
     """
-    course, driver = _line_follower(options, "endurance", "gt3")
+    tracks, driver = _line_follower(options, HOME["aggressiveness"], CAR["aggressiveness"])
     space = aggressiveness_style_space()
     defaults: dict[str, Any] = {
         "cars": CARS,
         "controlled": AGENTS if num_envs % AGENTS == 0 else 1,
         "driver": Rivals(driver, (space.low, space.high), slowest=0.8 / RIVALS_GRIP),
-        "car": "gt3",
+        "car": CAR["aggressiveness"],
         "scenarios": race_scenarios(CARS),
     }
-    return RacingEnv(num_envs, **{**defaults, **options, "track": course})
+    return RacingEnv(num_envs, **{**defaults, **options, "track": tracks})
 
 
-def _line_follower(options: Mapping[str, Any], track: str, car: str) -> tuple[Track, LineFollower]:
-    """Return the track of an environment with these options, and the fastest scripted opponent on it."""
-    chosen = options.get("track", track)
-    course = load_track(chosen) if isinstance(chosen, str) else chosen
-    return course, LineFollower(course, load_car(options.get("car", car)), grip=RIVALS_GRIP, lanes=(0.0, 2.2, -2.2))
+def _line_follower(options: Mapping[str, Any], track: str, car: str) -> tuple[tuple[Track, ...], LineFollower]:
+    """Return the circuits of an environment with these options, and the fastest scripted opponent on them."""
+    tracks = load_tracks(options.get("track", track))
+    return tracks, LineFollower(tracks, load_car(options.get("car", car)), grip=RIVALS_GRIP, lanes=(0.0, 2.2, -2.2))
 
 
 class Family(NamedTuple):
@@ -129,6 +136,29 @@ def family_env(num_envs: int = 64, *, family: str, **options: Any) -> RacingEnv:
         ValueError: If there is no such family.
     """
     return racing_family(family).make_env(num_envs, **options)
+
+
+def home_track(family: str, settings: Mapping[str, Any]) -> str:
+    """Return the name of the circuit on which an agent is measured and shown: its only one, or its family's.
+
+    Args:
+        family: Name of the family.
+        settings: Options of the environment that the agent was trained in.
+    """
+    tracks = training_tracks(family, settings)
+    return tracks[0] if len(tracks) == 1 else HOME[family]
+
+
+def training_tracks(family: str, settings: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the names of the circuits that an agent was trained on; the arguments are those of `home_track`."""
+    track = settings.get("track", HOME[family])
+    return SETS.get(track, (track,)) if isinstance(track, str) else tuple(track)
+
+
+def typical_car(family: str, settings: Mapping[str, Any]) -> str:
+    """Return the shipped car that an agent drove, or the one after which its pool is made, as in `home_track`."""
+    car = settings.get("car", CAR[family])
+    return "gt3" if car == POOL else car
 
 
 def family_style(family: str) -> tuple[StyleSpace, Callable[..., StyleReward]]:

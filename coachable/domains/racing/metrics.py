@@ -11,15 +11,24 @@ from torch import Tensor
 
 from coachable.domains.racing.families import racing_family
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
-from coachable.envs.racing.race.features import DRIFT, FUEL, NEAR_DISTANCE, TIRE, anyone_near, gap_columns
+from coachable.envs.racing.race.features import (
+    CORNER_RADIUS,
+    DRIFT,
+    FUEL,
+    NEAR_DISTANCE,
+    TIRE,
+    anyone_near,
+    gap_columns,
+)
 from coachable.envs.racing.race.observation import own_columns
 from coachable.envs.racing.race.referee import TELEMETRY
 from coachable.keys import STYLE, STYLE_FEATURES
 
-DRIFT_ANGLE_DEG = 20.0  # smallest slip angle of a drift
-GRIP_ANGLE_DEG = 8.0  # largest slip angle without a drift
+DRIFT_DEG = (15.0, 60.0)  # sideslip of a drift
+DRIFT_SPEED = 8.0  # [m/s], smallest speed of a drift
+GRIP_DEG = 8.0  # largest sideslip without a drift
 _NEEDS = {
-    "drift": "a step",
+    "drift": "a step in a corner, or one without a request",
     "resources": "whole stints with and without saving, as `coachable evaluate` drives them",
     "aggressiveness": f"another car within {NEAR_DISTANCE:g} m",
 }
@@ -73,9 +82,7 @@ class RacingMeasures:
         if self.family == "drift":
             found["heading"] = told("heading")
             found["slip_ratio_front"], found["slip_ratio_rear"] = features[:, DRIFT].unbind(-1)[2:]
-            asked = theta[:, 1] > 1.0
-            angle = found["slip_angle_rear"]
-            found["complied"] = torch.where(asked, angle >= DRIFT_ANGLE_DEG, angle <= GRIP_ANGLE_DEG).float()
+            found |= _drifting(told("sideslip") * degrees, told("speed"), told("curvature"), theta[:, 1] > 1.0)
         elif self.family == "resources":
             found["complied"] = 1.0 - found["off"]
         else:
@@ -86,7 +93,8 @@ class RacingMeasures:
     def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
         """Return means over the steps that count, with wear and fuel per kilometre; see `StyleMeasures.summarise`.
 
-        For drift, "turns" is the largest rotation against the track in one direction, in whole turns.
+        For drift, "turns" is the largest rotation against the track in one direction, in whole turns, "turned_per_km"
+        how often per kilometre the car turned to face backwards, and "backwards" the share of time that it faced so.
         """
         record = dict(record)
         heading = record.pop("heading", None)
@@ -96,20 +104,25 @@ class RacingMeasures:
             means[f"{name}_per_km"] = means.pop(name) / kilometres
         if heading is not None:
             means["turns"] = whole_turns(heading, alive)
+            back = (heading.abs() > 0.5 * math.pi) & alive
+            driven = means["pace"].abs() * alive.sum(0) * CONTROL_STEP / 1000.0
+            means["turned_per_km"] = (back[1:] & ~back[:-1]).sum(0) / driven.clamp(min=0.1)
+            means["backwards"] = back.sum(0) / alive.sum(0)
         return means
 
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
         """Return whether the car complies in each step; see `StyleMeasures.complies`.
 
-        By family, it drifts at 20 degrees or more if asked to and at 8 or less if not, it is on the track, or it keeps
-        the margins to the cars nearby.
+        By family, it drifts with 15 to 60 degrees of sideslip in corners if asked to and has 8 degrees or less if not,
+        it is on the track, or it keeps the margins to the cars nearby.
         """
         return record["complied"] > 0
 
     def judged(self, record: Mapping[str, Tensor]) -> Tensor:
         """Return whether compliance can be judged in each step, (T, N) bool.
 
-        Margins can be judged only while another car is near, and savings only by comparison with a stint without them.
+        Requested drifts can be judged only in corners, margins only while another car is near, and savings only by
+        comparison with a stint without them.
         """
         return ~torch.isnan(record["complied"]) & (self.family != "resources")
 
@@ -151,6 +164,28 @@ def whole_turns(heading: Tensor, alive: Tensor) -> Tensor:
     up = (angle - angle.cummin(0).values).amax(0)
     down = (angle.cummax(0).values - angle).amax(0)
     return torch.floor(torch.maximum(up, down) / (2.0 * math.pi))
+
+
+def _drifting(sideslip: Tensor, speed: Tensor, curvature: Tensor, asked: Tensor) -> dict[str, Tensor]:
+    """Return the measures of drifting in a step, (N,) each, with angles in degrees.
+
+    "sideslip" and "drift" (share of drifts) come with a measure for corners and one for straights each, which is NaN
+    elsewhere.
+
+    Args:
+        sideslip: Sideslip (N,) [deg].
+        speed: Speed (N,) [m/s].
+        curvature: Curvature of the track (N,) [1/m].
+        asked: Whether a drift is requested (N,) bool.
+    """
+    angle, corner = sideslip.abs(), curvature.abs() * CORNER_RADIUS >= 1.0
+    drifts = (angle >= DRIFT_DEG[0]) & (angle <= DRIFT_DEG[1]) & (speed > DRIFT_SPEED)
+    kept = torch.where(asked, torch.where(corner, drifts.float(), torch.nan), (angle <= GRIP_DEG).float())
+    found = {"complied": kept, "sideslip": angle, "drift": drifts.float()}
+    for name in ("sideslip", "drift"):
+        found[f"{name}_corners"] = torch.where(corner, found[name], torch.nan)
+        found[f"{name}_straights"] = torch.where(corner, torch.nan, found[name])
+    return found
 
 
 def _margins_kept(features: Tensor, theta: Tensor) -> Tensor:

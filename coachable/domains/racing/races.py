@@ -16,6 +16,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from coachable.domains.racing.laps import circuits_report, circuits_summary, drive_circuits
 from coachable.domains.racing.metrics import TelemetryMeasures
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
 from coachable.envs.racing.race.features import anyone_beside
@@ -62,7 +63,8 @@ class _RaceMeasures(TelemetryMeasures):
 def evaluate_aggressiveness(domain: Domain, agent: LoadedPolicy, out: Path, settings: EvaluationSettings) -> str:
     """Race pairs with rising lateral margins against three other copies of the agent, and write the results.
 
-    The files are `races.csv` (by setting and margin), `radar.png`, `report.md` and `summary.json`.
+    The files are `races.csv` (by setting and margin), `circuits.csv` (laps of `drive_circuits`), `radar.png`,
+    `report.md` and `summary.json`.
 
     Args:
         domain: Domain racing_aggressiveness, as the agent was trained in.
@@ -88,7 +90,10 @@ def evaluate_aggressiveness(domain: Domain, agent: LoadedPolicy, out: Path, sett
         summary[setting] = {name: rank_correlation(gained["lateral"], gained[name]) for name in _RANKED}
     summary |= {"races_per_row": len(OTHERS) * episodes, "seed": seed}
     draw_radar(rows, out / "radar.png")
-    return write_results(out, _report(agent, rows, summary), summary, {"races": rows})
+    circuits = drive_circuits(domain, agent, settings)
+    report = _report(agent, rows, summary) + circuits_report(circuits)
+    summary["circuits"] = circuits_summary(circuits)
+    return write_results(out, report, summary, {"races": rows, "circuits": circuits})
 
 
 def _race(

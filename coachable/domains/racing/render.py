@@ -46,7 +46,7 @@ class RacingRenderer:
         self._figure.clear()
         axes = self._figure.add_axes((0, 0, 1, 1), facecolor=_GRASS)
         x, y = state[ROW["x"], row], state[ROW["y"], row]
-        self._road(axes, env, x, y)
+        self._road(axes, env, row, x, y)
         for car, column in enumerate(_mates(env, row)):
             shape = _corners(env, state, column)
             colour = _CAR_COLOURS[car % len(_CAR_COLOURS)]
@@ -67,8 +67,8 @@ class RacingRenderer:
         self._figure.clear()
 
     @staticmethod
-    def _road(axes, env: RacingEnv, x: float, y: float) -> None:
-        table = env.track.table.numpy()
+    def _road(axes, env: RacingEnv, row: int, x: float, y: float) -> None:
+        table = _circuit(env, row)
         normal = np.stack([-table[:, 3], table[:, 2]], axis=1)
         left = table[:, :2] + table[:, 5:6] * normal
         right = table[:, :2] - table[:, 6:7] * normal
@@ -82,13 +82,18 @@ class RacingRenderer:
 
     def _map(self, env: RacingEnv, state: np.ndarray, row: int) -> None:
         axes = self._figure.add_axes((0.76, 0.70, 0.23, 0.29))
-        table = env.track.table.numpy()
+        table = _circuit(env, row)
         axes.plot(*np.vstack([table[:, :2], table[:1, :2]]).T, color="white", linewidth=1.0)
         for car, column in enumerate(_mates(env, row)):
             place = state[ROW["x"], column], state[ROW["y"], column]
             axes.plot(*place, "o", color=_CAR_COLOURS[car % len(_CAR_COLOURS)], markersize=3)
         axes.set_aspect("equal")
         axes.axis("off")
+
+
+def _circuit(env: RacingEnv, row: int) -> np.ndarray:
+    """Return the table of the circuit that the car of a row is on."""
+    return env.tracks[int(env.circuit[row % env.races])].table.numpy()
 
 
 def _mates(env: RacingEnv, row: int) -> list[int]:

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from coachable.domains.racing.families import home_track
 from coachable.domains.racing.frontier import TANK, WORN, sweep
+from coachable.domains.racing.laps import SOLO, TRIAL_STEPS, circuits_report, circuits_summary, cut_laps, drive_circuits
 from coachable.domains.racing.metrics import TelemetryMeasures
 from coachable.domains.racing.traffic import draw_traffic, race_in_traffic, traffic_report, traffic_response
 from coachable.envs.racing.circuit.circuits import load_track
 from coachable.envs.racing.physics.cars import Resources
-from coachable.envs.racing.physics.simulation import CONTROL_STEP
-from coachable.envs.racing.race.scenarios import Conditions, Scenario
+from coachable.envs.racing.race.scenarios import Conditions
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import drawing, shade
 from coachable.evaluation.rollouts import record_styles
@@ -31,10 +32,8 @@ WEIGHTS = {"fuel": "fuel", "tyre": "tire"}  # style weight of each resource
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the largest weight
 COMPARED = 6  # flying laps of each stint whose times are compared; the first lap is on cold tyres
 STINT_STEPS = 9000  # 15 minutes
-TRIAL_STEPS = 3600
 _COLD = 40.0  # [°C]
 _PRICES = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 9.0, 12.0, 16.0, 24.0, 40.0, 70.0)  # of the frontier, see `LapProgramme.laps`
-_SOLO = (Scenario("solo", 1.0, "solo"),)
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ def evaluate_resources(domain: Domain, agent: LoadedPolicy, out: Path, settings:
     As in the paper, the other resource is switched off. The files are `stints.csv` (by resource and weight), `laps.csv`
     (every lap), `stints.png` (resource left and lap times over laps), `tradeoff.png` (range against pace, with the
     frontier), `report.md` and `summary.json`. An agent that was trained with several cars also races in traffic, see
-    `race_in_traffic`, which adds `traffic.csv` and `traffic.png`.
+    `race_in_traffic`, which adds `traffic.csv` and `traffic.png`. `circuits.csv` has the laps of `drive_circuits`.
 
     Args:
         domain: Domain racing_resources, as the agent was trained in.
@@ -80,7 +79,7 @@ def evaluate_resources(domain: Domain, agent: LoadedPolicy, out: Path, settings:
     """
     out.mkdir(parents=True, exist_ok=True)
     trained, episodes, seed = agent.config.get("env", {}), settings.episodes, settings.seed
-    car, track = trained.get("car", "x2019"), trained.get("track", "lakeside")
+    car, track = trained.get("car", "x2019"), home_track("resources", trained)
     rates, length = Resources.calibrated(car), load_track(track).length
     options: dict[str, Any] = {**settings.rollout, "steps": settings.steps or STINT_STEPS}
     rows: list[dict[str, Any]] = []
@@ -109,14 +108,17 @@ def evaluate_resources(domain: Domain, agent: LoadedPolicy, out: Path, settings:
     [trial] = _drive(domain, agent, [{}], max(episodes, 10), "fuel", label="trial", length=length, **options)
     summary = _summary(rows, trial, frontiers["fuel"][0]["lap_time"], episodes, seed)
     traffic = race_in_traffic(domain, agent, settings) if trained.get("cars", 1) > 1 else []
-    report = _report(agent, rows, summary, seed, episodes)
+    circuits = drive_circuits(domain, agent, settings)
+    summary["circuits"] = circuits_summary(circuits)
+    report = _report(agent, rows, summary, seed, episodes) + circuits_report(circuits)
     if traffic:
         summary["traffic"] = traffic_response(traffic)
         report += traffic_report(traffic, summary["traffic"])
         draw_traffic(traffic, out / "traffic.png")
     draw_stints(every, out / "stints.png")
     draw_tradeoff(rows, frontiers, out / "tradeoff.png")
-    return write_results(out, report, summary, {"stints": rows, "laps": every, "traffic": traffic})
+    tables = {"stints": rows, "laps": every, "traffic": traffic, "circuits": circuits}
+    return write_results(out, report, summary, tables)
 
 
 def frontier(track: str, car: str, resource: str) -> list[dict[str, float]]:
@@ -154,7 +156,7 @@ def _drive(
         theta,
         f"{label}: {count} stints",
         measures=TelemetryMeasures("distance", "fuel", "wear", "off"),
-        scenarios=_SOLO,
+        scenarios=SOLO,
         episode_steps=options["steps"] + 1,
         **options,
     )
@@ -167,19 +169,15 @@ def _drive(
 def _stint(measured: Mapping[str, np.ndarray], alive: np.ndarray, row: int, length: float, resource: str) -> Stint:
     """Return the stint of one row from the measures (T, N) of all cars."""
     driven = {name: values[:, row][alive[:, row]] for name, values in measured.items()}
-    distance, off = driven["distance"], np.cumsum(driven["off"])
+    distance, off = driven["distance"], driven["off"]
     left = driven["fuel" if resource == "fuel" else "wear"]
     running = left > 0.0 if resource == "fuel" else left < 1.0  # later steps use nothing
     distance, off, left = distance[running], off[running], left[running]
-    furthest = np.maximum.accumulate(distance)
-    ends = length * np.arange(1, int(furthest[-1] // length) + 1)
-    steps = np.searchsorted(furthest, ends)  # step in which each lap ends
-    before = np.where(steps > 0, furthest[np.maximum(steps - 1, 0)], 0.0)
-    crossed = CONTROL_STEP * (steps + (ends - before) / (furthest[steps] - before))
+    times, clean, steps = cut_laps(distance, off, length)
     first, last = (steps[0], steps[-1]) if len(steps) > 1 else (0, -1)  # the first lap contains the start
     return Stint(
-        laps=np.diff(crossed, prepend=0.0),
-        clean=np.diff(off[steps], prepend=0.0) == 0.0,
+        laps=times,
+        clean=clean,
         left=left[steps],
         per_km=abs(left[last] - left[first]) / max((distance[last] - distance[first]) / 1000.0, 1e-9),
     )

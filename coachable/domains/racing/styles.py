@@ -7,7 +7,16 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from coachable.envs.racing.race.features import DEFEND, DRIFT, DRIFT_NAMES, FUEL, OVERTAKE, TIRE, gap_columns
+from coachable.envs.racing.race.features import (
+    CORNER_DRIFT,
+    DEFEND,
+    DRIFT,
+    DRIFT_NAMES,
+    FUEL,
+    OVERTAKE,
+    TIRE,
+    gap_columns,
+)
 from coachable.styles import (
     Mixture,
     PointMass,
@@ -74,9 +83,34 @@ def aggressiveness_style_space(cars: int = 1) -> StyleSpace:
     return StyleSpace(parameters, law if cars == 1 else Shared(law, cars), name="racing_aggressiveness")
 
 
-def drift_style_reward(space: StyleSpace) -> StyleReward:
-    """Return the reward Σ w_i g_i of mean slip angles [rad] and slip ratios of the axles."""
-    return StyleReward(space, {"drift": WeightedSum(DRIFT_NAMES, DRIFT)})
+def drift_style_reward(space: StyleSpace, *, in_corners: float = 0.0) -> StyleReward:
+    """Return the reward Σ w_i g_i of mean slip angles [rad] and slip ratios of the axles.
+
+    Args:
+        space: Result of `drift_style_space`.
+        in_corners: Share of a positive weight of the rear slip angle that pays for `corner_drift` (our choice), which
+            is what the car drifts through corners while it makes way. The rest pays for the slip angle, as does a
+            negative weight. 0 is the paper's literal reward, of which spinning anywhere earns most.
+
+    Raises:
+        ValueError: If `in_corners` is not in [0, 1].
+    """
+    if not 0.0 <= in_corners <= 1.0:
+        raise ValueError(f"in_corners is {in_corners}: expected a share between 0 and 1")
+    if in_corners == 0.0:
+        return StyleReward(space, {"drift": WeightedSum(DRIFT_NAMES, DRIFT)})
+    front, rear, *ratios = DRIFT_NAMES
+
+    def rear_angle(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
+        weight, angle = style[rear], features[..., DRIFT_NAMES.index(rear)]
+        return weight * torch.where(weight > 0.0, angle.lerp(features[..., CORNER_DRIFT], in_corners), angle)
+
+    terms = {
+        "front_angle": WeightedSum((front,), slice(0, 1)),
+        "rear_angle": Term(rear_angle, parameters=(rear,)),
+        "ratios": WeightedSum(tuple(ratios), slice(2, 4)),
+    }
+    return StyleReward(space, terms)
 
 
 def resource_style_reward(space: StyleSpace, *, gained: float = 1.0, defended: float | None = None) -> StyleReward:

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from coachable.envs.racing.circuit.circuits import load_track
-from coachable.envs.racing.circuit.profile import Envelope, speed_profile
+from coachable.envs.racing.circuit.circuits import load_tracks
+from coachable.envs.racing.circuit.profile import Envelope, speed_profiles
 from coachable.envs.racing.circuit.track import Course, Track
 from coachable.envs.racing.physics.cars import Resources, compound_table
 from coachable.envs.racing.physics.simulation import SUBSTEPS, Simulation, maybe_compile
@@ -55,13 +56,17 @@ class RacingEnv(EnvBase):
         controlled: Number of cars of each race that the agent drives, the first ones; all by default. `driver` drives
             the others.
         driver: Driver of the other cars.
-        track: Name of a shipped circuit, or a `Track`.
+        track: Name of a circuit, a `Track`, several of them, or the name of a set, see `load_tracks`. With several
+            circuits, races take turns on them: race b drives its episode e on circuit b + e, counted from 0 and round
+            and round.
         car: Name of a shipped car, or "pool" for cars drawn from a pool, one model per race.
         scenarios: Kinds of starts of the episodes; by default the mixture of `race_scenarios`.
         conditions: Tyres and fuel at the start.
         resources: Wear and fuel rates.
         weights: Weights of the task reward.
         course_points: Number of points of each edge of the track in the observation.
+        curvature: Whether the observation has the curvature of the track ahead instead of the place on the lap, which
+            is 0 then. Use it for drivers of circuits that they have not seen.
         opponents: Whether the observation has columns for opponents; by default it has them if there are several cars.
             They are 0 for a car that is alone.
         episode_steps: Number of control steps (0.1 s) after which an episode is truncated.
@@ -78,7 +83,7 @@ class RacingEnv(EnvBase):
         seed: Seed of the starts; each race, up to `copies`, has a random stream of its own.
         num_threads: Ignored; torch's own threads are used.
 
-    Keys written: `observation` (N, D), `task_reward` (N, 1), `style_features` (N, 8 + 3 (A - 1)), `telemetry` (N, 12),
+    Keys written: `observation` (N, D), `task_reward` (N, 1), `style_features` (N, 9 + 3 (A - 1)), `telemetry` (N, 13),
     `scenario` (N, 1) int64, `done`, `terminated`, `truncated` (N, 1).
 
     Raises:
@@ -87,7 +92,7 @@ class RacingEnv(EnvBase):
     Example:
         >>> env = RacingEnv(num_envs=2, track="ring", seed=0)
         >>> env.rollout(3)["next", "style_features"].shape
-        torch.Size([2, 3, 8])
+        torch.Size([2, 3, 9])
     """
 
     def __init__(
@@ -97,13 +102,14 @@ class RacingEnv(EnvBase):
         cars: int = 1,
         controlled: int | None = None,
         driver: Driver | None = None,
-        track: str | Track = "lakeside",
+        track: str | Track | Sequence[str | Track] = "lakeside",
         car: str = "gt3",
         scenarios: Sequence[Scenario] | None = None,
         conditions: Conditions | None = None,
         resources: Resources | None = None,
         weights: TaskWeights | None = None,
         course_points: int = COURSE_POINTS,
+        curvature: bool = False,
         opponents: bool | None = None,
         episode_steps: int = EPISODE_STEPS,
         wrong_way_time: float = WRONG_WAY_TIME,
@@ -133,10 +139,11 @@ class RacingEnv(EnvBase):
         super().__init__(device=device, batch_size=torch.Size((num_envs,)))
         self.num_envs, self.cars, self.controlled = num_envs, cars, controlled
         self.races, self.driver, self.episode_steps = num_envs // controlled, driver, episode_steps
-        self.put_back, self.copies = put_back, copies
-        self.track = load_track(track) if isinstance(track, str) else track
+        self.put_back = put_back
+        self._start_of_race = torch.arange(self.races, device=device) % (self.races // copies)
+        self.tracks = load_tracks(track)
         place = torch.device(device)
-        self.course = Course(self.track, place)
+        self.course = Course(self.tracks, place)
         self.garage = Garage(car, cars, self.races, place)
         self.simulation = Simulation(
             self.garage.car, resources or Resources(), cars=cars, substeps=substeps, compile=compiled, device=place
@@ -149,12 +156,12 @@ class RacingEnv(EnvBase):
             course_points,
             pool=self.garage.pooled,
             opponents=opponents,
+            curvature=curvature,
             wrong_way_time=wrong_way_time,
         )
-        profile = speed_profile(Envelope(self.garage.typical), self.track.table[:, 4].numpy(), self.track.spacing)
-        self.starter = Starter(
-            self.course, scenarios or race_scenarios(cars), conditions or Conditions(), torch.tensor(profile), cars
-        )
+        bends, spacings = [one.table[:, 4].numpy() for one in self.tracks], [one.spacing for one in self.tracks]
+        speeds = torch.tensor(np.concatenate(speed_profiles(Envelope(self.garage.typical), bends, spacings)))
+        self.starter = Starter(self.course, scenarios or race_scenarios(cars), conditions or Conditions(), speeds, cars)
         self._command = maybe_compile(self.referee.command, place, compiled)
         self._judge = maybe_compile(self.referee.judge, place, compiled)
         self._compounds = compound_table().to(place)
@@ -167,7 +174,7 @@ class RacingEnv(EnvBase):
         self.episode = torch.zeros(self.races, dtype=torch.int64, device=place)
         self.seeds = torch.zeros(self.races, dtype=torch.int64, device=place)
         self.observation_size = sum(
-            width for _, width in observation_groups(opponents, self.garage.pooled, course_points)
+            width for _, width in observation_groups(opponents, self.garage.pooled, course_points, curvature)
         )
         self._observation = torch.zeros(rows, self.observation_size, device=place)
         self._set_seed(seed)
@@ -208,9 +215,9 @@ class RacingEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         start = int(torch.randint(2**31, ()).item()) if seed is None else seed
-        start_of_race = torch.arange(self.races, device=self.seeds.device) % (self.races // self.copies)
-        self.seeds = start * 1_000_003 + start_of_race
+        self.seeds = start * 1_000_003 + self._start_of_race
         self.episode = torch.zeros_like(self.episode)
+        self.course.assign(self.circuit.repeat(self.cars))
         self.garage.reset(start)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
@@ -304,6 +311,7 @@ class RacingEnv(EnvBase):
             raise ValueError(f"state of {races} races of {cars} cars given, this env has {self.races} of {self.cars}")
         for name in _STATE:
             setattr(self, name, state[name].to(self.device, copy=True))
+        self.course.assign(self.circuit.repeat(self.cars))
         self._observation = state["observation_now"].to(self.device, copy=True)
         self.garage.load_state(state)
         self.simulation.set_cars(self.garage.car)
@@ -314,6 +322,11 @@ class RacingEnv(EnvBase):
         """Set the policy that rivals copy; it has no effect without rivals."""
         if isinstance(self.driver, Rivals):
             self.driver.follow(policy)
+
+    @property
+    def circuit(self) -> Tensor:
+        """Number of the circuit of each race (B,), an index into `tracks`."""
+        return (self._start_of_race + (self.episode - 1).clamp(min=0)) % len(self.tracks)
 
     @property
     def field(self) -> Field:
@@ -356,10 +369,11 @@ class RacingEnv(EnvBase):
     def _start_races(self, races: Tensor) -> None:
         """Start new episodes of the races (B,) bool and leave the others unchanged."""
         self.episode = self.episode + races
+        self.course.assign(self.circuit.repeat(self.cars))
         if self.garage.pooled:
             self.garage.draw(races, self.seeds, self.episode, Run(*self.run.unbind(0)).spins)
             self.simulation.set_cars(self.garage.car)
-        starts = self.starter.draw(self.seeds, self.episode, self.garage.car)
+        starts = self.starter.draw(self.seeds, self.episode, self.garage.car, self.circuit)
         rows = races.repeat(self.cars)
         self.state = torch.where(rows, starts.state.reshape(STATE_ROWS, -1), self.state)
         self.group = torch.where(races, starts.group, self.group)

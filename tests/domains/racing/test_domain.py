@@ -1,6 +1,7 @@
 """The three declarations: they make environments, measure and draw."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,10 +9,11 @@ import torch
 
 from coachable.domain import load_domain
 from coachable.domains.racing.events import racing_events
-from coachable.domains.racing.families import family_env, family_style
+from coachable.domains.racing.families import family_env, family_style, training_tracks
 from coachable.domains.racing.metrics import RacingMeasures
 from coachable.domains.racing.render import RacingRenderer
 from coachable.envs.racing import RacingEnv
+from coachable.envs.racing.circuit.circuits import SETS
 from coachable.envs.racing.race.referee import TELEMETRY
 from coachable.envs.racing.race.scenarios import Conditions
 from coachable.transforms import coachable_env
@@ -61,6 +63,22 @@ def test_who_learnt_among_others_is_measured_alone_and_coached_among_others():
     assert not ready.coached and torch.equal(ready.make_env(num_envs=4, seed=0).reset()["observation"], seen)
 
 
+def test_drivers_of_many_circuits_are_shown_on_their_familys_or_on_the_users(tmp_path):
+    settings = {"env": {"track": "training", "curvature": True}}
+    domain = load_domain("racing_resources", settings)
+    env = domain.make_env(num_envs=2, seed=0)
+    assert [track.name for track in env.tracks] == ["lakeside"]
+    assert sum(width for _, width in domain.observation_groups) == env.observation_size
+    assert training_tracks("resources", settings["env"]) == SETS["training"]
+    points = [(150 * math.cos(a / 20), 150 * math.sin(a / 20), 6, 6) for a in range(126)]
+    (tmp_path / "own.csv").write_text("\n".join(",".join(map(str, point)) for point in points))
+    moved = domain.moved_to(tmp_path / "own.csv")
+    own = moved.make_env(num_envs=2, seed=0)
+    assert [track.name for track in own.tracks] == ["own"] and own.observation_size == env.observation_size
+    with pytest.raises(ValueError, match=r"humanoid has no circuits: --track own\.csv is for agents that race"):
+        load_domain("humanoid").moved_to(Path("own.csv"))
+
+
 def test_an_agent_of_tyres_and_fuel_races_agents_or_scripted_drivers():
     agents, one = (family_env(n, family="resources", cars=3, track="ring", seed=0) for n in (6, 4))
     assert (agents.races, agents.controlled, one.races, one.controlled) == (2, 3, 4, 1)
@@ -85,7 +103,7 @@ def test_a_domain_is_as_its_training_made_it():
     settings |= {"scenarios": [{"_target_": "x"}], "conditions": {"_target_": "x"}, "weights": {"_target_": "x"}}
     domain = load_domain("racing_resources", {"env": {**settings, "episode_steps": 20, "course_points": 5}})
     env = domain.make_env(num_envs=2, seed=0)
-    assert (env.track.name, env.num_envs, domain.episode_steps) == ("ring", 2, 20)
+    assert (env.tracks[0].name, env.num_envs, domain.episode_steps) == ("ring", 2, 20)
     assert sum(width for _, width in domain.observation_groups) == env.observation_size
 
 

@@ -10,14 +10,16 @@ import pytest
 import torch
 
 from coachable.domain import load_domain
-from coachable.domains.racing import traffic
+from coachable.domains.racing import laps, traffic
 from coachable.domains.racing.drifts import evaluate_drift
 from coachable.domains.racing.families import family_style
+from coachable.domains.racing.laps import circuits_report, circuits_summary, drive_circuits
 from coachable.domains.racing.metrics import whole_turns
 from coachable.domains.racing.races import _count, _overtakes, _pair_results, evaluate_aggressiveness
 from coachable.domains.racing.stints import _stint, evaluate_resources, range_at
 from coachable.domains.racing.traffic import race_in_traffic, traffic_report, traffic_response
-from coachable.envs.racing.circuit.circuits import load_track
+from coachable.envs.racing.circuit.circuits import load_track, load_tracks
+from coachable.envs.racing.circuit.track import Track
 from coachable.envs.racing.physics.cars import load_car
 from coachable.envs.racing.race.driver import LineFollower
 from coachable.evaluation.evaluation_settings import EvaluationSettings
@@ -30,10 +32,10 @@ def read(path):
         return list(csv.DictReader(file))
 
 
-def scripted(family, car, **settings):
+def scripted(family, car, drives="ring", **settings):
     """A domain on the ring and an "agent" that looks at the simulator instead of the observation."""
     domain = load_domain(f"racing_{family}", {"env": {"track": "ring", "car": car, **settings}})
-    driver, envs = LineFollower(load_track("ring"), load_car(car), grip=0.8), []
+    driver, envs = LineFollower(load_tracks(drives), load_car(car), grip=0.8), []
 
     def make_env(**options):
         envs.append(domain.make_env(**options))
@@ -45,6 +47,12 @@ def scripted(family, car, **settings):
 
     agent = LoadedPolicy(Policy(), family_style(family)[0], {"env": {"track": "ring", "car": car}}, {})
     return replace(domain, make_env=make_env), agent
+
+
+@pytest.fixture
+def one_circuit(monkeypatch):
+    """Only the ring to drive on."""
+    monkeypatch.setattr(laps, "DRIVEN", ("ring",))
 
 
 def test_laps_of_a_stint_are_cut_at_the_line():
@@ -133,7 +141,7 @@ def test_wilson_interval():
 
 
 @pytest.mark.slow
-def test_stints_of_the_scripted_driver(tmp_path):
+def test_stints_of_the_scripted_driver(tmp_path, one_circuit):
     domain, agent = scripted("resources", "gt3")
     report = evaluate_resources(domain, agent, tmp_path, EvaluationSettings(episodes=1, steps=800, progress=False))
     rows = read(tmp_path / "stints.csv")
@@ -146,17 +154,38 @@ def test_stints_of_the_scripted_driver(tmp_path):
     assert {path.name for path in tmp_path.glob("*.png")} == {"stints.png", "tradeoff.png"}
 
 
-def test_a_driver_who_never_drifts(tmp_path):
+def test_a_driver_who_never_drifts(tmp_path, one_circuit):
     domain, agent = scripted("drift", "street")
     evaluate_drift(domain, agent, tmp_path, EvaluationSettings(episodes=2, steps=60, progress=False))
     rows = read(tmp_path / "drift.csv")
     assert [float(row["weight"]) for row in rows] == 3 * [-0.4, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
-    assert sum(float(row["slip_angle_rear"]) < 8.0 for row in rows) >= 14  # it loses the car now and then
+    assert sum(float(row["sideslip_corners"]) < 8.0 for row in rows) >= 14  # it loses the car now and then
     assert all(float(row["turns"]) == 0.0 for row in rows)
+    assert sum(float(row["turned_per_km"]) == float(row["backwards"]) == 0.0 for row in rows) >= 14
     assert (tmp_path / "drift.png").stat().st_size > 10_000
 
 
-def test_races_of_the_scripted_driver(tmp_path):
+def test_laps_on_shipped_held_out_and_own_circuits(tmp_path, monkeypatch):
+    angle = np.linspace(0.0, 2.0 * np.pi, 100, endpoint=False)
+    points = np.stack([150 * np.cos(angle), 150 * np.sin(angle), 6 + 0 * angle, 6 + 0 * angle], axis=1)
+    np.savetxt(tmp_path / "own.csv", points, delimiter=",")
+    monkeypatch.setattr(laps, "DRIVEN", ("ring", "oval"))
+    tracks = [load_track("ring"), load_track("oval"), Track.from_csv(tmp_path / "own.csv")]
+    domain, agent = scripted("resources", "gt3", drives=tracks)
+    settings = EvaluationSettings(episodes=2, steps=1100, progress=False, track=tmp_path / "own.csv")
+    rows = drive_circuits(domain, agent, settings)
+    assert [(row["circuit"], row["trained"]) for row in rows] == [("ring", "yes"), ("oval", "no"), ("own", "no")]
+    for row, track in zip(rows, tracks, strict=True):
+        assert row["kilometres"] == pytest.approx(track.length / 1000.0)
+        assert row["laps"] >= 2 and row["clean_laps"] == 1.0 and row["off"] == row["retired"] == 0.0
+        assert 0.0 < row["over"] < 0.3
+        assert row["mean_lap"] == pytest.approx(row["quasi_steady_state"] * (1 + row["over"]))
+    summary = circuits_summary(rows)
+    assert summary["unseen"]["over"] == pytest.approx((rows[1]["over"] + rows[2]["over"]) / 2)
+    assert "| own | no |" in circuits_report(rows)
+
+
+def test_races_of_the_scripted_driver(tmp_path, one_circuit):
     domain, agent = scripted("aggressiveness", "gt3")
     settings = EvaluationSettings(episodes=1, steps=40, seed=1, progress=False)
     report = evaluate_aggressiveness(domain, agent, tmp_path, settings)

@@ -1,5 +1,7 @@
 """What can be judged of a style, by hand: nothing is called met that was not measured."""
 
+import math
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -8,6 +10,8 @@ from coachable.domains.racing.metrics import RacingMeasures
 from coachable.envs.racing.race.features import GAPS
 from coachable.envs.racing.race.observation import own_columns
 from coachable.envs.racing.race.referee import TELEMETRY
+
+T = {name: column for column, name in enumerate(TELEMETRY)}
 
 
 def race(gaps, theta):
@@ -71,3 +75,40 @@ def test_slip_ratios_are_measured_where_they_are_asked_for():
     step["next", "style_features"][0, :4] = torch.tensor([0.1, 0.2, 0.3, 0.4])
     found = RacingMeasures("drift").step(step)
     assert (found["slip_ratio_front"].item(), found["slip_ratio_rear"].item()) == pytest.approx((0.3, 0.4))
+
+
+@pytest.mark.parametrize(
+    ("degrees", "radius", "speed", "weight", "complied"),
+    [
+        (30.0, 50.0, 20.0, 3.0, True),
+        (-30.0, -50.0, 20.0, 3.0, True),
+        (10.0, 50.0, 20.0, 3.0, False),
+        (70.0, 50.0, 20.0, 3.0, False),
+        (180.0, 50.0, 20.0, 3.0, False),  # backwards is no drift, and no grip either
+        (30.0, 50.0, 5.0, 3.0, False),
+        (30.0, 1000.0, 20.0, 3.0, None),  # a request cannot be judged on a straight
+        (3.0, 1000.0, 50.0, 0.0, True),
+        (180.0, 1000.0, 50.0, 0.0, False),
+    ],
+)
+def test_drifts_are_measured_by_the_true_sideslip(degrees, radius, speed, weight, complied):
+    step = race([], [0.0, weight, 0.0, 0.0])
+    for name, value in {"sideslip": math.radians(degrees), "curvature": 1.0 / radius, "speed": speed}.items():
+        step["next", "telemetry"][0, T[name]] = value
+    measures = RacingMeasures("drift")
+    found = measures.step(step)
+    record = {name: value[None] for name, value in found.items()}
+    assert measures.judged(record).item() is (complied is not None)
+    assert measures.complies(record).item() is bool(complied)
+    here, there = ("corners", "straights") if abs(radius) < 250 else ("straights", "corners")
+    assert found[f"sideslip_{here}"].item() == pytest.approx(abs(degrees)) and found[f"sideslip_{there}"].isnan()
+    assert found[f"drift_{here}"].item() == (15 <= abs(degrees) <= 60 and speed > 8) and found[f"drift_{there}"].isnan()
+
+
+def test_turning_round_is_counted_per_kilometre():
+    headings = torch.tensor([0.0, 1.0, 2.0, 3.0, -3.0, -1.0, 0.0, -2.0, 0.0, 0.0])[:, None]
+    nothing = torch.zeros(10, 1)
+    record = {"pace": nothing + 200.0, "heading": headings, "wear": nothing, "fuel": nothing}
+    found = RacingMeasures("drift").summarise(record, torch.ones(10, 1, dtype=torch.bool))
+    assert found["turned_per_km"].item() == pytest.approx(2 / 0.2)  # twice in 200 m
+    assert found["backwards"].item() == pytest.approx(0.4)

@@ -11,7 +11,7 @@ from coachable.domains.racing.styles import (
     resource_style_reward,
     resource_style_space,
 )
-from coachable.envs.racing.race.features import anyone_beside
+from coachable.envs.racing.race.features import GAPS, anyone_beside, corner_drift
 from coachable.styles import Shared, StyleSpace
 
 N = 40000
@@ -73,13 +73,45 @@ def test_the_shared_sampler_survives_serialisation():
 
 def test_drift_reward_by_hand():
     space = drift_style_space()
-    features = torch.tensor([[0.1, 0.5, 0.2, 0.3, 9.0, 9.0, 9.0, 9.0]])
+    features = torch.tensor([[0.1, 0.5, 0.2, 0.3, 9.0, 9.0, 9.0, 9.0, 0.7]])
     reward = drift_style_reward(space)(features, torch.tensor([[1.0, 2.0, -0.4, 5.0]]))
     assert reward.item() == pytest.approx(0.1 + 1.0 - 0.08 + 1.5)
 
 
+def test_drifts_in_corners_replace_a_requested_rear_angle():
+    space = drift_style_space()
+    features = torch.tensor([[0.1, 0.5, 0.2, 0.3, 9.0, 9.0, 9.0, 9.0, 0.7]] * 2)
+    theta = torch.tensor([[1.0, 2.0, -0.4, 5.0], [1.0, -0.2, -0.4, 5.0]])
+    reward = drift_style_reward(space, in_corners=1.0)(features, theta)
+    assert reward[:, 0].tolist() == pytest.approx([0.1 + 2 * 0.7 - 0.08 + 1.5, 0.1 - 0.2 * 0.5 - 0.08 + 1.5])
+    half = drift_style_reward(space, in_corners=0.5)(features, theta)
+    assert half[:, 0].tolist() == pytest.approx([0.1 + 2 * 0.6 - 0.08 + 1.5, 0.1 - 0.2 * 0.5 - 0.08 + 1.5])
+    with pytest.raises(ValueError, match="in_corners is 2: expected a share"):
+        drift_style_reward(space, in_corners=2)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "radius", "pace", "expected"),
+    [
+        (-30.0, 50.0, 20.0, 30.0),  # the nose points to the left, into a left corner
+        (30.0, -50.0, 20.0, 30.0),  # a right corner
+        (30.0, 50.0, 20.0, 0.0),  # the nose points out of the corner
+        (-60.0, 50.0, 20.0, 30.0),  # beyond 45 degrees it counts less
+        (-120.0, 50.0, 20.0, 0.0),  # spun
+        (180.0, 50.0, 20.0, 0.0),  # backwards
+        (-30.0, 200.0, 20.0, 15.0),  # a fast corner
+        (-30.0, 300.0, 20.0, 0.0),  # as good as straight
+        (-30.0, 50.0, 2.5, 7.5),  # it hardly makes way
+        (-30.0, 50.0, -5.0, 0.0),  # it goes back
+    ],
+)
+def test_what_counts_as_a_drift_in_a_corner(degrees, radius, pace, expected):
+    found = corner_drift(torch.tensor(degrees).deg2rad(), torch.tensor(1.0 / radius), torch.tensor(pace))
+    assert found.rad2deg().item() == pytest.approx(expected, abs=1e-4)
+
+
 def test_resource_reward_by_hand():
-    features = torch.tensor([[9.0, 9.0, 9.0, 9.0, 3.0, -1.0, -8e-5, -0.01]])
+    features = torch.tensor([[9.0, 9.0, 9.0, 9.0, 3.0, -1.0, -8e-5, -0.01, 9.0]])
     space, theta = resource_style_space(), torch.tensor([[2.0, 0.5, 12000.0, 105.0]])
     assert resource_style_reward(space)(features, theta).item() == pytest.approx(6.0 - 0.5 - 0.96 - 1.05)
     more = resource_style_reward(space, gained=4.0)
@@ -92,11 +124,11 @@ def test_resource_reward_by_hand():
 def test_margin_reward_by_hand():
     """Gaps (3, 2) and (0.5, 0.25) m, margins (2, 1): -1.5 - 0.75 = -2.25. A far car costs nothing."""
     space = aggressiveness_style_space()
-    features = torch.tensor([[0.0] * 8 + [3.0, 2.0, 1.0, 0.5, 0.25, 1.0, 0.0, 0.0, 0.0]])
+    features = torch.tensor([[0.0] * GAPS + [3.0, 2.0, 1.0, 0.5, 0.25, 1.0, 0.0, 0.0, 0.0]])
     theta = torch.tensor([[2.0, 1.0]])
     assert aggressiveness_style_reward(space)(features, theta).item() == pytest.approx(-2.25)
     assert aggressiveness_style_reward(space, weight=4.0)(features, theta).item() == pytest.approx(-9.0)
-    ahead = torch.tensor([[0.0] * 8 + [1.0, 0.0, 1.0]])
+    ahead = torch.tensor([[0.0] * GAPS + [1.0, 0.0, 1.0]])
     assert aggressiveness_style_reward(space)(ahead, theta).item() == pytest.approx(-2.0)
     assert aggressiveness_style_reward(space, apart=0.0)(ahead, theta).item() == pytest.approx(-1.0)
     assert aggressiveness_style_reward(space, apart=0.1)(ahead, theta).item() == pytest.approx(-1.1)
@@ -107,6 +139,6 @@ def test_margin_reward_by_hand():
 def test_beside_is_alongside_within_so_many_metres():
     """Two opponents each: one 0.6 m beside; one ahead; one beside but not near."""
     far = [3.0, 2.0, 0.0]
-    features = torch.tensor([[0.0] * 8 + far + gaps for gaps in ([0.0, 0.6, 1.0], [0.5, 0.0, 1.0], [0.0, 0.6, 0.0])])
+    features = torch.tensor([[0.0] * GAPS + far + gaps for gaps in ([0.0, 0.6, 1.0], [0.5, 0.0, 1.0], [0.0, 0.6, 0.0])])
     assert anyone_beside(features, within=1.0).tolist() == [True, False, False]
     assert not anyone_beside(features, within=0.5).any()

@@ -24,7 +24,7 @@ def drive(env, driver, steps):
 
 def test_it_keeps_to_the_road_of_an_oval():
     env = RacingEnv(8, track="oval", seed=0, scenarios=ALONE)
-    seen = drive(env, LineFollower(env.track, env.garage.typical), 60)
+    seen = drive(env, LineFollower(env.tracks, env.garage.typical), 60)
     assert seen[..., T["off"]].sum() == 0
     assert (seen[-1, :, T["distance"]] > 60 * 0.1 * 30.0).all()
 
@@ -34,8 +34,8 @@ def test_it_keeps_to_the_road_of_an_oval():
 def test_a_lap_of_lakeside(car, bound):
     """The bounds leave room for a simple driver, which needs 115.5 s and 93.4 s."""
     env = RacingEnv(3, track="lakeside", car=car, seed=0, scenarios=ALONE)
-    line = minimum_curvature_line(env.track, margin=2.0)
-    driver = LineFollower(env.track, env.garage.typical, grip=0.93, line=line)
+    line = minimum_curvature_line(env.tracks[0], margin=2.0)
+    driver = LineFollower(env.tracks, env.garage.typical, grip=0.93, line=line)
     seen = drive(env, driver, int(10 * bound))
     assert seen[..., T["off"]].sum() == 0
     assert (seen[-1, :, T["distance"]] > env.course.length).all()

@@ -336,7 +336,7 @@ def test_cars_of_one_race_end_together_and_only_the_culprit_terminates():
 
 
 def test_scripted_opponents_drive_the_other_cars():
-    driver = LineFollower(RacingEnv(1, track="oval").track, RacingEnv(1, track="oval").garage.typical, grip=0.8)
+    driver = LineFollower(RacingEnv(1, track="oval").tracks, RacingEnv(1, track="oval").garage.typical, grip=0.8)
     env = RacingEnv(2, cars=3, controlled=1, driver=driver, track="oval", seed=0, scenarios=rolling_start(3))
     seen = roll(env, torch.zeros(10, 2, 2))
     assert seen["observation"].shape == (10, 2, env.observation_size)

@@ -33,7 +33,7 @@ class Constant(nn.Module):
 
 def races(rivals_options=None, races=6, seed=0):
     env = RacingEnv(num_envs=1, track="ring", cars=1)
-    driver = LineFollower(env.track, env.garage.typical)
+    driver = LineFollower(env.tracks, env.garage.typical)
     rivals = Rivals(driver, STYLES, **(rivals_options or {}))
     return RacingEnv(
         2 * races, track="ring", cars=4, controlled=2, driver=rivals, scenarios=rolling_start(4), seed=seed

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from coachable.envs.racing.circuit.circuits import CIRCUITS, generate_track, load_track, oval, ring
+from coachable.envs.racing.circuit.circuits import CIRCUITS, load_track, oval, ring
+from coachable.envs.racing.circuit.generator import generate_track
 from coachable.envs.racing.circuit.line import minimum_curvature_line
 from coachable.envs.racing.circuit.profile import Envelope, cornering_speed, lap_time, speed_profile
 from coachable.envs.racing.circuit.track import Course, Track, clearance
@@ -98,13 +99,33 @@ def test_a_first_point_that_is_repeated_changes_nothing():
         (lambda lines: [*lines[:5], "1, 2, 3", *lines[5:]], r"line 6.*expected x, y"),
         (lambda lines: circle_lines(width=0.8), r"0\.80 m wide.*at least 3"),
         (lambda lines: lines[:4], "4 points"),
+        (lambda lines: [*lines[:5], lines[4], *lines[5:]], "points 5 and 6 are the same"),
+        (lambda lines: circle_lines(radius=9000.0), "is 56[0-9]{3} m long: expected 100 to 30000 m"),
+        (lambda lines: [*lines[:5], "1e300, 1, 5, 5", *lines[5:]], r"line 6.*expected x, y"),
+        (lambda lines: [*lines[:5], "1, \0, 5, 5", *lines[5:]], r"line 6.*expected x, y"),
     ],
-    ids=["open", "nan", "columns", "narrow", "short"],
+    ids=["open", "nan", "columns", "narrow", "short", "twice", "long", "far", "nul"],
 )
 def test_bad_files_are_refused(tmp_path, change, message):
     path = circle_file(tmp_path / "bad.csv", change(circle_lines()))
     with pytest.raises(ValueError, match=message):
         Track.from_csv(path)
+
+
+def test_a_file_that_is_no_text_is_refused(tmp_path):
+    file = tmp_path / "picture.csv"
+    file.write_bytes(b"\x89PNG\xff\xfe")
+    with pytest.raises(ValueError, match="is no text: expected lines of x, y"):
+        Track.from_csv(file)
+
+
+def test_walls_move_closer_inside_tight_corners():
+    angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    points = np.stack([200.0 * np.cos(angle), 60.0 * np.sin(angle)], axis=1)  # radius 18 m at its ends
+    track = Track.from_points(points, np.full(60, 6.0), np.full(60, 6.0), margin=20.0)
+    margin, curvature = track.table[:, 7], track.table[:, 4]
+    assert margin.max() == 20.0 and 8.0 < margin.min() < 13.0
+    torch.testing.assert_close(margin[curvature.argmax()], 0.94 / curvature.max() - 6.0)
 
 
 def test_a_track_that_crosses_itself_is_refused():

@@ -1,13 +1,13 @@
-"""Shipped circuits and a generator of random ones. All were made for this library and use no third-party data."""
+"""Circuits by name. All were made for this library and use no third-party data."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 
-import numpy as np
-
-from coachable.envs.racing.circuit.track import Track, clearance
+from coachable.envs.racing.circuit.generator import numbered_track
+from coachable.envs.racing.circuit.track import Track
 
 # (straight before [m], angle [deg, positive to the left], radius [m]) of each turn, from the start line on.
 _LAKESIDE = (
@@ -44,7 +44,6 @@ _ENDURANCE = (
     (1438.0, -101.03, 156.0),
     (642.0, 88.22, 183.0),
 )
-_APART = 60.0  # [m], between sections of a generated track
 
 
 def ring(radius: float = 200.0, width: float = 12.0) -> Track:
@@ -93,68 +92,44 @@ def endurance() -> Track:
 
 _BUILDERS = {"lakeside": lakeside, "ridge": ridge, "endurance": endurance, "ring": ring, "oval": oval}
 CIRCUITS = tuple(_BUILDERS)
+SHIPPED = ("lakeside", "ridge", "endurance")
+TRAINED = tuple(f"circuit-{number}" for number in range(24))
+HELD_OUT = tuple(f"circuit-{number}" for number in range(1000, 1008))
+SETS = {"training": (*SHIPPED, *TRAINED), "held_out": HELD_OUT}
 
 
 @lru_cache
 def load_track(name: str) -> Track:
-    """Return a shipped circuit.
+    """Return a circuit by its name.
 
     Args:
-        name: One of `CIRCUITS`.
+        name: One of `CIRCUITS`, or "circuit-N" with a whole number N for a generated one.
 
     Raises:
         ValueError: If there is no such circuit.
     """
-    if name not in _BUILDERS:
-        raise ValueError(f"unknown track {name!r}: expected one of {', '.join(_BUILDERS)}, or a Track")
-    return _BUILDERS[name]()
+    if name in _BUILDERS:
+        return _BUILDERS[name]()
+    number = name.removeprefix("circuit-")
+    if number == name or not number.isdecimal():
+        known = ", ".join(_BUILDERS)
+        raise ValueError(f"unknown track {name!r}: expected one of {known}, circuit-N with a number N, or a Track")
+    return numbered_track(int(number))
 
 
-def generate_track(
-    seed: int, length: float = 5000.0, *, width: float = 12.0, name: str | None = None, attempts: int = 5000
-) -> Track:
-    """Generate a random circuit of about a given length whose sections keep clear of each other.
+def load_tracks(tracks: str | Track | Sequence[str | Track]) -> tuple[Track, ...]:
+    """Return one or several circuits.
 
     Args:
-        seed: Seed of the circuit.
-        length: Length, 2,000 to 14,000; the circuit's differs by less than 10 % [m].
-        width: Width of the track [m].
-        name: Name of the circuit; by default it is made from the seed.
-        attempts: Number of candidates to try.
+        tracks: A circuit or its name, several of them, or the name of a set: "training" (the shipped ones and
+            `TRAINED`) or "held_out" (`HELD_OUT`, on which no preset trains).
 
     Raises:
-        ValueError: If the length is out of range.
-        RuntimeError: If no candidate fits.
+        ValueError: If there is no such circuit, or none is given.
     """
-    if not 2000.0 <= length <= 14000.0:
-        raise ValueError(f"length is {length:g} m: expected 2000 to 14000")
-    name = name or f"generated-{seed}"
-    random = np.random.default_rng(seed)
-    turns = int(np.clip(round(length / 450.0), 7, 22))
-    for _ in range(attempts):
-        candidate = _candidate(random, turns, length)
-        try:
-            track = Track.from_turns(candidate, solve=(turns // 2, turns - 1), width=width, name=name)
-        except ValueError:
-            continue
-        if abs(track.length / length - 1.0) < 0.1 and clearance(track, apart=150.0) > _APART:
-            return track
-    raise RuntimeError(f"no circuit of {length:g} m in {attempts} attempts with seed {seed}: try another seed")
-
-
-def _candidate(random: np.random.Generator, turns: int, length: float) -> list[tuple[float, float, float]]:
-    """Draw sections (straight [m], angle [deg], radius [m]) of a closed circuit, most of which turn the same way."""
-    sign = random.choice([-1.0, 1.0])
-    angles = random.uniform(30.0, 130.0, turns) * np.where(random.random(turns) < 0.68, 1.0, -1.0)
-    angles *= 1.0 - 0.4 * (angles < 0)
-    if angles.sum() <= 0.0:
-        return [(0.0, 0.0, 1.0)]
-    angles *= 360.0 / angles.sum() * np.ones(turns)
-    if np.abs(angles).max() > 170.0 or np.abs(angles).min() < 15.0:
-        return [(0.0, 0.0, 1.0)]
-    angles[-1] += 360.0 - angles.sum()
-    radii = np.exp(random.uniform(math.log(28.0), math.log(160.0), turns))
-    arcs = radii * np.radians(np.abs(angles)) + 30.0
-    straights = random.uniform(0.3, 2.0, turns)
-    straights *= max(length - arcs.sum(), 0.3 * length) / straights.sum()
-    return [(float(s), float(sign * a), float(r)) for s, a, r in zip(straights, angles, radii, strict=True)]
+    if isinstance(tracks, str):
+        tracks = SETS.get(tracks, (tracks,))
+    chosen = (tracks,) if isinstance(tracks, Track) else tuple(tracks)
+    if not chosen:
+        raise ValueError("no track given: expected at least one")
+    return tuple(load_track(track) if isinstance(track, str) else track for track in chosen)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,31 +96,46 @@ def speed_profile(envelope: Envelope, curvature: np.ndarray, spacing: np.ndarray
     Returns:
         Speeds (n,) [m/s].
     """
-    n = len(curvature)
-    step = np.broadcast_to(np.asarray(spacing, dtype=float), (n,))
+    return speed_profiles(envelope, [curvature], [spacing])[0]
+
+
+def speed_profiles(
+    envelope: Envelope, curvatures: Sequence[np.ndarray], spacings: Sequence[np.ndarray | float]
+) -> list[np.ndarray]:
+    """Return what `speed_profile` returns for each of several closed lines; all are computed at once.
+
+    Args:
+        envelope: Largest accelerations of the car.
+        curvatures: Curvature (n,) of each line [1/m].
+        spacings: Distance from each point to the next of each line, (n,) or one number [m].
+    """
+    counts = np.array([len(line) for line in curvatures])
+    first = np.cumsum(counts) - counts
+    curvature = np.concatenate(curvatures)
+    lines = zip(spacings, counts, strict=True)
+    step = np.concatenate([np.broadcast_to(np.asarray(s, dtype=float), (int(n),)) for s, n in lines])
     speed = cornering_speed(envelope, curvature)
     grid = np.linspace(3.0, SPEED_MAX, 200)
     engine = envelope.engine(grid)
-    for _ in range(_LAPS):  # braking, backwards
-        for i in range(n - 1, -1, -1):
-            ahead = speed[(i + 1) % n]
-            room = _left(float(envelope.friction(ahead)), ahead**2 * curvature[i])
-            room = envelope.braking * room + envelope.drag(ahead)
-            speed[i] = min(speed[i], np.sqrt(ahead**2 + 2 * room * step[i]))
-    for _ in range(_LAPS):  # accelerating, forwards
-        for i in range(n):
-            now, following = speed[i], (i + 1) % n
-            share = _left(
-                float(envelope.traction(now)), now**2 * curvature[i] * envelope.traction(now) / envelope.friction(now)
-            )
-            gain = min(share, float(np.interp(now, grid, engine))) - envelope.drag(now)
-            speed[following] = min(speed[following], np.sqrt(max(now**2 + 2 * gain * step[i], 1.0)))
-    return speed
+    rounds = _LAPS * int(counts.max())
+    for k in range(rounds):  # braking, backwards
+        i = first + (-1 - k) % counts
+        ahead = speed[first + (-k) % counts]
+        room = envelope.braking * _left(envelope.friction(ahead), ahead**2 * curvature[i]) + envelope.drag(ahead)
+        speed[i] = np.minimum(speed[i], np.sqrt(ahead**2 + 2 * room * step[i]))
+    for k in range(rounds):  # accelerating, forwards
+        i, following = first + k % counts, first + (k + 1) % counts
+        now = speed[i]
+        traction = envelope.traction(now)
+        share = _left(traction, now**2 * curvature[i] * traction / envelope.friction(now))
+        gain = np.minimum(share, np.interp(now, grid, engine)) - envelope.drag(now)
+        speed[following] = np.minimum(speed[following], np.sqrt(np.maximum(now**2 + 2 * gain * step[i], 1.0)))
+    return np.split(speed, first[1:])
 
 
-def _left(friction: float, used: float) -> float:
+def _left(friction: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Return the longitudinal acceleration that the friction circle leaves beside a lateral one."""
-    return float(np.sqrt(max(friction**2 - used**2, 0.0)))
+    return np.sqrt(np.maximum(friction**2 - used**2, 0.0))
 
 
 def lap_time(speed: np.ndarray, spacing: np.ndarray | float) -> float:

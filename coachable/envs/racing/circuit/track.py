@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,6 +18,9 @@ WIDTH_MIN = 3.0  # [m], half-width, below which cars do not fit
 COLUMNS = ("x", "y", "tx", "ty", "curvature", "left", "right", "margin")
 _CLOSURE = 1.0  # [m], gap between the ends of a centre line that still counts as closed
 _FINE = 0.25  # [m], step of the integration
+_LENGTHS = (100.0, 30_000.0)  # [m]; the checks compare all points with each other
+_MARGIN_MIN = 1.0  # [m]
+_FAR = 1e6  # [m], beyond which single precision does not resolve centimetres
 
 
 @dataclass(frozen=True)
@@ -57,24 +59,27 @@ class Track:
             margin: Distance from the edge of the track to the wall [m].
 
         Raises:
-            ValueError: If a line does not hold four finite numbers, or if the track is open, crosses itself or is too
-                narrow.
+            ValueError: If the file is no text, a line does not hold four finite numbers, or the track is open, crosses
+                itself, is too narrow or too long.
         """
         path = Path(path)
+        try:
+            lines = path.read_text(encoding="utf-8-sig").splitlines()
+        except UnicodeDecodeError:
+            raise ValueError(f"{path} is no text: expected lines of x, y, w_right, w_left in metres") from None
         rows = []
-        with path.open(newline="") as file:
-            for number, row in enumerate(csv.reader(file), start=1):
-                if not row or row[0].lstrip().startswith("#"):
+        for number, line in enumerate(lines, start=1):
+            if not line.strip() or line.lstrip().startswith("#"):
+                continue
+            try:
+                values = [float(value) for value in line.split(",")[:4]]
+            except ValueError:
+                if not rows:  # a header
                     continue
-                try:
-                    values = [float(value) for value in row[:4]]
-                except ValueError:
-                    if not rows:  # a header
-                        continue
-                    values = []
-                if len(values) != 4 or not all(math.isfinite(v) for v in values):
-                    raise ValueError(f"{path}, line {number}: got {row}, expected x, y, w_right, w_left in metres")
-                rows.append(values)
+                values = []
+            if len(values) != 4 or not all(abs(v) < _FAR for v in values):
+                raise ValueError(f"{path}, line {number}: got {line[:80]!r}, expected x, y, w_right, w_left in metres")
+            rows.append(values)
         if len(rows) < 8:
             raise ValueError(f"{path} has {len(rows)} points: expected at least 8 on a closed centre line")
         points = np.array(rows)
@@ -91,10 +96,11 @@ class Track:
             left: Distances (n,) from the centre line to the left edge [m].
             right: Distances (n,) from the centre line to the right edge [m].
             name: Name of the circuit.
-            margin: Distance from the edge of the track to the wall [m].
+            margin: Distance from the edge of the track to the wall [m]; it is less inside tight corners, where the wall
+                would otherwise lie beyond the centre of the turn.
 
         Raises:
-            ValueError: If the track is open, crosses itself or is too narrow.
+            ValueError: If the track is open, crosses itself, is too narrow, too short or too long.
         """
         from scipy.interpolate import CubicSpline  # slow to import, and needed here only
 
@@ -104,6 +110,14 @@ class Track:
             points, left, right = points[:-1], left[:-1], right[:-1]
         elif ends > max(3.0 * steps.max(), _CLOSURE):
             raise ValueError(f"track {name!r} is open: {ends:.1f} m between its ends, expected a closed centre line")
+        if not steps[: len(points) - 1].all():
+            twice = int(steps.argmin())
+            raise ValueError(
+                f"track {name!r}: points {twice + 1} and {twice + 2} are the same, expected different ones"
+            )
+        low, high = _LENGTHS
+        if not low <= steps.sum() + ends <= high:
+            raise ValueError(f"track {name!r} is {steps.sum() + ends:.0f} m long: expected {low:.0f} to {high:.0f} m")
         closed = np.vstack([points, points[:1]])
         knots = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
         spline = CubicSpline(knots, closed, bc_type="periodic")
@@ -115,7 +129,10 @@ class Track:
         speed = np.linalg.norm(velocity, axis=1)
         curvature = (velocity[:, 0] * bend[:, 1] - velocity[:, 1] * bend[:, 0]) / speed**3
         widths = [np.interp(at, knots, np.append(w, w[:1])) for w in (left, right)]
-        columns = [*spline(at).T, *(velocity / speed[:, None]).T, curvature, *widths, np.full(count, margin)]
+        inner = np.where(curvature > 0, *widths)
+        room = 0.94 / np.maximum(np.abs(curvature), 1e-9) - inner
+        margins = np.clip(room, min(_MARGIN_MIN, margin), margin)
+        columns = [*spline(at).T, *(velocity / speed[:, None]).T, curvature, *widths, margins]
         return cls(name, torch.from_numpy(np.stack(columns, axis=1)), float(arc[-1] / count))
 
     @classmethod
@@ -149,7 +166,7 @@ class Track:
             straights = _close(turns, straights, solve, name)
         pieces = []
         for straight, (_, angle, radius) in zip(straights, turns, strict=True):
-            pieces += [(straight, 0.0, 0.0), *_turn(angle, radius)]
+            pieces += [(straight, 0.0, 0.0), *turn_pieces(angle, radius)]
         points, headings, curvatures, arc = _integrate(pieces)
         if np.linalg.norm(points[-1] - points[0]) > 1e-3:
             gap = np.linalg.norm(points[-1] - points[0])
@@ -164,7 +181,7 @@ class Track:
         return cls(name, torch.from_numpy(np.stack(columns, axis=1)), float(arc[-1] / count))
 
 
-def _turn(angle: float, radius: float) -> list[tuple[float, float, float]]:
+def turn_pieces(angle: float, radius: float) -> list[tuple[float, float, float]]:
     """Return ramp, arc and ramp of a turn as (length, curvature at the start, curvature at the end)."""
     arc = radius * math.radians(abs(angle))
     ramp = min(0.45 * arc, 45.0)
@@ -204,7 +221,7 @@ def _close(
     pieces, headings, heading = [], [], 0.0
     for index, (_, angle, radius) in enumerate(turns):
         headings.append(heading)
-        pieces += [(0.0 if index in solve else straights[index], 0.0, 0.0), *_turn(angle, radius)]
+        pieces += [(0.0 if index in solve else straights[index], 0.0, 0.0), *turn_pieces(angle, radius)]
         heading += math.radians(angle)
     gap = _integrate(pieces)[0][-1]
     directions = np.array([[math.cos(headings[i]), math.sin(headings[i])] for i in solve]).T
@@ -261,23 +278,61 @@ def _check(track: Track) -> None:
 
 
 class Course(torch.nn.Module):
-    """The table of a track on a device, with conversions between positions and distances along the track.
+    """Tables of one or several circuits on a device, with conversions between positions and distances along the track.
+
+    With several circuits, each of N cars is on one of them, and the methods take tensors whose last dimension is N.
+    With one circuit they take tensors of any shape. Nodes are rows of the joint table.
 
     Args:
-        track: Circuit.
+        tracks: Circuit, or several of them.
         device: Device of the table.
         dtype: Type of the table.
+
+    Attributes:
+        tracks: The circuits.
+        length: Length of the circuit [m], or of each car's circuit (N,).
     """
 
-    def __init__(self, track: Track, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> None:
+    def __init__(
+        self,
+        tracks: Track | Sequence[Track],
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
         super().__init__()
-        self.length, self.spacing, self.count = track.length, track.spacing, len(track.table)
-        self.register_buffer("table", track.table.to(device, dtype).contiguous())
+        tracks = (tracks,) if isinstance(tracks, Track) else tuple(tracks)
+        self.tracks = tracks
+        self.register_buffer("table", torch.cat([track.table for track in tracks]).to(device, dtype).contiguous())
         self.table: Tensor
+        counts = torch.tensor([len(track.table) for track in tracks], device=device)
+        lengths = torch.tensor([track.length for track in tracks], device=device, dtype=dtype)
+        spacings = torch.tensor([track.spacing for track in tracks], device=device, dtype=dtype)
+        self._each = (lengths, spacings, counts, counts.cumsum(0) - counts)
+        self.length: float | Tensor = tracks[0].length
+        self.spacing: float | Tensor = tracks[0].spacing
+        self.count: int | Tensor = len(tracks[0].table)
+        self.first: int | Tensor = 0
+
+    def assign(self, circuit: Tensor) -> None:
+        """Put each of N cars on one of several circuits.
+
+        Args:
+            circuit: Number of the circuit of each car (N,) int64.
+        """
+        if len(self.tracks) > 1:
+            self.length, self.spacing, self.count, self.first = (values[circuit] for values in self._each)
+
+    def race_length(self, cars: int) -> float | Tensor:
+        """Return the length of the circuit of each race (B,) [m], or of the only circuit, for races of `cars` cars."""
+        return self.length[: len(self.length) // cars] if isinstance(self.length, Tensor) else self.length
 
     def node(self, s: Tensor) -> Tensor:
-        """Return the index of the node nearest to a distance along the track [m]."""
-        return torch.remainder(torch.round(s / self.spacing).to(torch.int64), self.count)
+        """Return the node nearest to a distance along the track [m]."""
+        return torch.remainder(torch.round(s / self.spacing).to(torch.int64), self.count) + self.first
+
+    def distance(self, node: Tensor) -> Tensor:
+        """Return the distance of a node along its track [m]."""
+        return (node - self.first) * self.spacing
 
     def frame(self, node: Tensor) -> Tensor:
         """Return the rows of the table at nodes (...), as (8, ...)."""
@@ -300,16 +355,19 @@ class Course(torch.nn.Module):
         node = self.node(s)
         frame = self.frame(node)
         arc = locate(x, y, *frame[:5].unbind(0))
-        node = self.node(node * self.spacing + arc.ahead.clamp(-40.0, 40.0))
+        node = self.node(self.distance(node) + arc.ahead.clamp(-40.0, 40.0))
         frame = self.frame(node)
         arc = locate(x, y, *frame[:5].unbind(0))
-        s = torch.remainder(node * self.spacing + arc.ahead.clamp(-self.spacing, self.spacing), self.length)
-        return s, arc, frame
+        ahead = torch.clamp(arc.ahead, -self.spacing, self.spacing)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        return torch.remainder(self.distance(node) + ahead, self.length), arc, frame
 
     def find(self, x: Tensor, y: Tensor) -> tuple[Tensor, Arc, Tensor]:
-        """Project points (N,) on the centre line like `project`, without an estimate, by comparing all nodes."""
+        """Project points (N,) on the centre line of one circuit like `project`, without an estimate.
+
+        All nodes are compared.
+        """
         distance = (x[..., None] - self.table[:, 0]) ** 2 + (y[..., None] - self.table[:, 1]) ** 2
-        return self.project(x, y, distance.argmin(-1) * self.spacing)
+        return self.project(x, y, self.distance(distance.argmin(-1)))
 
     def place(self, s: Tensor, offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the positions of points beside the centre line, and the direction of the track there.
@@ -323,7 +381,7 @@ class Course(torch.nn.Module):
         """
         node = self.node(s)
         x, y, tx, ty, curvature = self.frame(node)[:5].unbind(0)
-        ahead = torch.remainder(s - node * self.spacing + self.length / 2, self.length) - self.length / 2
+        ahead = self.past(node, s)
         angle = curvature * ahead
         # Along the arc: chord by the series of sine and versine, which is exact enough within half a spacing.
         forward = ahead * (1 - angle * angle / 6)
@@ -331,3 +389,8 @@ class Course(torch.nn.Module):
         cos, sin = torch.cos(angle), torch.sin(angle)
         dx, dy = forward - offset * sin, side + offset * cos
         return x + dx * tx - dy * ty, y + dx * ty + dy * tx, torch.atan2(ty, tx) + angle
+
+    def past(self, node: Tensor, s: Tensor) -> Tensor:
+        """Return how far distances along the track are past nodes near them, negative before [m]."""
+        half = self.length / 2
+        return torch.remainder(s - self.distance(node) + half, self.length) - half

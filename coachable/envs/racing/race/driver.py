@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from coachable.envs.racing.circuit.profile import Envelope, speed_profile
+from coachable.envs.racing.circuit.profile import Envelope, speed_profiles
 from coachable.envs.racing.circuit.track import Track
 from coachable.envs.racing.physics.cars import Car
 from coachable.envs.racing.physics.dynamics import total_mass
@@ -37,10 +38,10 @@ class LineFollower:
     less grip than the profile assumes.
 
     Args:
-        track: Circuit.
+        track: Circuit, or the circuits of an environment in its order.
         car: Parameters of one car, as numbers.
         grip: Share of the tyres' grip that the profile uses.
-        line: Offsets (n,) of the line from the centre line at each node, 0 by default [m].
+        line: Offsets (n,) of the line from the centre line at each node of all circuits, 0 by default [m].
         lanes: Offsets from that line that successive cars of a race take, so that they do not queue up [m].
 
     Raises:
@@ -49,7 +50,7 @@ class LineFollower:
     Example:
         >>> from coachable.envs.racing import RacingEnv
         >>> env = RacingEnv(num_envs=2, track="ring", seed=0)
-        >>> driver = LineFollower(env.track, env.garage.typical)
+        >>> driver = LineFollower(env.tracks, env.garage.typical)
         >>> observation = env.reset()["observation"]
         >>> driver(env.field, observation).shape
         torch.Size([2, 2])
@@ -57,7 +58,7 @@ class LineFollower:
 
     def __init__(
         self,
-        track: Track,
+        track: Track | Sequence[Track],
         car: Car,
         *,
         grip: float = 0.9,
@@ -66,13 +67,21 @@ class LineFollower:
     ) -> None:
         if not 0.0 < grip <= 1.2:
             raise ValueError(f"grip is {grip}: expected a share of the tyres' grip above 0 and up to 1.2, such as 0.9")
-        curvature, spacing = line_geometry(track, line)
-        self.line = torch.as_tensor(np.zeros(len(track.table)) if line is None else line, dtype=torch.float32)
+        tracks = (track,) if isinstance(track, Track) else tuple(track)
+        ends = np.cumsum([len(one.table) for one in tracks])
+        offsets = np.zeros(ends[-1]) if line is None else line
+        self.line = torch.as_tensor(offsets, dtype=torch.float32)
+        lines = [None] * len(tracks) if line is None else np.split(offsets, ends[:-1])
+        curvatures, spacings = zip(*map(line_geometry, tracks, lines), strict=True)
         envelope = Envelope(car, grip=grip, braking=_BRAKING)
-        profile = speed_profile(envelope, curvature, spacing)
-        gain = (np.roll(profile, -1) ** 2 - profile**2) / (2 * spacing) + envelope.drag(profile)
-        self.speeds = torch.as_tensor(profile, dtype=torch.float32)
-        self.gains = torch.as_tensor(gain, dtype=torch.float32)  # acceleration that engine or brakes must provide
+        profiles = speed_profiles(envelope, curvatures, spacings)
+        gains = [
+            (np.roll(profile, -1) ** 2 - profile**2) / (2 * spacing) + envelope.drag(profile)
+            for profile, spacing in zip(profiles, spacings, strict=True)
+        ]
+        self.speeds = torch.as_tensor(np.concatenate(profiles), dtype=torch.float32)
+        # Acceleration that engine or brakes must provide.
+        self.gains = torch.as_tensor(np.concatenate(gains), dtype=torch.float32)
         self.car, self.lanes = car, lanes
         # `_steer` inverts the force share sin(C atan(B ρ)) of `slip_curve` with ρ = tan α / tan α_p.
         self._stiffness = math.tan(math.pi / 2 / car.shape)
@@ -148,7 +157,9 @@ class LineFollower:
     def _behind(field: Field, run: Run, speed: Tensor) -> Tensor:
         """Return the speed that keeps the time gap to the next car in the same lane [m/s]."""
         split = (field.cars, field.races)
-        others = look_around(run.s.reshape(split), run.offset.reshape(split), field.group, field.course.length)
+        others = look_around(
+            run.s.reshape(split), run.offset.reshape(split), field.group, field.course.race_length(field.cars)
+        )
         in_lane = (others.gap > 0.0) & (others.aside.abs() < _LANE)
         gap = torch.where(in_lane, others.gap, 1e4)
         theirs = torch.stack([speed.reshape(split).roll(-k, 0) for k in range(1, field.cars)])

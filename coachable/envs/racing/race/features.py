@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-# Columns of `style_features`. Then three per opponent: longitudinal and lateral gap [m], near.
+# Columns of `style_features`: four of slip, four of gains and resources, the drift in corners. Then three per
+# opponent: longitudinal and lateral gap [m], near.
 DRIFT_NAMES = ("slip_angle_front", "slip_angle_rear", "slip_ratio_front", "slip_ratio_rear")
 DRIFT = slice(0, 4)
 OVERTAKE, DEFEND, TIRE, FUEL = range(4, 8)
-GAPS = 8
+CORNER_DRIFT = 8
+GAPS = 9
 GAP_COLUMNS = ("longitudinal", "lateral", "near")
 
 NEAR_DISTANCE = 10.0  # [m] between centres; the paper leaves "nearby" open
 DRIFT_SPEED_MIN = 5.0  # [m/s], below which slip counts as none
+CORNER_RADIUS = 250.0  # [m], of the centre line, below which a car is in a corner
+_FULL_CORNER = 100.0  # [m], radius below which a corner counts fully
+_FULL_WAY = 10.0  # [m/s] along the track, from which on a drift counts fully
 
 
 def style_features_size(cars: int) -> int:
@@ -39,6 +45,37 @@ def gap_columns(features: Tensor) -> tuple[Tensor, ...]:
     return tuple(features[..., GAPS + column :: len(GAP_COLUMNS)] for column in range(len(GAP_COLUMNS)))
 
 
-def pack_style_features(drift: Sequence[Tensor], resources: Sequence[Tensor], gaps: Sequence[Tensor]) -> Tensor:
+def sideslip(vx: Tensor, vy: Tensor) -> Tensor:
+    """Return the angle from the heading of cars to their velocity, (N,) in (-π, π], positive to the left [rad].
+
+    Args:
+        vx: Forward speed (N,) [m/s].
+        vy: Speed to the left (N,) [m/s].
+    """
+    return torch.atan2(vy, vx)
+
+
+def corner_drift(angle: Tensor, curvature: Tensor, pace: Tensor) -> Tensor:
+    """Return how far cars drift through a corner, (N,) from 0 to π / 4 [rad].
+
+    What counts is the angle by which the nose points further into the corner than the car moves. It counts fully up to
+    45 degrees and ever less beyond, to nothing at 90 degrees, so that spinning pays less than drifting. It counts in
+    proportion to the curvature up to that of a radius of 100 m, not on straights, and in proportion to the speed
+    along the track up to 10 m/s.
+
+    Args:
+        angle: Sideslip (N,) [rad].
+        curvature: Curvature of the track, positive to the left (N,) [1/m].
+        pace: Speed along the track (N,) [m/s].
+    """
+    inwards = -angle * torch.sign(curvature)
+    counted = torch.minimum(inwards, 0.5 * math.pi - inwards).clamp(min=0.0)
+    bend = torch.where(curvature.abs() * CORNER_RADIUS >= 1.0, (curvature.abs() * _FULL_CORNER).clamp(max=1.0), 0.0)
+    return counted * bend * (pace / _FULL_WAY).clamp(0.0, 1.0)
+
+
+def pack_style_features(
+    drift: Sequence[Tensor], resources: Sequence[Tensor], in_corner: Tensor, gaps: Sequence[Tensor]
+) -> Tensor:
     """Stack tensors (N,) to the columns of `style_features`, (N, F)."""
-    return torch.stack([*drift, *resources, *gaps], dim=-1)
+    return torch.stack([*drift, *resources, in_corner, *gaps], dim=-1)

@@ -18,19 +18,23 @@ from coachable.envs.racing.race.run import Others, Run, TyreView
 COURSE_POINTS = 20
 COURSE_TIME = 6.0  # [s] of travel that the course points cover
 _COURSE_SPEED_MIN = 10.0  # [m/s], so that the course points of a slow car are not all beside it
+CURVATURE_SCALE = 30.0  # [m], radius of a tight corner
 OPPONENTS = 4
 _OPPONENT_GROUPS = (("opponents", 8 * OPPONENTS), ("slipstream", 1))
 OPPONENT_COLUMNS = sum(width for _, width in _OPPONENT_GROUPS)
 _SEEN = 150.0  # [m]
 
 
-def observation_groups(opponents: bool, pool: bool, course_points: int = COURSE_POINTS) -> tuple[tuple[str, int], ...]:
+def observation_groups(
+    opponents: bool, pool: bool, course_points: int = COURSE_POINTS, curvature: bool = False
+) -> tuple[tuple[str, int], ...]:
     """Return name and width of each block of the observation, in order; those of opponents come last.
 
     Args:
         opponents: Whether drivers see opponents.
         pool: Whether cars differ.
         course_points: Number of points of each edge of the track.
+        curvature: Whether drivers see the curvature of the track ahead, and not where on the lap they are.
     """
     groups = [
         ("motion", 5),
@@ -50,6 +54,8 @@ def observation_groups(opponents: bool, pool: bool, course_points: int = COURSE_
     if pool:
         groups.append(("car", 8))
     groups.append(("course", 4 * course_points))
+    if curvature:
+        groups.append(("curvature", course_points))
     if opponents:
         groups += _OPPONENT_GROUPS
     return tuple(groups)
@@ -72,7 +78,9 @@ def own_columns(name: str) -> slice:
     raise KeyError(f"no block {name!r} in the observation")
 
 
-def own_car(car: Car, wheels: WheelSet, packed: Tensor, run: Run, tyres: TyreView, length: float) -> list[Tensor]:
+def own_car(
+    car: Car, wheels: WheelSet, packed: Tensor, run: Run, tyres: TyreView, length: float | Tensor | None
+) -> list[Tensor]:
     """Return the columns (N,) of the car itself, up to the fuel.
 
     Args:
@@ -81,7 +89,7 @@ def own_car(car: Car, wheels: WheelSet, packed: Tensor, run: Run, tyres: TyreVie
         packed: State (29, N).
         run: Task state.
         tyres: Loads, slip and grip in that state.
-        length: Length of the track [m].
+        length: Length of the track [m], or None for columns of 0 instead of the place on the lap.
     """
     s = CarState(*packed.unbind(0))
     share = car.drive_share_front
@@ -89,13 +97,14 @@ def own_car(car: Car, wheels: WheelSet, packed: Tensor, run: Run, tyres: TyreVie
     mean_speed = share * 0.5 * (spins[0] + spins[1]) + (1.0 - share) * 0.5 * (spins[2] + spins[3])
     rpm = engine_speed(car, gear_ratio(car, s.gear), mean_speed)
     torque = s.throttle * full_torque(car, rpm * (2.0 * math.pi / 60.0)) * (rpm <= car.rpm_max)
-    phase = run.s * (2.0 * math.pi / length)
+    phase = None if length is None else run.s * (2.0 * math.pi / length)
+    place = [torch.zeros_like(run.s)] * 2 if phase is None else [phase.sin(), phase.cos()]
     half = 0.5 * (run.left + run.right)
     columns = [s.vx / 50.0, s.vy / 20.0, s.yaw_rate / 2.0, s.ax / 20.0, s.ay / 20.0]
     columns += (tyres.load / 5000.0).unbind(0)
     columns += torch.clamp(tyres.ratio * 3.0, -3.0, 3.0).unbind(0)
     columns += torch.clamp(tyres.side * 3.0, -3.0, 3.0).unbind(0)
-    columns += [phase.sin(), phase.cos(), (run.offset + 0.5 * (run.right - run.left)) / half, run.across, run.along]
+    columns += [*place, (run.offset + 0.5 * (run.right - run.left)) / half, run.across, run.along]
     columns += [run.off, run.wall, run.contact]
     columns += [s.steer / car.steer_max, s.throttle, s.brake]
     columns += [run.steer, run.pedal, run.steer_before, run.pedal_before]
@@ -122,7 +131,7 @@ def car_columns(car: Car) -> Tensor:
     return torch.stack(columns, dim=-1)
 
 
-def course_ahead(course: Course, packed: Tensor, run: Run, points: int) -> Tensor:
+def course_ahead(course: Course, packed: Tensor, run: Run, points: int, curvature: bool = False) -> Tensor:
     """Return the left and right edge of the track ahead in the car's frame.
 
     Points are spaced evenly in time, up to six seconds at the present speed.
@@ -132,20 +141,21 @@ def course_ahead(course: Course, packed: Tensor, run: Run, points: int) -> Tenso
         packed: State (29, N).
         run: Task state.
         points: Number of points of each edge.
+        curvature: Whether to add the curvature of the centre line beside the points.
 
     Returns:
-        Coordinates (N, 4 * points) [100 m].
+        Coordinates (N, 4 * points) [100 m], then the curvature (N, points) [1/30 m] if it is wanted.
     """
     s = CarState(*packed.unbind(0))
     speed = torch.clamp(torch.sqrt(s.vx * s.vx + s.vy * s.vy), min=_COURSE_SPEED_MIN)
     times = torch.arange(1, points + 1, device=packed.device, dtype=packed.dtype) * (COURSE_TIME / points)
-    ahead = run.s[:, None] + speed[:, None] * times  # (N, points)
+    ahead = run.s + times[:, None] * speed  # (points, N)
     node = course.node(ahead)
-    x, y, tx, ty, _, left, right, _ = course.frame(node).unbind(0)
-    past = torch.remainder(ahead - node * course.spacing + 0.5 * course.length, course.length) - 0.5 * course.length
-    dx = x + past * tx - s.x[:, None]
-    dy = y + past * ty - s.y[:, None]
-    cos, sin = torch.cos(s.yaw)[:, None], torch.sin(s.yaw)[:, None]
+    x, y, tx, ty, bend, left, right, _ = course.frame(node).unbind(0)
+    past = course.past(node, ahead)
+    dx = x + past * tx - s.x
+    dy = y + past * ty - s.y
+    cos, sin = torch.cos(s.yaw), torch.sin(s.yaw)
     forward, side = dx * cos + dy * sin, dy * cos - dx * sin
     tangent_x, tangent_y = tx * cos + ty * sin, ty * cos - tx * sin
     edges = (
@@ -154,7 +164,8 @@ def course_ahead(course: Course, packed: Tensor, run: Run, points: int) -> Tenso
         forward + right * tangent_y,
         side - right * tangent_x,
     )
-    return torch.cat(edges, dim=1) * 0.01
+    seen = torch.cat(edges) * 0.01
+    return (torch.cat([seen, bend * CURVATURE_SCALE]) if curvature else seen).T
 
 
 def _squeezed(distance: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ from coachable.envs.racing.physics.simulation import CONTROL_STEP, bodies_of
 from coachable.envs.racing.physics.state import HEATS, ROW, WEARS, CarInputs, CarState
 from coachable.envs.racing.physics.surface import beyond
 from coachable.envs.racing.physics.tyres import heat_loss
+from coachable.envs.racing.race.features import sideslip
 from coachable.envs.racing.race.observation import (
     COURSE_POINTS,
     OPPONENT_COLUMNS,
@@ -51,8 +52,9 @@ TELEMETRY = (
     "wall",
     "contact",
     "place",  # 1 is first of the group
-    "beta",  # body slip angle [rad]
+    "sideslip",  # angle from the heading to the velocity, in (-π, π] [rad]
     "heading",  # relative to the track [rad]
+    "curvature",  # of the track [1/m]
 )
 
 
@@ -64,7 +66,7 @@ class Verdict(NamedTuple):
     observation: Tensor  # (N, D)
     reward: Tensor  # (N,) of the task
     features: Tensor  # (N, F)
-    telemetry: Tensor  # (N, 12)
+    telemetry: Tensor  # (N, 13)
     terminated: Tensor  # (N,) bool
 
 
@@ -80,6 +82,7 @@ class Referee:
         course_points: Number of points of each edge of the track in the observation.
         pool: Whether cars differ, in which case the observation describes the car.
         opponents: Whether the observation has columns for opponents.
+        curvature: Whether the observation has the curvature of the track ahead instead of the place on the lap.
         wrong_way_time: Time of driving backwards that ends an episode [s].
     """
 
@@ -90,6 +93,7 @@ class Referee:
     course_points: int = COURSE_POINTS
     pool: bool = False
     opponents: bool = False
+    curvature: bool = False
     wrong_way_time: float = WRONG_WAY_TIME
 
     def command(self, packed: Tensor, packed_run: Tensor, action: Tensor, compound: Tensor) -> tuple[Tensor, Tensor]:
@@ -158,8 +162,8 @@ class Referee:
         others, bodies, tow = None, None, torch.zeros_like(s.x)
         if group is not None and impact is not None:
             bodies = bodies_of(new, car, self.cars)
-            others = look_around(self._split(place), self._split(arc.offset), group, self.course.length)
-            earlier = look_around(self._split(before.s), self._split(before.offset), group, self.course.length)
+            others = self._around(place, arc.offset, group)
+            earlier = self._around(before.s, before.offset, group)
             ahead, behind = metres_gained(earlier, others)
             touched, rear_end = contacts(impact, earlier, self.cars)
             outcome = Outcome(progress, *(value.reshape(-1) for value in (ahead, behind, touched, rear_end)))
@@ -187,7 +191,7 @@ class Referee:
         )
         tyres = tyre_view(car, wheels, new, compound[0])
         reward = task_reward(self.weights, s, run, tyres, outcome)
-        features = style_features(old, new, tyres, outcome, bodies, group)
+        features = style_features(old, new, tyres, outcome, run.curvature, bodies, group)
         reward = reward - self.weights.tyre_heat * (heat_loss(new[HEATS]) - heat_loss(old[HEATS])).mean(0)
         lost = beyond(arc.offset, run.left, run.right) > run.margin + _BEHIND_WALL
         stranded = (run.wrong_time > self.wrong_way_time) | (run.stopped_time > STOPPED_TIME) | lost
@@ -211,13 +215,14 @@ class Referee:
         """Return the observations (N, D); the arguments are those of `judge`."""
         run = Run(*packed_run.unbind(0))
         tyres = tyre_view(car, wheels, packed, compound[0])
-        parts = [torch.stack(own_car(car, wheels, packed, run, tyres, self.course.length), dim=-1), compound[2:].T]
+        length = None if self.curvature else self.course.length
+        parts = [torch.stack(own_car(car, wheels, packed, run, tyres, length), dim=-1), compound[2:].T]
         if self.pool:
             parts.append(car_columns(car))
-        parts.append(course_ahead(self.course, packed, run, self.course_points))
+        parts.append(course_ahead(self.course, packed, run, self.course_points, self.curvature))
         if group is not None:
             bodies = bodies_of(packed, car, self.cars)
-            others = look_around(self._split(run.s), self._split(run.offset), group, self.course.length)
+            others = self._around(run.s, run.offset, group)
             parts += [opponents_seen(bodies, others), run.slipstream[:, None]]
         elif self.opponents:
             parts.append(run.slipstream.new_zeros(len(run.slipstream), OPPONENT_COLUMNS))
@@ -239,7 +244,7 @@ class Referee:
         nothing = torch.zeros_like(place)
         tow = nothing
         if group is not None:
-            tow = self._tow(look_around(self._split(place), self._split(arc.offset), group, self.course.length), car)
+            tow = self._tow(self._around(place, arc.offset, group), car)
         return torch.stack(
             [
                 place,
@@ -256,6 +261,10 @@ class Referee:
 
     def _split(self, values: Tensor) -> Tensor:
         return values.reshape(self.cars, -1)
+
+    def _around(self, s: Tensor, offset: Tensor, group: Tensor) -> Others:
+        length = self.course.race_length(self.cars)
+        return look_around(self._split(s), self._split(offset), group, length)
 
     def _tow(self, others: Others, car: Car) -> Tensor:
         length = self._split(car.length) if isinstance(car.length, Tensor) else car.length
@@ -281,8 +290,9 @@ class Referee:
                 run.wall,
                 run.contact,
                 rank,
-                torch.atan2(s.vy, s.vx.abs().clamp(min=1e-3)),
+                sideslip(s.vx, s.vy),
                 torch.atan2(run.across, run.along),
+                run.curvature,
             ],
             dim=-1,
         )

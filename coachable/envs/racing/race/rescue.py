@@ -30,7 +30,7 @@ def way_clear(course: Course, run: Run, stranded: Tensor, group: Tensor) -> Tens
     cars = group.shape[0]
     if cars == 1:
         return torch.ones_like(stranded)
-    others = look_around(run.s.reshape(cars, -1), run.offset.reshape(cars, -1), group, course.length)
+    others = look_around(run.s.reshape(cars, -1), run.offset.reshape(cars, -1), group, course.race_length(cars))
     near = others.met & (others.gap > -_CLEAR_BEHIND) & (others.gap < _CLEAR_AHEAD)
     index = torch.arange(cars, device=group.device)[:, None].expand_as(group)
     waiting = others_of(stranded.reshape(cars, -1)) & (others_of(index) > index)

@@ -112,7 +112,7 @@ def tyre_view(car: Car, wheels: WheelSet, packed: Tensor, compound_grip: Tensor)
     )
 
 
-def wrap(distance: Tensor, length: float) -> Tensor:
+def wrap(distance: Tensor, length: float | Tensor) -> Tensor:
     """Return signed distances on a loop of the given length, in [-length / 2, length / 2) [m]."""
     return torch.remainder(distance + 0.5 * length, length) - 0.5 * length
 
@@ -130,14 +130,14 @@ def others_of(values: Tensor) -> Tensor:
     return torch.stack([values.roll(-k, 0) for k in range(1, values.shape[0])])
 
 
-def look_around(s: Tensor, offset: Tensor, group: Tensor, length: float) -> Others:
+def look_around(s: Tensor, offset: Tensor, group: Tensor, length: float | Tensor) -> Others:
     """Return the positions of the other cars relative to each car.
 
     Args:
         s: Distances (A, B) along the track [m].
         offset: Offsets (A, B) from the centre line [m].
         group: Groups (A, B) of cars that meet.
-        length: Length of the track [m].
+        length: Length of the track, or of the track of each race (B,) [m].
     """
     gap = wrap(others_of(s) - s, length)
     met = others_of(group) == group

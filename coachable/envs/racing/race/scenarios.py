@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from coachable.envs.racing.circuit.track import Course
+from coachable.envs.racing.circuit.track import Course, Track
 from coachable.envs.racing.physics.cars import COMPOUNDS, RACE_COMPOUNDS, Car
 from coachable.envs.racing.physics.state import HEATS, ROW, SPINS, STATE_ROWS, WEARS
 from coachable.envs.racing.race.counter_rng import normal, uniforms
@@ -140,7 +140,7 @@ class Starter:
         course: Track.
         scenarios: Mixture of scenarios.
         conditions: Tyres and fuel.
-        speeds: Sensible speed at each node (n,) [m/s].
+        speeds: Sensible speed at each node of the course (n,) [m/s].
         cars: Number A of cars in a race.
 
     Raises:
@@ -163,15 +163,20 @@ class Starter:
         self._start = torch.tensor([STARTS.index(scenario.start) for scenario in scenarios], device=device)
         self._group = torch.tensor([scenario.group for scenario in scenarios], device=device)
         self._compounds = torch.tensor(conditions.compounds, device=device)
-        self._straight = _longest_straight(course)
+        straights = [_longest_straight(track) for track in course.tracks]
+        half = [float(track.table[:, 5:7].min()) for track in course.tracks]
+        margin = [float(track.table[:, 7].min()) for track in course.tracks]
+        columns = [*zip(*straights, strict=True), half, margin]
+        self._circuits = torch.tensor(columns, dtype=torch.float32, device=device)  # (4, number of circuits)
 
-    def draw(self, seed: Tensor, episode: Tensor, car: Car) -> Starts:
+    def draw(self, seed: Tensor, episode: Tensor, car: Car, circuit: Tensor) -> Starts:
         """Draw the starts of all races.
 
         Args:
             seed: Seed of each race (B,) int64.
             episode: Number of episodes that each race has started (B,) int64.
             car: Parameters.
+            circuit: Number of the circuit of each race (B,) int64.
         """
         u = uniforms(seed, episode, _DRAWS, self.cars)
         first = u[:, 0]  # (rows, B), numbers that the cars of a race share
@@ -185,7 +190,8 @@ class Starter:
         def chosen(*names: str) -> Tensor:
             return torch.stack([kind == STARTS.index(name) for name in names]).any(0)
 
-        length, half = self.course.length, self._half_width()
+        length = self.course.race_length(self.cars)
+        straight, extent, half, margin = self._circuits[:, circuit]
         rank = (order % size).to(u.dtype)  # place within the group, from the front
         close = chosen("slipstream", "passing")
         gap = torch.where(
@@ -193,7 +199,6 @@ class Starter:
             ROLLING_GAP,
             torch.where(close, 7.0 + 6.0 * first[2], 8.0 + 22.0 * first[2]),
         )
-        straight, extent = self._straight
         lead = torch.where(close, straight + extent * (0.2 + 0.4 * first[3]), length * first[3])
         lead = torch.where(chosen("rolling"), length - 10.0, lead)
         # Groups that do not meet spread over the track.
@@ -212,7 +217,7 @@ class Starter:
         speed = torch.where(chosen("passing"), speed * (1.0 + _PASSING_SPREAD * (u[9] - 0.5)), speed)
         yaw_error = 0.05 * (2.0 * u[8] - 1.0)
 
-        beside = half + float(self.course.table[:, 7].min()) - 3.0
+        beside = half + margin - 3.0
         lost = chosen("recovery").expand_as(s)
         offset, speed = torch.where(lost, spread * beside, offset), torch.where(lost, 20.0 * u[7], speed)
         any_way = math.pi * (2.0 * u[8] - 1.0)
@@ -228,7 +233,8 @@ class Starter:
 
     def _state(self, car: Car, s: Tensor, offset: Tensor, yaw_error: Tensor, speed: Tensor, u: Tensor) -> Tensor:
         """Return the state (29, A, B) of rolling cars with tyres and fuel drawn from the conditions."""
-        state = rolling_cars(self.course, car, s, offset, yaw_error, speed)
+        placed = (value.expand_as(s).reshape(-1) for value in (s, offset, yaw_error, speed))
+        state = rolling_cars(self.course, car, *placed).reshape(-1, *s.shape)
         conditions = self.conditions
         low, high = _HEAT
         state[HEATS] = low + (high - low) * u[11] if conditions.heat is None else conditions.heat
@@ -241,11 +247,8 @@ class Starter:
             state[WEARS] = (common + _WEAR_SPREAD * torch.cat([pair, other])).clamp(0.0, 1.0)
         return state
 
-    def _half_width(self) -> float:
-        return float(self.course.table[:, 5:7].min())
-
     def _sensible(self, s: Tensor) -> Tensor:
-        return self.speeds[self.course.node(s)]
+        return self.speeds[self.course.node(s.reshape(-1))].reshape(s.shape)
 
 
 def rolling_cars(course: Course, car: Car, s: Tensor, offset: Tensor, yaw_error: Tensor, speed: Tensor) -> Tensor:
@@ -272,9 +275,9 @@ def rolling_cars(course: Course, car: Car, s: Tensor, offset: Tensor, yaw_error:
     return state
 
 
-def _longest_straight(course: Course) -> tuple[float, float]:
+def _longest_straight(track: Track) -> tuple[float, float]:
     """Return start and length of the longest stretch with hardly any curvature [m]."""
-    straight = (course.table[:, 4].abs() < 1e-3).tolist()
+    straight = (track.table[:, 4].abs() < 1e-3).tolist()
     best, start, run = (0, 0), 0, 0
     for index, flag in enumerate(straight * 2):
         run = run + 1 if flag else 0
@@ -282,4 +285,4 @@ def _longest_straight(course: Course) -> tuple[float, float]:
             start = index
         if best[1] < run <= len(straight):
             best = (start, run)
-    return best[0] % len(straight) * course.spacing, best[1] * course.spacing
+    return best[0] % len(straight) * track.spacing, best[1] * track.spacing

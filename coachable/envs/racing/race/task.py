@@ -9,8 +9,15 @@ import torch
 from torch import Tensor
 
 from coachable.envs.racing.physics.contact import Bodies, body_gaps, partner
+from coachable.envs.racing.physics.simulation import CONTROL_STEP
 from coachable.envs.racing.physics.state import WEARS, CarState
-from coachable.envs.racing.race.features import DRIFT_SPEED_MIN, NEAR_DISTANCE, pack_style_features
+from coachable.envs.racing.race.features import (
+    DRIFT_SPEED_MIN,
+    NEAR_DISTANCE,
+    corner_drift,
+    pack_style_features,
+    sideslip,
+)
 from coachable.envs.racing.race.run import Others, Run, TyreView
 
 BEHIND, AHEAD = 20.0, 40.0  # [m], window in which passing counts
@@ -123,7 +130,13 @@ def task_reward(weights: TaskWeights, state: CarState, run: Run, tyres: TyreView
 
 
 def style_features(
-    old: Tensor, new: Tensor, tyres: TyreView, outcome: Outcome, bodies: Bodies | None, group: Tensor | None
+    old: Tensor,
+    new: Tensor,
+    tyres: TyreView,
+    outcome: Outcome,
+    curvature: Tensor,
+    bodies: Bodies | None,
+    group: Tensor | None,
 ) -> Tensor:
     """Return the raw quantities of all style terms, (N, F).
 
@@ -132,6 +145,7 @@ def style_features(
         new: State (29, N) after the step.
         tyres: Slip after the step.
         outcome: Events of the step.
+        curvature: Curvature of the track after the step (N,) [1/m].
         bodies: Cars (A, B) after the step, if there are several in a race.
         group: Groups (A, B), if there are several cars in a race.
     """
@@ -150,4 +164,5 @@ def style_features(
             apart = (other.x - bodies.x) ** 2 + (other.y - bodies.y) ** 2
             near = (apart <= NEAR_DISTANCE * NEAR_DISTANCE) & (group == group.roll(-k, 0))
             gaps += [long.reshape(-1), lat.reshape(-1), near.to(new.dtype).reshape(-1)]
-    return pack_style_features(drift, [outcome.overtake, outcome.defend, tire, burnt], gaps)
+    in_corner = corner_drift(sideslip(state.vx, state.vy), curvature, outcome.progress / CONTROL_STEP)
+    return pack_style_features(drift, [outcome.overtake, outcome.defend, tire, burnt], in_corner, gaps)

@@ -1,0 +1,143 @@
+"""Laps on circuits that an agent was trained on and on others, beside quasi-steady-state laps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from coachable.domains.racing.families import training_tracks, typical_car
+from coachable.domains.racing.frontier import TANK, LapProgramme
+from coachable.domains.racing.metrics import TelemetryMeasures
+from coachable.envs.racing.circuit.circuits import HELD_OUT, SHIPPED, load_tracks
+from coachable.envs.racing.circuit.track import Track
+from coachable.envs.racing.physics.cars import Resources, load_car
+from coachable.envs.racing.physics.simulation import CONTROL_STEP
+from coachable.envs.racing.race.scenarios import Conditions, Scenario
+from coachable.evaluation.evaluation_settings import EvaluationSettings
+from coachable.evaluation.rollouts import record_styles
+from coachable.evaluation.style_grid import markdown_table, mean_of
+
+if TYPE_CHECKING:
+    from coachable.domain import Domain
+    from coachable.training.weights import LoadedPolicy
+
+TRIAL_STEPS = 3600  # six minutes
+DRIVEN = (*SHIPPED, *HELD_OUT)
+SOLO = (Scenario("solo", 1.0, "solo"),)
+_SHOWN = {"circuit": "", "trained": "", "kilometres": ".1f", "laps": "", "clean_laps": ".0%", "mean_lap": ".2f"}
+_SHOWN |= {"quasi_steady_state": ".2f", "over": "+.1%", "off": ".2%", "retired": ".0%"}
+
+
+def cut_laps(distance: np.ndarray, off: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cut a drive into laps.
+
+    Args:
+        distance: Distance covered at each step (T,) [m].
+        off: Whether three wheels are off the track at each step (T,).
+        length: Length of the circuit [m].
+
+    Returns:
+        For each completed lap, counted from the start: its time [s], whether the car was never off the track, and the
+        step in which it ends.
+    """
+    if not len(distance):
+        return np.zeros(0), np.zeros(0, dtype=bool), np.zeros(0, dtype=np.int64)
+    furthest = np.maximum.accumulate(distance)
+    ends = length * np.arange(1, int(furthest[-1] // length) + 1)
+    steps = np.searchsorted(furthest, ends)
+    before = np.where(steps > 0, furthest[np.maximum(steps - 1, 0)], 0.0)
+    crossed = CONTROL_STEP * (steps + (ends - before) / (furthest[steps] - before))
+    return np.diff(crossed, prepend=0.0), np.diff(np.cumsum(off)[steps], prepend=0.0) == 0.0, steps
+
+
+def drive_circuits(domain: Domain, agent: LoadedPolicy, settings: EvaluationSettings) -> list[dict[str, Any]]:
+    """Drive alone on the shipped circuits, on held-out ones and on the user's, in the default style.
+
+    Args:
+        domain: Racing domain, as the agent was trained in.
+        agent: Policy, which acts deterministically.
+        settings: `episodes` is the number of cars on each circuit, each from its own place; `steps` is the length of
+            their drives, 3600 (six minutes) at most and by default; `track` is the file of a further circuit.
+
+    Returns:
+        A row per circuit: whether the agent was trained on it, completed laps, share of them that never left the track,
+        mean lap after the first one and quasi-steady-state lap [s], share of time off the track, share of cars that
+        retired.
+    """
+    tracks = load_tracks(DRIVEN)
+    if settings.track is not None:
+        tracks += (Track.from_csv(settings.track),)
+    steps = min(settings.steps or TRIAL_STEPS, TRIAL_STEPS)
+    count = len(tracks) * settings.episodes
+    record = record_styles(
+        domain,
+        agent.actor,
+        agent.space,
+        agent.space.default.repeat(count, 1),
+        f"{len(tracks)} circuits",
+        measures=TelemetryMeasures("distance", "off"),
+        track=tracks,  # row i is on circuit i modulo their number
+        cars=1,
+        controlled=1,
+        driver=None,
+        scenarios=SOLO,
+        conditions=Conditions(fuel=TANK / 2),
+        episode_steps=steps + 1,
+        **{**settings.rollout, "steps": steps},
+    )
+    distance, off = (record.measures[name].double().numpy() for name in ("distance", "off"))
+    alive = record.alive.numpy()
+    family, trained_in = domain.name.removeprefix("racing_"), agent.config.get("env", {})
+    trained, car = training_tracks(family, trained_in), load_car(typical_car(family, trained_in))
+    rows = []
+    for index, track in enumerate(tracks):
+        own = range(index, count, len(tracks))
+        driven = [(distance[:, i][alive[:, i]], off[:, i][alive[:, i]]) for i in own]
+        times, clean, _ = zip(*(cut_laps(*drive, track.length) for drive in driven), strict=True)
+        [bound] = LapProgramme(track, car, Resources(), fuel=TANK / 2).laps("fuel", [0.0])
+        mean = mean_of(np.array([*np.concatenate([lap[1:] for lap in times]), np.nan]))
+        rows.append(
+            {
+                "circuit": track.name,
+                "trained": "yes" if track.name in trained else "no",
+                "kilometres": track.length / 1000.0,
+                "laps": sum(map(len, times)),
+                "clean_laps": float(np.concatenate(clean).mean()) if sum(map(len, clean)) else 0.0,
+                "mean_lap": mean,
+                "quasi_steady_state": bound.time,
+                "over": mean / bound.time - 1.0,
+                "off": float(np.concatenate([flags for _, flags in driven]).mean()),
+                "retired": float(1.0 - record.survived.double().numpy()[list(own)].mean()),
+            }
+        )
+    return rows
+
+
+def circuits_report(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return the section on circuits of a report, as Markdown.
+
+    Args:
+        rows: Result of `drive_circuits`.
+    """
+    text = "\n## Circuits\n\nAlone, in the default style, on half a tank.\n\n" + markdown_table(rows, _SHOWN)
+    text += "\nTrained: whether the agent was trained on the circuit. Laps: completed ones; clean if never three "
+    text += "wheels were off the track. Mean lap: after the first one [s]; over: above the quasi-steady state of a "
+    text += "point mass. "
+    return text + "Off: share of the time off the track. Retired: share of the cars that stood, drove back or left.\n"
+
+
+def circuits_summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
+    """Return the means over the circuits that the agent was trained on, and over the others.
+
+    Args:
+        rows: Result of `drive_circuits`.
+    """
+    summary = {}
+    for label, trained in (("trained", "yes"), ("unseen", "no")):
+        own = [row for row in rows if row["trained"] == trained]
+        if own:
+            names = ("clean_laps", "over", "off", "retired")
+            summary[label] = {name: mean_of(np.array([row[name] for row in own])) for name in names}
+    return summary
