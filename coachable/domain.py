@@ -17,6 +17,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, Transform
 
 from coachable.defaults import EnvPictures, RewardMeasures, steps_per_episode, style_grid, time_per_step
+from coachable.signals import Signal
 from coachable.styles import Setpoint, StyleReward, StyleSpace
 from coachable.transforms import CoachableEnv, coachable_env
 
@@ -159,8 +160,9 @@ class Domain:
         targets: Largest value of a metric that is wanted as its median over the styles, by name.
         columns: Metrics of the published table, in order, with the format of their values; by default all.
         units: Units of measured quantities by name, for the axes of figures and the page of `coachable coach`.
-        observation_groups: Name and width of each block of the observation, in order, for explanations; by default
-            every entry is a group of its own.
+        observation_groups: Blocks of the observation, in order, for explanations and exported models; by default every
+            entry is explained on its own.
+        action_groups: Blocks of the action, in order, for exported models.
         controls: Live controls, which are steered while the agent acts.
         words: Words for the domain, for phrases and presets.
         as_trained: Function from `env` of a training's configuration to this domain with these settings (such as the
@@ -183,7 +185,8 @@ class Domain:
     targets: Mapping[str, float] = field(default_factory=dict)
     columns: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
-    observation_groups: Sequence[tuple[str, int]] = ()
+    observation_groups: Sequence[Signal] = ()
+    action_groups: Sequence[Signal] = ()
     controls: Sequence[Control] = ()
     words: Words = field(default_factory=Words)
     as_trained: Callable[[Mapping[str, Any]], Domain] | None = None

@@ -17,7 +17,7 @@ FILES = {
 }
 
 # Small modules at the top level that know no room.
-BASE = {"extras", "files", "finite", "gl", "keys", "offscreen", "ranges", "third_party"}
+BASE = {"extras", "files", "finite", "gl", "keys", "offscreen", "ranges", "signals", "third_party"}
 
 # Of each room, the rooms below it that it may import; what these may import it may, too.
 ROOMS = {

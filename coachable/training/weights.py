@@ -139,7 +139,7 @@ def domain_of(agent: LoadedPolicy) -> Domain:
     if here != there:
         raise CheckpointError(f"{source} has the styles {', '.join(there)}: domain {name} has {', '.join(here)}")
     reads = widths_of(agent)
-    groups = sum(width for _, width in domain.observation_groups)
+    groups = sum(signal.width for signal in domain.observation_groups)
     if groups:
         _check_widths(source, reads, (groups, reads[1]), name)
 

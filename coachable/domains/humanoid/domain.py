@@ -10,7 +10,7 @@ from coachable.domains.humanoid.styles import POSES, humanoid_style_reward, huma
 from coachable.domains.humanoid.words import COURSE, WORDS
 from coachable.envs.humanoid.env import EPISODE_STEPS, HumanoidEnv
 from coachable.envs.humanoid.model import CONTROL_STEP
-from coachable.envs.humanoid.observation import OBSERVATION_GROUPS
+from coachable.envs.humanoid.observation import ACTION_GROUPS, OBSERVATION_GROUPS
 
 DOMAIN = Domain(
     name="humanoid",
@@ -52,5 +52,6 @@ DOMAIN = Domain(
     },
     controls=(COURSE,),
     words=WORDS,
-    observation_groups=tuple((name, width) for name, width, _ in OBSERVATION_GROUPS),
+    observation_groups=OBSERVATION_GROUPS,
+    action_groups=ACTION_GROUPS,
 )
