@@ -28,7 +28,7 @@ SECONDS = 60.0  # that a command may take
 NOT_RUN = {
     r"^\S+ -m (venv|pip) |^pip ": "installs packages, which .ci/run does",
     r"pytest": "the tests, which .ci/run runs, and benchmarks",
-    r"^coachable (coach|evaluate|explain|export|report|train RECIPE)$": "the name of a command, not one to be typed",
+    r"^coachable (coach|evaluate|explain|export|report|train RECIPE|verify)$": "the name of a command",
     r"preset=smoke|--help": "",  # is run
     r"runs/": "needs a training of minutes to hours, or is one",
     r"^python recipes/": "a training of minutes to hours",

@@ -24,12 +24,13 @@ ROOMS = {
     "styles": set(),
     "distributions": {"styles"},
     "networks": {"distributions"},
+    "contract": {"networks"},  # of exported models
     "losses": {"networks"},
     "replay": {"networks"},
     "transforms": {"networks"},
     "defaults": {"transforms"},  # what a `Domain` leaves out
     "domain": {"defaults"},  # the type of a declaration
-    "training": {"domain", "losses", "replay"},
+    "training": {"contract", "domain", "losses", "replay"},
     "fast": {"losses", "training"},
     "gym": {"transforms"},
     "export": {"training"},
