@@ -96,6 +96,33 @@ class Control:
 
 
 @dataclass(frozen=True)
+class Push:
+    """Push that a coach may give the agent.
+
+    Attributes:
+        apply: Function of the base environment and the strength forward and to the left, in the agent's direction.
+        largest: Largest strength.
+        unit: Unit of the strength.
+    """
+
+    apply: Callable[[EnvBase, float, float], None]
+    largest: float
+    unit: str
+
+    def fit(self, forward: float, left: float) -> tuple[float, float]:
+        """Scale a push down to the largest strength.
+
+        Raises:
+            ValueError: If a component is not finite.
+        """
+        strength = math.hypot(forward, left)
+        if not math.isfinite(strength):
+            raise ValueError(f"a push of {forward} forward and {left} left: expected numbers in {self.unit}")
+        scale = min(1.0, self.largest / strength) if strength else 1.0
+        return forward * scale, left * scale
+
+
+@dataclass(frozen=True)
 class Words:
     """Words for a domain, in addition to the names and help texts of its styles.
 
@@ -164,6 +191,7 @@ class Domain:
             entry is explained on its own.
         action_groups: Blocks of the action, in order, for exported models.
         controls: Live controls, which are steered while the agent acts.
+        push: Push that a coach may give the agent; None if the environment has none.
         words: Words for the domain, for phrases and presets.
         as_trained: Function from `env` of a training's configuration to this domain with these settings (such as the
             machines or cars); None if trainings do not differ.
@@ -188,6 +216,7 @@ class Domain:
     observation_groups: Sequence[Signal] = ()
     action_groups: Sequence[Signal] = ()
     controls: Sequence[Control] = ()
+    push: Push | None = None
     words: Words = field(default_factory=Words)
     as_trained: Callable[[Mapping[str, Any]], Domain] | None = None
     coached: Mapping[str, Any] = field(default_factory=dict)
