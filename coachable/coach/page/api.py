@@ -9,13 +9,13 @@ import math
 import threading
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
 from websockets.exceptions import ConnectionClosed
 
-from coachable.coach.session.bindings import make_bindings
+from coachable.coach.session.bindings import Binding, make_bindings
 from coachable.coach.session.loop import LiveLoop
 from coachable.coach.session.readout import StyleReport
 from coachable.coach.session.session import CoachSession
@@ -47,6 +47,7 @@ class CoachApi:
     def __init__(self, loop: LiveLoop) -> None:
         self._loop = loop
         self._space = describe(loop.session)
+        self._bindings = make_bindings(loop.session.space, loop.session.domain.controls)
         self._state: dict[str, Any] = {}
         self._rates: dict[object, float] = {}
         self._lock = threading.Lock()  # of the rates, which two threads use
@@ -112,7 +113,7 @@ class CoachApi:
         sent: dict[str, Any] = {}
         with contextlib.suppress(ConnectionClosed):
             while True:
-                if self._state is not sent:
+                if self._state and self._state is not sent:
                     sent = self._state
                     await connection.send(json.dumps({"state": sent}))
                 await asyncio.sleep(1.0 / rate)
@@ -141,7 +142,7 @@ class CoachApi:
             if rate and not _RATES[0] <= rate <= _RATES[1]:
                 raise ValueError(f"rate = {rate:g}: expected 0, or {_RATES[0]:g} to {_RATES[1]:g} per second")
             return {"rate": rate}, rate
-        return await self._change(_change_of(what, request)), None
+        return await self._change(_bound(what, request, self._bindings) or _change_of(what, request)), None
 
     async def _change(self, change: Callable[[CoachSession], Any]) -> dict[str, Any]:
         """Make a change in the loop's thread and return what is then in force."""
@@ -225,8 +226,26 @@ def _change_of(what: Any, request: Mapping[str, Any]) -> Callable[[CoachSession]
         if seed is not None and type(seed) is not int:
             raise ValueError(f"seed = {seed!r}: expected a whole number")
         return lambda session: session.reset(seed)
-    expected = "'space', 'read', 'subscribe', 'set', 'steer', 'push' or 'reset'"
+    expected = "'space', 'read', 'subscribe', 'set', 'steer', 'press', 'move', 'push' or 'reset'"
     raise ValueError(f"do = {str(what)[:40]!r}: expected {expected}")
+
+
+def _bound(what: Any, request: Mapping[str, Any], bindings: Sequence[Binding]) -> Callable[[CoachSession], Any] | None:
+    """Return the change of a key, button or axis that was used, or None for other requests."""
+    if what == "press":
+        given = request.get("key", request.get("button"))
+        for binding in bindings:
+            pair: tuple[Any, ...] = binding.keys if "key" in request else binding.buttons
+            if type(given) in (str, int) and given in pair:
+                return lambda session: binding.press(session, 1 if pair.index(given) else -1)
+        raise ValueError(f"nothing is bound to {str(given)[:40]!r}: expected a key or button of the bindings")
+    if what == "move":
+        axis, position = request.get("axis"), _number("position", request.get("position"))
+        found = next((b for b in bindings if b.axis is not None and type(axis) is int and b.axis == axis), None)
+        if found is None:
+            raise ValueError(f"nothing is bound to axis {str(axis)[:40]}: expected an axis of the bindings")
+        return lambda session: found.move(session, position)
+    return None
 
 
 def _known(values: Mapping[str, Any], names: Any) -> Mapping[str, Any]:

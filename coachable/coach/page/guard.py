@@ -17,6 +17,7 @@ import re
 import socket
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -31,6 +32,7 @@ _THIS_MACHINE = ("localhost", "127.0.0.1", "::1")
 _EVERYWHERE = ("", "*", "0.0.0.0", "::")
 _HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([^\[\]:@/\s]+))(?::\d{1,5})?", re.IGNORECASE)
 _VISER = re.compile(r"viser-v[\w.+-]{1,32}")
+_PAD = "/pad"  # page for keys and gamepads
 _CONNECTIONS = 64  # at the same time
 _LONGEST_MESSAGE = 1 << 20  # [byte]; viser's page uploads files in pieces of half this size
 _UPLOADED = 16 << 20  # [byte], per connection
@@ -115,17 +117,18 @@ class Guard:
         return judge
 
     def _read(self, request: Request) -> Response | None:
-        """Return the API's answer to a request over HTTP, or None if the path is not the API's."""
+        """Return the answer to a request over HTTP if the path is the API's or that of the page for keys."""
+        if request.path == _PAD:
+            return _answered(
+                Path(__file__).with_name("pad.html").read_text(encoding="utf-8"), "text/html; charset=utf-8"
+            )
         if not request.path.startswith(f"{PATH}/"):
             return None
         found = None if self.api is None else self.api.read(request.path)
         if found is None:
             status = http.HTTPStatus.SERVICE_UNAVAILABLE if self.api is None else http.HTTPStatus.NOT_FOUND
             return _refused(status, "the agent is being loaded" if self.api is None else "there is nothing here")
-        headers = Headers({"Content-Type": "application/json", "Cache-Control": "no-store"})
-        body = found.encode()
-        headers["Content-Length"] = str(len(body))
-        return Response(http.HTTPStatus.OK.value, "OK", headers, body)
+        return _answered(found, "application/json")
 
     def refusal(self, request: Request) -> str:
         """Return why a request is refused, or an empty text if it is accepted."""
@@ -243,6 +246,12 @@ def _refused(status: http.HTTPStatus, reason: str) -> Response:
     body = f"Refused: {reason}.\n".encode()
     headers = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))})
     return Response(status.value, status.phrase, headers, body)
+
+
+def _answered(text: str, kind: str) -> Response:
+    body = text.encode()
+    headers = Headers({"Content-Type": kind, "Cache-Control": "no-store", "Content-Length": str(len(body))})
+    return Response(http.HTTPStatus.OK.value, http.HTTPStatus.OK.phrase, headers, body)
 
 
 def _protection(host: str) -> dict[str, str]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
+from coachable.coach.session.session import CoachSession
 from coachable.domain import Control
 from coachable.styles import Choice, Parameter, StyleSpace
 
@@ -64,10 +64,19 @@ class Binding:
         low, high = self._range()
         return low + 0.5 * (min(max(position, -1.0), 1.0) + 1.0) * (high - low)
 
-    def request(self, value: float | str) -> dict[str, Any]:
-        """Return the message of the coaching page's API that asks for a value."""
-        what, of = ("steer", "controls") if self.is_control else ("set", "style")
-        return {"do": what, of: {self.name: value}}
+    def press(self, session: CoachSession, direction: int) -> None:
+        """Request the value after a key or button; see `stepped`."""
+        self._ask(session, self.stepped((session.style | session.controls)[self.name], direction))
+
+    def move(self, session: CoachSession, position: float) -> None:
+        """Request the value of an axis at a position in [-1, 1]."""
+        self._ask(session, self.at(position))
+
+    def _ask(self, session: CoachSession, value: float | str) -> None:
+        if self.is_control:
+            session.steer(**{self.name: float(value)})
+        else:
+            session.set(**{self.name: value})
 
     def _range(self) -> tuple[float, float]:
         if self.low is None or self.high is None:
@@ -87,8 +96,8 @@ def make_bindings(space: StyleSpace, controls: Sequence[Control] = ()) -> list[B
     Example:
         >>> from coachable.styles import Setpoint
         >>> (binding,) = make_bindings(StyleSpace([Setpoint("gap", 0.0, 2.0)]))
-        >>> binding.keys, binding.axis, binding.at(0.5), binding.request(binding.stepped(1.0, -1))
-        (('q', 'w'), 0, 1.5, {'do': 'set', 'style': {'gap': 0.8}})
+        >>> binding.keys, binding.axis, binding.at(0.5), binding.stepped(1.0, -1)
+        (('q', 'w'), 0, 1.5, 0.8)
     """
     keys, axes, buttons = iter(_KEYS), iter(_AXES), iter(_BUTTONS)
     circular: Mapping[str, bool] = {control.parameter.name: control.circular for control in controls}

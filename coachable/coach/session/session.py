@@ -147,20 +147,16 @@ class CoachSession:
         self._apply({"controls": fitted})
 
     def push(self, forward: float = 0.0, left: float = 0.0) -> None:
-        """Push the agent before the next step; a push above the largest strength is scaled down to it.
-
-        Args:
-            forward: Strength in the agent's direction, in the unit of `Domain.push`.
-            left: Strength to its left.
+        """Push the agent before the next step; see `coachable.domain.Push`, whose largest strength limits the push.
 
         Raises:
             ValueError: If the domain has no push, or a strength is not finite.
         """
         if self.domain.push is None:
             raise ValueError(f"{self.domain.name} has no push")
-        fitted = self.domain.push.fit(float(forward), float(left))
+        fitted = list(self.domain.push.fit(float(forward), float(left)))
         self._timeline.take_over()
-        self._apply({"push": list(fitted)})
+        self._apply({"push": fitted})
 
     def say(self, phrase: str) -> Understanding:
         """Request a style in words: "shorter steps, arms up", "0.4 m", "a bit more", or a preset's name.

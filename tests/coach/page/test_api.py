@@ -1,9 +1,14 @@
 """Other programs coach through the page's port: they read, set, subscribe, reset and push; two at once get along."""
 
 import json
+import re
+import shutil
 import socket
+import subprocess
+import sys
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
@@ -142,6 +147,11 @@ def test_set_is_clamped_as_the_session_does(echo):
         ('{"do": "reset", "seed": -1}', "seed = -1: expected a whole number"),
         ('{"do": "reset", "seed": 1.5}', "seed = 1.5: expected a whole number"),
         ('{"do": "subscribe", "rate": 1000}', "rate = 1000: expected 0, or 0.1 to 50 per second"),
+        ('{"do": "press", "key": "F1"}', "nothing is bound to 'F1'"),
+        ('{"do": "press"}', "nothing is bound to 'None'"),
+        ('{"do": "press", "button": true}', "nothing is bound to 'True'"),
+        ('{"do": "move", "axis": 9, "position": 0}', "nothing is bound to axis 9"),
+        ('{"do": "move", "axis": 0, "position": "left"}', "position = left: expected a number"),
         ('{"do": "fly"}', "do = 'fly': expected 'space', 'read', "),
         ('{"id": [1]}', "the id of the message is neither"),
         ('"' + "x" * (1 << 16) + '"', "characters: expected at most 65,536"),
@@ -202,6 +212,19 @@ def test_reset_and_seed(echo):
         assert echo.session.recording().seed == 11
 
 
+def test_keys_buttons_and_axes_are_forwarded(echo):
+    with connect(echo) as connection:
+        target, mood, fire = ask(connection, do="space")["space"]["bindings"]
+        ask(connection, do="set", style={"target": 0.0, "mood": "calm", "fire": 0.0})
+        assert ask(connection, do="press", key=target["keys"][1])["style"]["target"] == pytest.approx(0.16)
+        assert ask(connection, do="press", key=target["keys"][0])["style"]["target"] == pytest.approx(0.0, abs=1e-6)
+        assert ask(connection, do="move", axis=target["axis"], position=-1)["style"]["target"] == pytest.approx(-0.8)
+        assert ask(connection, do="press", button=mood["buttons"][1])["style"]["mood"] == "wild_card"
+        assert ask(connection, do="press", key=mood["keys"][1])["style"]["mood"] == "calm"
+        assert ask(connection, do="move", axis=fire["axis"], position=1)["style"]["fire"] == pytest.approx(2.0)
+        assert ask(connection, do="press", key=fire["keys"][1])["outside"] == {}, "keys stay within the range"
+
+
 def test_steer_and_push(humanoid):
     with connect(humanoid) as connection:
         assert ask(connection, do="steer", controls={"course": 190})["controls"] == {"course": -170.0}
@@ -235,6 +258,43 @@ def test_before_the_agent_is_there():
     with connect(page) as connection, pytest.raises(ConnectionClosed, match="the agent is being loaded"):
         connection.recv(timeout=20)
     server.stop()
+
+
+GUIDE = (Path(__file__).resolve().parents[3] / "docs" / "guides" / "coach_from_code.md").read_text()
+
+
+def example(language):
+    (program,) = re.findall(rf"```{language}\n(.*?)```", GUIDE, re.DOTALL)
+    return program
+
+
+def test_the_documented_python_program(echo):
+    program = [sys.executable, "-W", "error", "-c", example("python"), f"http://{address(echo)}"]
+    done = subprocess.run(program, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert "asked for {'target': 0.8" in done.stdout and done.stdout.count(" s: measured {") == 5
+    assert echo.session.style["fire"] == 2.0
+
+
+def node():
+    """The command of a Node with WebSockets, None if there is none."""
+    for options in ([], ["--experimental-websocket"]):
+        command = ["node", *options]
+        if shutil.which("node"):
+            test = [*command, "-e", "process.exit(typeof WebSocket === 'function' ? 0 : 1)"]
+            if subprocess.run(test, capture_output=True).returncode == 0:
+                return command
+    return None
+
+
+@pytest.mark.skipif(node() is None, reason="no Node with WebSocket is installed")
+def test_the_documented_javascript_program(echo, tmp_path):
+    file = tmp_path / "coach.mjs"
+    file.write_text(example("javascript"))
+    done = subprocess.run([*node(), str(file), f"http://{address(echo)}"], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert 'asked for {"target":-0.8' in done.stdout and done.stdout.count(" s: measured {") == 5
+    assert echo.session.style["fire"] == -0.5
 
 
 def test_a_live_session_replays_to_the_same_actions(humanoid):
