@@ -353,7 +353,7 @@ def test_pushes_are_limited_recorded_and_replayed(session):
     assert recording.events == [{"step": 0, "push": [pytest.approx(0.3), pytest.approx(0.4)]}]
     pushed.replay(recording)
     pushed.step()
-    with pytest.raises(ValueError, match="a push of nan forward and 0.0 left: expected numbers in m"):
+    with pytest.raises(ValueError, match=r"a push of nan forward and 0\.0 left: expected numbers in m"):
         pushed.push(math.nan)
     assert pushed.replaying and pushed.base_env.position.equal(states[0])
     for state in states[1:]:
