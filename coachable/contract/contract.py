@@ -23,6 +23,7 @@ SCHEMA_VERSION = 3
 _LONGEST_TEXT = 1 << 20  # [characters] of an entry of the metadata, except the recording
 _LONGEST_RECORDING = 1 << 26
 _MOST_NUMBERS = 1 << 24  # in the arrays of a recording
+_MOST_ROWS = 10_000  # of such an array; an environment has to be stepped as often
 _MOST_ENTRIES = 1 << 17  # of an observation or an action
 
 
@@ -249,10 +250,10 @@ def _unpacked(name: str, entry: Any, width: int) -> np.ndarray:
     shape, data = (entry.get("shape"), entry.get("data")) if isinstance(entry, dict) else (None, None)
     if not isinstance(shape, list) or len(shape) != 2 or any(type(n) is not int or n < 0 for n in shape):
         raise ContractError(f"the array {name} of its recording has the shape {shape!r}: expected two numbers")
-    if shape[1] != width or shape[0] * shape[1] > _MOST_NUMBERS:
+    if shape[1] != width or shape[0] > _MOST_ROWS or shape[0] * shape[1] > _MOST_NUMBERS:
         raise ContractError(
             f"the array {name} of its recording has the shape {shape}: expected {width} columns, as its blocks have, "
-            f"and at most {_MOST_NUMBERS:,} numbers"
+            f"at most {_MOST_ROWS:,} rows and {_MOST_NUMBERS:,} numbers"
         )
     size = 4 * shape[0] * shape[1]
     try:

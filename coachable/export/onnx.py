@@ -7,6 +7,7 @@ import math
 import os
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -77,9 +78,9 @@ def write_onnx(agent: LoadedPolicy, domain: Domain | None, out: Path) -> float:
     model = _trace(plain).model_proto
     contract = contract_of(agent, plain, domain)
     if domain is not None:
-        rig = Rig(domain, agent.space)
-        contract = replace(contract, recorded=record(rig, contract, OnnxRun(model.SerializeToString(), contract)))
-        rig.close()
+        with closing(Rig(domain, agent.space)) as rig:
+            policy = OnnxRun(model.SerializeToString(), contract)
+            contract = replace(contract, recorded=record(rig, contract, policy))
     onnx.helper.set_model_props(model, {"coachable_version": __version__} | contract.to_metadata())
     onnx.checker.check_model(model)
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -128,18 +130,11 @@ def _blocks_differ(what: str, expected: Sequence[Signal], declared: Sequence[Sig
 
 def _environment(contract: Contract, recorded: Recorded, domain: Domain) -> list[str]:
     """Repeat the recorded runs in the domain's environment."""
-    rig = Rig(domain, contract.space)
-    try:
+    with closing(Rig(domain, contract.space)) as rig:
         if rig.widths != contract.widths:
             return [
                 f"the environment of {domain.name} has {rig.widths[0]} observations and {rig.widths[1]} actions: "
                 f"expected {contract.widths[0]} and {contract.widths[1]}"
             ]
-
-        def repeat(action: np.ndarray, style: np.ndarray | None = None) -> np.ndarray:
-            return rig.repeat(recorded.seed, action, style)
-
-        found = diagnose(contract, recorded, repeat)
-    finally:
-        rig.close()
+        found = diagnose(contract, recorded, partial(rig.repeat, recorded.seed))
     return [f"wrong {d.cause}: {d.text}" if d.cause else f"the environment differs: {d.text}" for d in found]

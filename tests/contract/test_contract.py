@@ -142,7 +142,10 @@ BAD = {
     "no arrays": ({"recording": '{"seed": 0}'}, r"recording has the arrays \[\]"),
     "a number": ({"recording": recording(rest=3)}, "rest of its recording has the shape None"),
     "a wrong shape": ({"recording": recording(rest=packed(numbers(3, 5)))}, r"has the shape \[3, 5\]: expected 4"),
-    "a huge shape": ({"recording": recording(rest={"shape": [1 << 40, 4], "data": ""})}, "and at most 16,777,216"),
+    "a huge shape": (
+        {"recording": recording(rest={"shape": [1 << 40, 4], "data": ""})},
+        "at most 10,000 rows and 16,777,216",
+    ),
     "too little": ({"recording": recording(rest=packed(numbers(2, 4), (3, 4)))}, "does not have the size of its shape"),
     "a bomb": ({"recording": recording(observation=BOMB)}, "does not have the size of its shape"),
     "no base64": ({"recording": recording(rest={"shape": [3, 4], "data": "?"})}, "cannot be unpacked"),
