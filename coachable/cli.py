@@ -19,7 +19,7 @@ __all__ = ["main"]
 
 _LARGEST = 2**31 - 1
 _PICTURES = (".png", ".svg", ".pdf")
-_SOURCE_HELP = "a run's folder, a checkpoint, a weights file, or a domain that ships with weights"
+_SOURCE_HELP = "a run's folder, a checkpoint, a weights file, an exported model, or a domain that ships with weights"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -124,6 +124,11 @@ def _parser() -> argparse.ArgumentParser:
 
     export = command("export", _export, "write the policy as one ONNX file, to run it without torch", _SOURCE_HELP)
     _add_out(export, "policy.onnx")
+
+    verify = command("verify", _verify, "check an exported model, and an environment, against the model's contract")
+    verify.add_argument("file", type=Path, help="a file of coachable export")
+    text = "whose environment is compared with the recording (default: the model's own, if it is installed)"
+    verify.add_argument("--domain", metavar="NAME", help=text)
 
     from coachable.coach.page.command import add_parser
 
@@ -237,6 +242,17 @@ def _export(options: argparse.Namespace) -> int:
     return 0
 
 
+def _verify(options: argparse.Namespace) -> int:
+    from coachable.export.verify import verify
+
+    verdict = verify(**_arguments(options))
+    for sentence in verdict.checked:
+        print(sentence)
+    for sentence in verdict.problems:
+        print(sentence, file=sys.stderr)
+    return 1 if verdict.problems else 0
+
+
 def _coach(options: argparse.Namespace) -> int:
     _require_agent(options.source)  # before the page's address is announced
     from coachable.coach.page.command import serve
@@ -270,7 +286,7 @@ def _require_agent(source: str) -> None:
     names = ", ".join(sorted(path.parent.name for path in shipped.glob("*/weights.pt")))
     if not source or not Path(source).exists():
         raise ValueError(f"there is no agent {source!r}: expected {_SOURCE_HELP} ({names})")
-    if not zipfile.is_zipfile(source):
+    if not source.endswith(".onnx") and not zipfile.is_zipfile(source):
         raise ValueError(f"{source} is no weights file: expected {_SOURCE_HELP} ({names})")
 
 

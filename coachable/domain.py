@@ -18,6 +18,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, Transform
 
 from coachable.defaults import EnvPictures, RewardMeasures, steps_per_episode, style_grid, time_per_step
+from coachable.signals import Signal
 from coachable.styles import Setpoint, StyleReward, StyleSpace
 from coachable.transforms import CoachableEnv, coachable_env
 
@@ -96,6 +97,33 @@ class Control:
 
 
 @dataclass(frozen=True)
+class Push:
+    """Push that a coach may give the agent.
+
+    Attributes:
+        apply: Function of the base environment and the strength forward and to the left, in the agent's direction.
+        largest: Largest strength.
+        unit: Unit of the strength.
+    """
+
+    apply: Callable[[EnvBase, float, float], None]
+    largest: float
+    unit: str
+
+    def fit(self, forward: float, left: float) -> tuple[float, float]:
+        """Scale a push down to the largest strength.
+
+        Raises:
+            ValueError: If a component is not finite.
+        """
+        strength = math.hypot(forward, left)
+        if not math.isfinite(strength):
+            raise ValueError(f"a push of {forward} forward and {left} left: expected numbers in {self.unit}")
+        scale = min(1.0, self.largest / strength) if strength else 1.0
+        return forward * scale, left * scale
+
+
+@dataclass(frozen=True)
 class Words:
     """Words for a domain, in addition to the names and help texts of its styles.
 
@@ -160,9 +188,11 @@ class Domain:
         targets: Largest value of a metric that is wanted as its median over the styles, by name.
         columns: Metrics of the published table, in order, with the format of their values; by default all.
         units: Units of measured quantities by name, for the axes of figures and the page of `coachable coach`.
-        observation_groups: Name and width of each block of the observation, in order, for explanations; by default
-            every entry is a group of its own.
+        observation_groups: Blocks of the observation, in order, for explanations and exported models; by default every
+            entry is explained on its own.
+        action_groups: Blocks of the action, in order, for exported models.
         controls: Live controls, which are steered while the agent acts.
+        push: Push that a coach may give the agent; None if the environment has none.
         words: Words for the domain, for phrases and presets.
         as_trained: Function from `env` of a training's configuration to this domain with these settings (such as the
             machines or cars); None if trainings do not differ.
@@ -185,8 +215,10 @@ class Domain:
     targets: Mapping[str, float] = field(default_factory=dict)
     columns: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
-    observation_groups: Sequence[tuple[str, int]] = ()
+    observation_groups: Sequence[Signal] = ()
+    action_groups: Sequence[Signal] = ()
     controls: Sequence[Control] = ()
+    push: Push | None = None
     words: Words = field(default_factory=Words)
     as_trained: Callable[[Mapping[str, Any]], Domain] | None = None
     on_track: Callable[[Path], Domain] | None = None

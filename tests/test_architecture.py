@@ -17,19 +17,20 @@ FILES = {
 }
 
 # Small modules at the top level that know no room.
-BASE = {"code_version", "extras", "files", "finite", "gl", "keys", "offscreen", "ranges", "third_party"}
+BASE = {"code_version", "extras", "files", "finite", "gl", "keys", "offscreen", "ranges", "signals", "third_party"}
 
 # Of each room, the rooms below it that it may import; what these may import it may, too.
 ROOMS = {
     "styles": set(),
     "distributions": {"styles"},
     "networks": {"distributions"},
+    "contract": {"networks"},  # of exported models
     "losses": {"networks"},
     "replay": {"networks"},
     "transforms": {"networks"},
     "defaults": {"transforms"},  # what a `Domain` leaves out
     "domain": {"defaults"},  # the type of a declaration
-    "training": {"domain", "losses", "replay"},
+    "training": {"contract", "domain", "losses", "replay"},
     "fast": {"losses", "training"},
     "cluster": {"training"},
     "gym": {"transforms"},

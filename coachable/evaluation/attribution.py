@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from coachable.domain import Domain
 from coachable.extras import how_to_install
+from coachable.signals import Signal
 from coachable.styles import StyleSpace
 from coachable.training.rng import preserved_rng, seed_everything
 
@@ -75,17 +76,17 @@ def input_groups(domain: Domain, space: StyleSpace, observation_dim: int) -> lis
     Raises:
         ValueError: If the widths of the groups do not add up to that of the observation.
     """
-    named = list(domain.observation_groups) or [(f"observation {i}", 1) for i in range(observation_dim)]
-    covered = sum(width for _, width in named)
+    named = list(domain.observation_groups) or [Signal(f"observation {i}", 1) for i in range(observation_dim)]
+    covered = sum(signal.width for signal in named)
     if covered != observation_dim:
         raise ValueError(
             f"observation_groups of domain {domain.name!r} cover {covered} entries, the policy observes "
             f"{observation_dim}: correct them where the Domain is declared"
         )
     groups, first = [], 0
-    for name, width in named:
-        groups.append(Group(name, slice(first, first + width), is_style=False))
-        first += width
+    for signal in named:
+        groups.append(Group(signal.name, slice(first, first + signal.width), is_style=False))
+        first += signal.width
     for name, columns in space.slices.items():
         groups.append(Group(f"style: {name}", slice(first + columns.start, first + columns.stop), is_style=True))
     return groups

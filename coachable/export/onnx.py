@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +16,19 @@ import torch
 from torch import Tensor
 
 from coachable import __version__
-from coachable.domain import domain_names
+from coachable.contract import model as exported
+from coachable.contract.contract import Contract
+from coachable.contract.model import OnnxRun
+from coachable.domain import Domain, domain_names
+from coachable.export.recorder import Rig, record
 from coachable.extras import how_to_install
 from coachable.files import CheckpointError, space_named
 from coachable.networks.plain import DeterministicAction
+from coachable.signals import Signal
 from coachable.styles import StyleSpace
-from coachable.training.weights import LoadedPolicy, domain_of, load_policy
+from coachable.training.weights import LoadedPolicy, domain_of, load_policy, widths_of
 
-__all__ = ["SCHEMA_VERSION", "TOLERANCE", "export", "largest_difference", "metadata_of"]
-
-SCHEMA_VERSION = 2
-"""Version of the file's inputs, outputs and metadata."""
+__all__ = ["TOLERANCE", "contract_of", "export", "largest_difference", "write_onnx"]
 
 TOLERANCE = 1e-5
 """Largest difference between the file's actions and torch's."""
@@ -38,6 +41,8 @@ def export(source: str | Path, out: Path) -> float:
     the encoding is part of the graph. The output is `action` (batch, A) in [-1, 1]. The outputs of mixed actions are
     `axes` (batch, axes) in [-1, 1], `choices` (batch, heads), the index of the likeliest value of each head, and
     `probabilities` (batch, all values), from which choices can be sampled. The batch size is dynamic.
+
+    The file also holds the agent's contract, with recorded runs that `coachable verify` repeats.
 
     Args:
         source: Checkpoint, run folder, weights file, or the name of a domain that ships with weights.
@@ -53,12 +58,30 @@ def export(source: str | Path, out: Path) -> float:
             `TOLERANCE`; no file is written then.
         OSError: If writing fails; the message says how much space is needed.
     """
-    onnx = _import_onnx()
+    import_onnx()
     agent = load_policy(source)
+    domain = domain_of(agent) if agent.metadata["domain"] in domain_names() else None
+    return write_onnx(agent, domain, out)
+
+
+def write_onnx(agent: LoadedPolicy, domain: Domain | None, out: Path) -> float:
+    """Write the deterministic policy of a loaded agent as ONNX, with its contract; see `export`.
+
+    Args:
+        agent: Agent from `load_policy`.
+        domain: Its domain, in which the recording is made; without one the contract has neither a recording nor a
+            control step.
+        out: File to write.
+    """
+    onnx = import_onnx()
     plain = DeterministicAction(agent.actor).eval()
-    metadata = metadata_of(agent, plain)
     model = _trace(plain).model_proto
-    onnx.helper.set_model_props(model, metadata)
+    contract = contract_of(agent, plain, domain)
+    if domain is not None:
+        with closing(Rig(domain, agent.space)) as rig:
+            policy = OnnxRun(model.SerializeToString(), contract)
+            contract = replace(contract, recorded=record(rig, contract, policy))
+    onnx.helper.set_model_props(model, {"coachable_version": __version__} | contract.to_metadata())
     onnx.checker.check_model(model)
     out.parent.mkdir(parents=True, exist_ok=True)
     partial = out.with_name(out.name + ".partial")
@@ -68,6 +91,7 @@ def export(source: str | Path, out: Path) -> float:
             partial.write_bytes(content)
         difference = largest_difference(partial, plain, agent.space)
         if not difference <= TOLERANCE:
+            source = agent.metadata["source"]
             raise CheckpointError(
                 f"the exported policy of {source} differs from torch by {difference:.2g}: expected at most {TOLERANCE}"
             )
@@ -77,29 +101,29 @@ def export(source: str | Path, out: Path) -> float:
     return difference
 
 
-def metadata_of(agent: LoadedPolicy, plain: DeterministicAction) -> dict[str, str]:
-    """Return the metadata of the file as strings; `style_space` is JSON (`StyleSpace.from_json`).
+def contract_of(agent: LoadedPolicy, plain: DeterministicAction, domain: Domain | None) -> Contract:
+    """Return the contract of an agent, without a recording.
 
     Args:
         agent: Agent from `load_policy`.
         plain: Its deterministic policy.
+        domain: Its domain, if it is known.
     """
-    domain = agent.metadata["domain"]
-    known: dict[str, Any] = {
-        "schema_version": SCHEMA_VERSION,
-        "coachable_version": __version__,
-        "domain": domain,
-        "style_space": agent.space.to_json(),
-        "frames": agent.metadata["frames"],
-        "updates": agent.metadata["updates"],
-    }
-    if domain in domain_names():
-        declaration = domain_of(agent)
-        known["control_step"] = declaration.control_step  # [s]
-        known["observation_groups"] = json.dumps(list(declaration.observation_groups))
-    if plain.choice_sizes:
-        known["choice_sizes"] = json.dumps(list(plain.choice_sizes))
-    return {name: str(value) for name, value in known.items() if value is not None}
+    observed, acted = widths_of(agent)
+    signals = domain.observation_groups if domain else (), domain.action_groups if domain else ()
+    environment = agent.config.get("env", {})
+    return Contract(
+        space=agent.space,
+        observation=tuple(signals[0]) or (Signal("observation", observed),),
+        action=tuple(signals[1]) or (Signal("action", acted),),
+        choice_sizes=plain.choice_sizes,
+        domain=agent.metadata["domain"],
+        control_step=domain.control_step if domain else None,
+        environment=dict(environment) if isinstance(environment, Mapping) else {},
+        frames=agent.metadata["frames"],
+        updates=agent.metadata["updates"],
+        recorded=None,
+    )
 
 
 def largest_difference(file: Path, plain: DeterministicAction, space: StyleSpace, samples: int = 256) -> float:
@@ -158,11 +182,14 @@ def _trace(plain: DeterministicAction) -> Any:
         logging.disable(before)
 
 
-def _import_onnx() -> Any:
+def import_onnx() -> Any:
+    """Return `onnx`.
+
+    Raises:
+        ImportError: If a package of the extra `export` is not installed; the message names it.
+    """
     try:
-        import onnx
-        import onnxruntime  # noqa: F401
         import onnxscript  # noqa: F401
     except ImportError as error:
         raise ImportError(f"{error.name} is missing: {how_to_install('export')}") from error
-    return onnx
+    return exported.import_onnx()

@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
+from coachable.contract.model import OnnxPolicy, read_model
 from coachable.domain import Domain, load_domain
 from coachable.files import check_finite, refusing, save_state, space_named, tensor_bytes
 from coachable.networks import make_gaussian_actor, make_mixed_actor
@@ -96,13 +97,17 @@ def load_policy(path_or_domain: Path | str, device: torch.device | str = "cpu") 
     """Load a trained policy.
 
     Args:
-        path_or_domain: A run's folder, a checkpoint, a weights file, or the name of a domain that ships with weights.
-        device: Device of the actor.
+        path_or_domain: A run's folder, a checkpoint, a weights file, an exported model (`.onnx`), or the name of a
+            domain that ships with weights.
+        device: Device of the actor; exported models run on the CPU.
 
     Raises:
         CheckpointError: If there is no such file or domain, or the file does not describe its policy.
+        ImportError: If it is an exported model and the extra `export` is not installed.
     """
     file = _locate(path_or_domain)
+    if file.suffix == ".onnx":
+        return _exported(file)
     state = _read_agent(file, device)
     with refusing(file, "a style space"):
         space = StyleSpace.from_dict(state["space"])
@@ -117,6 +122,13 @@ def load_policy(path_or_domain: Path | str, device: torch.device | str = "cpu") 
         counters |= state.get("counters", {})
         known = {name: None if counters.get(name) is None else int(counters[name]) for name in ("frames", "updates")}
     return LoadedPolicy(actor, space, state["config"], {"domain": state["domain"], "source": str(file), **known})
+
+
+def _exported(file: Path) -> LoadedPolicy:
+    contract, run = read_model(file)
+    counts = {"frames": contract.frames, "updates": contract.updates}
+    metadata = {"domain": contract.domain, "source": str(file), **counts}
+    return LoadedPolicy(OnnxPolicy(run, contract), contract.space, {"env": contract.environment}, metadata)
 
 
 def domain_of(agent: LoadedPolicy) -> Domain:
@@ -139,7 +151,7 @@ def domain_of(agent: LoadedPolicy) -> Domain:
     if here != there:
         raise CheckpointError(f"{source} has the styles {', '.join(there)}: domain {name} has {', '.join(here)}")
     reads = widths_of(agent)
-    groups = sum(width for _, width in domain.observation_groups)
+    groups = sum(signal.width for signal in domain.observation_groups)
     if groups:
         _check_widths(source, reads, (groups, reads[1]), name)
 
@@ -163,6 +175,8 @@ def _check_widths(source: str, reads: tuple[int, int], gives: tuple[int, int], d
 
 def widths_of(agent: LoadedPolicy) -> tuple[int, int]:
     """Return the widths of an agent's observation and of its action."""
+    if isinstance(agent.actor, OnnxPolicy):
+        return agent.actor.contract.widths
     policy = policy_network(agent.actor)
     actions = policy.heads.action_dim if isinstance(policy, MixedPolicy) else (policy.trunk.out_features or 0) // 2
     return policy.trunk.in_features - agent.space.dim, actions

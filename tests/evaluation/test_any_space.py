@@ -6,8 +6,10 @@ from tensordict.nn import TensorDictModule
 
 from coachable.domain import Domain
 from coachable.evaluation import evaluate as evaluation
-from coachable.evaluation.report import write_report
-from coachable.styles import Choice, Setpoint, StyleReward, StyleSpace, Term, Weight
+from coachable.evaluation.report import report, write_report
+from coachable.networks import make_gaussian_actor
+from coachable.styles import Choice, Setpoint, StyleReward, StyleSpace, Term, Weight, WeightedFeature
+from coachable.training import weights
 from coachable.training.weights import LoadedPolicy
 from tests.echo import StyleEchoEnv
 
@@ -34,3 +36,33 @@ def test_evaluation_and_report(kind, tmp_path, monkeypatch):
     assert all(name in text for name in space.names) and "survived" in text
     assert (tmp_path / "evaluation" / "grid.png").stat().st_size > 1000
     assert "survived" in write_report(domain, {"any": agent}, tmp_path / "report", seeds=1, sweep_points=2, **options)
+
+
+def test_report_of_a_gymnasium_environment_from_an_exported_model(tmp_path, monkeypatch):
+    pytest.importorskip("onnxscript")
+    pytest.importorskip("onnxruntime")
+    gymnasium = pytest.importorskip("gymnasium")
+    from coachable.export.onnx import write_onnx
+    from coachable.export.verify import verify
+    from coachable.gym import GymnasiumEnv
+
+    space = StyleSpace([Weight("effort", -1.0, 1.0)])
+    domain = Domain(
+        "swing",
+        lambda num_envs=1: GymnasiumEnv(
+            lambda: gymnasium.make("Pendulum-v1"), lambda obs, action, info: -(action**2), num_envs
+        ),
+        lambda: space,
+        lambda space: StyleReward(space, {"effort": WeightedFeature("effort", 0)}),
+    )
+    actor = make_gaussian_actor(3, 1, space, widths=(8,)).eval()
+    agent = LoadedPolicy(actor, space, {}, {"domain": "swing", "source": "here", "frames": 12, "updates": 3})
+    file = tmp_path / "swing.onnx"
+    write_onnx(agent, domain, file)
+    assert verify(file, domain).problems == ()
+    monkeypatch.setattr(weights, "load_domain", lambda *_: domain)
+    options = {"seeds": 1, "episodes": 1, "switch_episodes": 1, "sweep_points": 2, "steps": 3, "progress": False}
+    assert "survived: 100%" in report([file], tmp_path / "report", **options)
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert f"Deterministic policy of {file}, trained for 12 frames" in page
+    assert "What a style costs" in page

@@ -14,8 +14,9 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coachable.cli import main
+from coachable.contract.contract import SCHEMA_VERSION
 from coachable.distributions.action_heads import ActionHeads
-from coachable.export.onnx import SCHEMA_VERSION, TOLERANCE, _trace, export, largest_difference
+from coachable.export.onnx import TOLERANCE, _trace, export, largest_difference
 from coachable.networks import make_gaussian_actor
 from coachable.networks.mixed import make_mixed_actor
 from coachable.networks.plain import DeterministicAction, policy_network
@@ -76,7 +77,13 @@ def test_the_file_describes_itself(file):
     assert float(metadata["control_step"]) == 0.025
     assert metadata["schema_version"] == str(SCHEMA_VERSION)
     assert metadata["domain"] == "humanoid"
-    assert sum(width for _, width in json.loads(metadata["observation_groups"])) == 82
+    assert metadata["schema_version"] == "3"
+    blocks = json.loads(metadata["observation"])
+    assert sum(block["width"] for block in blocks) == 82
+    assert (blocks[0]["name"], blocks[0]["unit"], blocks[0]["entries"][0]) == ("joint_angles", "rad", "abdomen_z")
+    (motors,) = json.loads(metadata["action"])
+    assert (motors["entries"][0], motors["unit"][0]) == ("abdomen_y", "40 N m")
+    assert len(json.loads(metadata["recording"])) == 7
 
 
 def test_it_is_one_file(file):

@@ -17,6 +17,7 @@ import re
 import socket
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -25,10 +26,13 @@ import websockets.asyncio.server as server
 from websockets import Headers
 from websockets.http11 import Request, Response
 
+from coachable.coach.page.api import PATH, PROTOCOL, CoachApi
+
 _THIS_MACHINE = ("localhost", "127.0.0.1", "::1")
 _EVERYWHERE = ("", "*", "0.0.0.0", "::")
 _HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([^\[\]:@/\s]+))(?::\d{1,5})?", re.IGNORECASE)
-_PROTOCOL = re.compile(r"viser-v[\w.+-]{1,32}")
+_VISER = re.compile(r"viser-v[\w.+-]{1,32}")
+_PAD = "/pad"  # page for keys and gamepads
 _CONNECTIONS = 64  # at the same time
 _LONGEST_MESSAGE = 1 << 20  # [byte]; viser's page uploads files in pieces of half this size
 _UPLOADED = 16 << 20  # [byte], per connection
@@ -50,10 +54,12 @@ class Guard:
 
     Attributes:
         active: Whether a guarded server was started.
+        api: The API for other programs, once there is an agent.
     """
 
     def __init__(self, host: str) -> None:
         self.active = False
+        self.api: CoachApi | None = None
         self._everywhere = host in _EVERYWHERE
         self._names = {*_THIS_MACHINE, host.lower().strip("[]")}
         if self._everywhere:
@@ -73,15 +79,28 @@ class Guard:
         def guarded(handler: Any, host: str, port: int, **settings: Any) -> Any:
             self.active = True
             asyncio.get_running_loop().set_exception_handler(_note)
+            choose = settings.get("select_subprotocol") or (lambda *_: None)
             settings |= {
+                "select_subprotocol": lambda c, offered: PROTOCOL if PROTOCOL in offered else choose(c, offered),
                 "process_request": self._request(settings.get("process_request") or (lambda *_: None)),
                 "create_connection": GuardedConnection,
                 "max_size": _LONGEST_MESSAGE,
                 "logger": _log,
             }
-            return serve(handler, host, port, **settings)
+            return serve(self._handler(handler), host, port, **settings)
 
         return guarded
+
+    def _handler(self, viser: Callable[..., Any]) -> Callable[..., Any]:
+        async def handle(connection: Any) -> None:
+            if connection.subprotocol != PROTOCOL:
+                await viser(connection)
+            elif self.api is None:
+                await connection.close(1013, "the agent is being loaded: try again")
+            else:
+                await self.api.serve(connection)
+
+        return handle
 
     def _request(self, answer: Callable[..., Response | None]) -> Callable[..., Response | None]:
         def judge(connection: server.ServerConnection, request: Request) -> Response | None:
@@ -90,12 +109,26 @@ class Guard:
                 return _refused(http.HTTPStatus.FORBIDDEN, reason)
             if _is_upgrade(request.headers) and len(connection.server.connections) >= _CONNECTIONS:
                 return _refused(http.HTTPStatus.SERVICE_UNAVAILABLE, f"{_CONNECTIONS} browsers are connected already")
-            response = answer(connection, request)
+            response = self._read(request) or answer(connection, request)
             if response is not None:
                 response.headers.update(_protection(request.headers["Host"]))
             return response
 
         return judge
+
+    def _read(self, request: Request) -> Response | None:
+        """Return the answer to a request over HTTP if the path is the API's or that of the page for keys."""
+        if request.path == _PAD:
+            return _answered(
+                Path(__file__).with_name("pad.html").read_text(encoding="utf-8"), "text/html; charset=utf-8"
+            )
+        if not request.path.startswith(f"{PATH}/"):
+            return None
+        found = None if self.api is None else self.api.read(request.path)
+        if found is None:
+            status = http.HTTPStatus.SERVICE_UNAVAILABLE if self.api is None else http.HTTPStatus.NOT_FOUND
+            return _refused(status, "the agent is being loaded" if self.api is None else "there is nothing here")
+        return _answered(found, "application/json")
 
     def refusal(self, request: Request) -> str:
         """Return why a request is refused, or an empty text if it is accepted."""
@@ -106,7 +139,8 @@ class Guard:
         upgrade = _is_upgrade(request.headers)
         if any(origin.lower() != own for origin in origins) or len(origins) > 1 or (upgrade and not origins):
             return "only the page itself may talk to this server"
-        if upgrade and not _PROTOCOL.fullmatch(request.headers.get("Sec-WebSocket-Protocol", "")):
+        protocol = request.headers.get("Sec-WebSocket-Protocol", "")
+        if upgrade and not (protocol == PROTOCOL if request.path == PATH else _VISER.fullmatch(protocol)):
             return "this is no connection of the page"
         if set(parse_qs(urlsplit(request.path).query, keep_blank_values=True)) & set(_FOREIGN_SOURCES):
             return "the page shows this server only"
@@ -132,6 +166,8 @@ class GuardedConnection(server.ServerConnection):
         while True:
             message = await super().recv(decode)
             await self._keep_pace()
+            if self.subprotocol == PROTOCOL:
+                return message
             try:
                 wanted = is_wanted(message)
             except Exception as error:  # random bytes can raise anything
@@ -210,6 +246,12 @@ def _refused(status: http.HTTPStatus, reason: str) -> Response:
     body = f"Refused: {reason}.\n".encode()
     headers = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))})
     return Response(status.value, status.phrase, headers, body)
+
+
+def _answered(text: str, kind: str) -> Response:
+    body = text.encode()
+    headers = Headers({"Content-Type": kind, "Cache-Control": "no-store", "Content-Length": str(len(body))})
+    return Response(http.HTTPStatus.OK.value, http.HTTPStatus.OK.phrase, headers, body)
 
 
 def _protection(host: str) -> dict[str, str]:

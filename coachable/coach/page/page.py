@@ -10,7 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+from coachable.coach.page.api import CoachApi
 from coachable.coach.page.film import FilmStudio
+from coachable.coach.page.server import serve_api
 from coachable.coach.page.views import View, make_view
 from coachable.coach.page.widgets import Chart, MeasuredText, ParameterWidget, write
 from coachable.coach.phrases.grammar import Understanding
@@ -55,6 +57,7 @@ class CoachPage:
     def __init__(self, server: viser.ViserServer, session: CoachSession) -> None:
         self.server, self.session = server, session
         self.loop = LiveLoop(session, self._on_step, on_stop=self._close_view)
+        self._api = CoachApi(self.loop)
         self._view: View | None = None
         self._reading = threading.Lock()
         self._studio = FilmStudio(session, lambda note: write(self.film_note, escaped(note)))
@@ -73,8 +76,9 @@ class CoachPage:
             self._add_session()
 
     def start(self) -> None:
-        """Start the loop."""
+        """Start the loop, and let other programs coach the session, too."""
         self.loop.start()
+        serve_api(self.server, self._api)
 
     def stop(self) -> None:
         """End the loop; the session stays open."""
@@ -239,11 +243,14 @@ class CoachPage:
     def _on_step(self) -> None:
         """Show the state of the session; the loop calls this in its thread."""
         now = time.perf_counter()
+        self._api.on_step()
         for name, value in (self.session.style | self.session.controls).items():
             self.widgets[name].follow(value)
         if now >= self._report_due or self.loop.paused or self.session.ended is not None:
             self._report_due = now + 1.0 / _REPORTS_PER_SECOND
-            self._show(self.session.report())
+            report = self.session.report()
+            self._api.publish(report)
+            self._show(report)
         # The view comes last: if it fails, the read-outs still show the problem.
         if self._view is None:
             self._view = make_view(self.server, self.session)

@@ -7,13 +7,18 @@ import errno
 import io
 import socket
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 from coachable.extras import how_to_install
 
 if TYPE_CHECKING:
     import viser
 
+    from coachable.coach.page.api import CoachApi
+    from coachable.coach.page.guard import Guard
+
 _PORTS = 65535
+_GUARDS: WeakKeyDictionary[viser.ViserServer, Guard] = WeakKeyDictionary()
 _TRIED = 100  # ports, before giving up
 
 
@@ -51,6 +56,7 @@ def make_server(host: str = "127.0.0.1", port: int = 8080) -> viser.ViserServer:
     free = free_port(host, port)  # viser itself tries 1000 ports after any error, and then waits for ever
     with guard.around(), contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
         server = LocalServer(host=host, port=free, label="coachable", verbose=False)
+    _GUARDS[server] = guard
     if not guard.active:
         server.stop()
         raise ImportError(f"viser {viser.__version__} starts its server in a way that the page cannot guard")
@@ -59,6 +65,11 @@ def make_server(host: str = "127.0.0.1", port: int = 8080) -> viser.ViserServer:
     server.gui.set_panel_label("coachable")
     server.gui.main_panel.dock_right()
     return server
+
+
+def serve_api(server: viser.ViserServer, api: CoachApi) -> None:
+    """Let other programs use an API on the port of a server from `make_server`."""
+    _GUARDS[server].api = api
 
 
 def free_port(host: str, port: int) -> int:

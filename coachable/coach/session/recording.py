@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from coachable.domain import Control
+from coachable.domain import Control, Push
 from coachable.styles import Choice, Parameter, StyleSpace
 
 SCHEMA_VERSION = 1
@@ -36,7 +36,7 @@ class Recording:
         controls: Live controls at the start, by name.
         endless: Whether time limits were ignored.
         events: `{"step": k, ...}` in order, each applied before step k (from 0), with one of `style` (changed
-            parameters), `controls` (changed controls) and `reset` (true).
+            parameters), `controls` (changed controls), `push` (forward and left) and `reset` (true).
         steps: Number of steps.
         checks: Pairs of a step and the checksum of the observation after it, with which a replay is compared.
     """
@@ -79,16 +79,17 @@ class Recording:
         recording.checks = [(step, checksum) for step, checksum in recording.checks]
         return recording
 
-    def check(self, domain: str, space: StyleSpace, controls: Mapping[str, Control]) -> None:
+    def check(self, domain: str, space: StyleSpace, controls: Mapping[str, Control], push: Push | None) -> None:
         """Check that a session can replay this recording.
 
         Args:
             domain: Name of the session's domain.
             space: Its style space.
             controls: Its live controls, by name.
+            push: Its push, if it has one.
 
         Raises:
-            ValueError: If the session has another domain, or lacks a style parameter, a control or a value.
+            ValueError: If the session has another domain, or lacks a style parameter, a control, a push or a value.
         """
         if self.domain != domain:
             raise ValueError(f"the recording belongs to {self.domain!r}, this session to {domain!r}")
@@ -105,6 +106,11 @@ class Recording:
                     raise ValueError(f"no live control named {name!r}: {domain} has {list(controls)}")
                 if controls[name].fit(value) != value:
                     raise ValueError(f"the recording steers {name} = {value}, which lies outside its range")
+        for pushed in (event["push"] for event in self.events if "push" in event):
+            if push is None:
+                raise ValueError(f"the recording has a push: {domain} has none")
+            if math.hypot(*pushed) > push.largest * (1.0 + 1e-9):
+                raise ValueError(f"the recording has a push of {pushed}: expected at most {push.largest:g} {push.unit}")
 
     def save(self, file: Path | str) -> Path:
         """Write the recording to a JSON file, whose folder is created if missing, and return the path."""
@@ -164,7 +170,12 @@ _SHARED: dict[str, Callable[[Any], bool]] = {
     "style": lambda value: isinstance(value, dict) and all(isinstance(v, str) or _is_number(v) for v in value.values()),
     "controls": lambda value: isinstance(value, dict) and all(map(_is_number, value.values())),
 }
-_EVENT = {**_SHARED, "step": _is_count, "reset": lambda value: value is True}
+_EVENT = {
+    **_SHARED,
+    "step": _is_count,
+    "push": lambda value: isinstance(value, list) and len(value) == 2 and all(map(_is_number, value)),
+    "reset": lambda value: value is True,
+}
 _SCHEMA = {
     **_SHARED,
     **dict.fromkeys(("domain", "source"), lambda value: isinstance(value, str)),

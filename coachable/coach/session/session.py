@@ -148,6 +148,18 @@ class CoachSession:
         self._timeline.take_over()
         self._apply({"controls": fitted})
 
+    def push(self, forward: float = 0.0, left: float = 0.0) -> None:
+        """Push the agent before the next step; see `coachable.domain.Push`, whose largest strength limits the push.
+
+        Raises:
+            ValueError: If the domain has no push, or a strength is not finite.
+        """
+        if self.domain.push is None:
+            raise ValueError(f"{self.domain.name} has no push")
+        fitted = list(self.domain.push.fit(float(forward), float(left)))
+        self._timeline.take_over()
+        self._apply({"push": fitted})
+
     def say(self, phrase: str) -> Understanding:
         """Request a style in words: "shorter steps, arms up", "0.4 m", "a bit more", or a preset's name.
 
@@ -330,7 +342,7 @@ class CoachSession:
             ValueError: If the recording belongs to another domain, style space or set of controls; the session is
                 then unchanged.
         """
-        recording.check(self.domain.name, self.space, self._controls)
+        recording.check(self.domain.name, self.space, self._controls, self.domain.push)
         self._theta, self._outside = self.space.make(strict=True, **recording.style), {}
         self._control_values |= recording.controls
         self._episodes.endless = recording.endless
@@ -355,6 +367,9 @@ class CoachSession:
             self._control_values |= event["controls"]
             self._steer_env()
             self._timeline.note({"controls": dict(event["controls"])})
+        if "push" in event and self.domain.push is not None:
+            self.domain.push.apply(self.base_env, *event["push"])
+            self._timeline.note({"push": list(event["push"])})
         if "reset" in event:
             self._timeline.note({"reset": True})
             self._begin_episode()

@@ -16,6 +16,7 @@ from coachable.domains.combat.words import WORDS
 from coachable.envs.combat.constants import CONTROL_STEP, EPISODE_STEPS
 from coachable.envs.combat.env import CombatEnv
 from coachable.envs.combat.features import observation_groups
+from coachable.envs.combat.gamepad import ACTION_GROUPS
 
 
 def make_combat_env(
@@ -61,6 +62,7 @@ DOMAIN = Domain(
     columns={"won": ".0%", "damage": ".0f", "style_score": ".2f"},
     units={"damage": "HP"},
     observation_groups=observation_groups("full"),
+    action_groups=ACTION_GROUPS,
     words=WORDS,
     as_trained=_as_trained,
     evaluation=evaluate_fights,

@@ -7,10 +7,10 @@ from coachable.domains.humanoid.metrics import HumanoidMeasures
 from coachable.domains.humanoid.render import HumanoidRenderer
 from coachable.domains.humanoid.scene import HumanoidScene
 from coachable.domains.humanoid.styles import POSES, humanoid_style_reward, humanoid_style_space
-from coachable.domains.humanoid.words import COURSE, WORDS
+from coachable.domains.humanoid.words import COURSE, PUSH, WORDS
 from coachable.envs.humanoid.env import EPISODE_STEPS, HumanoidEnv
 from coachable.envs.humanoid.model import CONTROL_STEP
-from coachable.envs.humanoid.observation import OBSERVATION_GROUPS
+from coachable.envs.humanoid.observation import ACTION_GROUPS, OBSERVATION_GROUPS
 
 DOMAIN = Domain(
     name="humanoid",
@@ -51,6 +51,8 @@ DOMAIN = Domain(
         "drift": "m",
     },
     controls=(COURSE,),
+    push=PUSH,
     words=WORDS,
-    observation_groups=tuple((name, width) for name, width, _ in OBSERVATION_GROUPS),
+    observation_groups=OBSERVATION_GROUPS,
+    action_groups=ACTION_GROUPS,
 )

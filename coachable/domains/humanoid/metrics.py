@@ -30,7 +30,7 @@ POSE_TOLERANCE_DEG = 10.0
 LENGTH_TOLERANCE = 0.06  # [m], a step this close to the request complies
 SPEED_TOLERANCE = 0.15  # [m/s], a step whose speed is this close to the request complies
 _DRIFT_SECONDS = 15.0
-_FORWARD_SPEED = sum(width for _, width, _ in OBSERVATION_GROUPS[:4])  # first of `com_velocity`
+_FORWARD_SPEED = sum(group.width for group in OBSERVATION_GROUPS[:4])  # first of `com_velocity`
 
 
 class HumanoidMeasures:

@@ -56,7 +56,7 @@ def _map(parts: tuple[list[int], list[int]]) -> MirrorMap:
     return MirrorMap(tuple(parts[0]), tuple(float(sign) for sign in parts[1]))
 
 
-OBSERVATION = _map(_join(*(_GROUPS[name] for name, _, _ in OBSERVATION_GROUPS)))
+OBSERVATION = _map(_join(*(_GROUPS[group.name] for group in OBSERVATION_GROUPS)))
 # The motors' order: abdomen y, z, x; per leg hip x, z, y, knee, ankle x, y; per arm shoulder 1, 2, elbow.
 ACTION = _map(_join(_keep((1, -1, -1)), _swap((1, 1, 1, 1, -1, 1)), _swap(_ARM)))
 STYLE_FEATURES, STYLED_SPEED_FEATURES = (

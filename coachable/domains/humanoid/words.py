@@ -1,10 +1,12 @@
-"""Words of the coach's commands to the humanoid, and the control of its course."""
+"""Words of the coach's commands to the humanoid, the control of its course, and pushes."""
 
 import math
 
+import numpy as np
 from torchrl.envs import EnvBase
 
-from coachable.domain import Control, Words
+from coachable.domain import Control, Push, Words
+from coachable.envs.humanoid.env import HumanoidEnv
 from coachable.styles import Setpoint
 
 
@@ -12,9 +14,18 @@ def _steer(env: EnvBase, course_deg: float) -> None:
     env.steer(math.radians(course_deg))  # pyright: ignore[reportCallIssue]
 
 
+def _push(env: EnvBase, forward: float, left: float) -> None:
+    assert isinstance(env, HumanoidEnv)
+    cosine, sine = np.cos(env.course), np.sin(env.course)
+    force = [cosine * forward - sine * left, sine * forward + cosine * left, np.zeros(env.num_envs)]
+    env.push_torso(np.stack(force, axis=1))
+
+
 COURSE = Control(
     Setpoint("course", -180.0, 180.0, unit="deg", help="direction of walking, left is positive"), _steer, circular=True
 )
+
+PUSH = Push(_push, largest=200.0, unit="N")
 
 _VOCABULARY = {
     "": ("walk", "walks", "walking"),

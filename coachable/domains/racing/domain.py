@@ -16,7 +16,7 @@ from coachable.domains.racing.words import WORDS
 from coachable.envs.racing.circuit.track import Track
 from coachable.envs.racing.env import EPISODE_STEPS
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
-from coachable.envs.racing.race.observation import COURSE_POINTS, observation_groups
+from coachable.envs.racing.race.observation import ACTION_GROUPS, COURSE_POINTS, observation_groups
 from coachable.envs.racing.race.scenarios import rolling_start
 
 # Options of a training's environment that do not apply when an agent is shown or measured.
@@ -79,6 +79,7 @@ def racing_domain(
         columns={"survived": ".0%", "pace": ".1f", "off": ".1%", "steering_change": ".2f"} | dict(columns),
         units=units,
         observation_groups=observation_groups(cars > 1, pool=False),
+        action_groups=ACTION_GROUPS,
         words=WORDS[family],
         as_trained=as_trained,
         evaluation=evaluation,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -25,6 +27,7 @@ from coachable.envs.combat.state import (
 from coachable.envs.combat.tables import ATTACK_SLOTS, ELEMENTS, PART_SLOTS, SITES, TRAPS, WEAPONS
 from coachable.envs.combat.traits import AMMO_SLOTS, HIDDEN, INTERVAL, MACHINE_NAMES, MAGAZINE, Traits
 from coachable.envs.combat.traits import RELOAD as RELOAD_FRAMES
+from coachable.signals import Signal
 
 SMALL_PARTS = 4
 _GAME_TIMERS = slice(0, 11)
@@ -33,40 +36,57 @@ _HP_MAX = 8500.0  # [HP], the strongest machine of the paper
 _LONGEST_STATE = 14.0 * c.FPS  # [frames]
 _ENCODED = 6
 
-# Name and width; names are the paper's rows of its importance tables.
-_PLAYER = [
-    ("Player health", 1),
-    ("Quick-tool: health bucket", 2),
-    ("Weapon technique stamina", 1),
-    ("Active weapon technique", 1),
-    ("Player stamina", 1),
-    ("Player pose", 7),
-    ("Player game state", 12),
-    ("Active weapon + ammo", 21),
-    ("Weapon wheel open", 2),
-]
-_TRAPS = [("Traps: pose + inventory", c.TRAP_SLOTS * (_ENCODED + 5) + 8)]
-_PLACES = [("Anchor pose", 7), ("Ejectors: pose + duration", c.HAZARD_SLOTS * 8)]
-_TYPE = ("Enemy type", len(MACHINE_NAMES))
+_PLACE = ("forward", "left", "up", "sine", "slow_sine", "slowest_sine")  # entries of `encode_position`
+_AT = f"{c.FPS * 2:g} frames"
+_SPEED = f"{1 / _SPEED_SCALE:g} m/s"
+
+# Names are the paper's rows of its importance tables.
+_PLAYER = (
+    Signal("Player health", 1, "full health"),
+    Signal("Quick-tool: health bucket", 2, "full", ("berries", "missing_health")),
+    Signal("Weapon technique stamina", 1, "full stamina"),
+    Signal("Active weapon technique", 1),
+    Signal("Player stamina", 1, "full stamina"),
+    Signal(
+        "Player pose",
+        7,
+        (_SPEED, _SPEED, "", "", _AT, _AT, _AT),
+        ("forward_speed", "left_speed", "pitch_sine", "pitch_cosine", "in_air", "dodging", "staggered"),
+    ),
+    Signal("Player game state", 12),
+    Signal("Active weapon + ammo", 21),
+    Signal("Weapon wheel open", 2, "", ("wheel", "quick")),
+)
+_TRAPS = Signal("Traps: pose + inventory", c.TRAP_SLOTS * (_ENCODED + 5) + 8)
+_PLACES = (
+    Signal("Anchor pose", 7, (*[""] * 6, f"{c.BOUND_RADIUS:g} m"), (*_PLACE, "distance")),
+    Signal("Ejectors: pose + duration", c.HAZARD_SLOTS * 8),
+)
 
 
-def _enemy(small: bool) -> list[tuple[str, int]]:
+def _enemy(small: bool) -> list[Signal]:
     parts = SMALL_PARTS if small else PART_SLOTS
+    pose = ("bearing", "pitch_error", "heading_forward", "heading_left", "forward_speed", "left_speed", "radius")
     return [
-        ("Enemy pose", 13),
-        ("Enemy health", 2),
-        *([] if small else [_TYPE]),
-        ("Enemy resistances", len(ELEMENTS)),
-        ("Enemy elemental status", 2 * len(ELEMENTS)),
-        ("Enemy attack state", NUM_PHASES + 1 + ATTACK_SLOTS + 2),
-        ("Enemy game state", 3),
-        ("Enemy parts pose", parts * _ENCODED),
-        ("Enemy parts health", parts * 5),
+        Signal("Enemy pose", 13, (*[""] * 6, "pi", "pi", "", "", _SPEED, _SPEED, "2.6 m"), (*_PLACE, *pose)),
+        Signal("Enemy health", 2, ("full health", f"{_HP_MAX:g} HP, square root"), ("share", "health")),
+        *([] if small else [Signal("Enemy type", len(MACHINE_NAMES), "", tuple(MACHINE_NAMES))]),
+        Signal("Enemy resistances", len(ELEMENTS), "factor 2", ELEMENTS),
+        Signal(
+            "Enemy elemental status",
+            2 * len(ELEMENTS),
+            (*["full gauge"] * len(ELEMENTS), *[f"{_LONGEST_STATE:g} frames"] * len(ELEMENTS)),
+            (*(f"{e}_gauge" for e in ELEMENTS), *(f"{e}_left" for e in ELEMENTS)),
+        ),
+        Signal("Enemy attack state", NUM_PHASES + 1 + ATTACK_SLOTS + 2),
+        Signal("Enemy game state", 3, "", ("staggered", "weak", "living")),
+        Signal("Enemy parts pose", parts * _ENCODED),
+        Signal("Enemy parts health", parts * 5),
     ]
 
 
-def observation_groups(observation: str) -> list[tuple[str, int]]:
-    """Return name and width of every group of the observation, in order.
+def observation_groups(observation: str) -> tuple[Signal, ...]:
+    """Return the blocks of the observation, in order.
 
     Enemies are sorted by distance; the names of the second one's groups end in "2".
 
@@ -77,24 +97,17 @@ def observation_groups(observation: str) -> list[tuple[str, int]]:
         ValueError: If it is neither.
     """
     if observation == "small":
-        return [*_PLAYER, *_PLACES, *_enemy(True), ("Action history", 24)]
+        return (*_PLAYER, *_PLACES, *_enemy(True), Signal("Action history", 24))
     if observation != "full":
         raise ValueError(f"observation is {observation!r}: expected 'full' or 'small'")
-    second = [(f"{name} 2", width) for name, width in _enemy(False)]
-    return [
-        *_PLAYER,
-        *_TRAPS,
-        *_PLACES,
-        *_enemy(False),
-        *second,
-        ("Action history", 72),
-        ("Feature history", 24),
-    ]
+    second = [replace(group, name=f"{group.name} 2") for group in _enemy(False)]
+    histories = Signal("Action history", 72), Signal("Feature history", 24)
+    return (*_PLAYER, _TRAPS, *_PLACES, *_enemy(False), *second, *histories)
 
 
 def observation_size(observation: str) -> int:
     """Return the width of the observation."""
-    return sum(width for _, width in observation_groups(observation))
+    return sum(group.width for group in observation_groups(observation))
 
 
 def encode_position(offset: Tensor) -> Tensor:

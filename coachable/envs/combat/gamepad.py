@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from coachable.distributions.action_heads import ActionHeads
+from coachable.signals import Signal
 
 FACE = ("none", "cross", "circle", "square")
 DPAD = ("none", "up", "down", "left", "right", "L3")
@@ -36,6 +37,12 @@ AXES = ("left_x", "left_y", "right_x", "right_y")
 
 GAMEPAD = ActionHeads(categorical=tuple(len(values) for values in HEADS.values()), axes=len(AXES))
 """Components of the action tensor, for policies and specs."""
+
+ACTION_GROUPS = (
+    *(Signal(head, len(values), "", values) for head, values in HEADS.items()),
+    Signal("sticks", len(AXES), "full deflection", AXES),
+)
+"""Blocks of the action tensor, in order."""
 
 NUM_COMBINATIONS = 315
 """Legal combinations of the buttons and thumb positions (paper)."""

@@ -23,6 +23,25 @@ NUM_ACTIONS = 21
 NUM_POSITIONS = 28  # free joint 7 + 21 hinges
 NUM_VELOCITIES = 27
 
+# In the order of the state and of the actions, which differ.
+JOINTS = (
+    "abdomen_z",
+    "abdomen_y",
+    "abdomen_x",
+    *(f"right_{joint}" for joint in ("hip_x", "hip_z", "hip_y", "knee", "ankle_y", "ankle_x")),
+    *(f"left_{joint}" for joint in ("hip_x", "hip_z", "hip_y", "knee", "ankle_y", "ankle_x")),
+    *(f"right_{joint}" for joint in ("shoulder1", "shoulder2", "elbow")),
+    *(f"left_{joint}" for joint in ("shoulder1", "shoulder2", "elbow")),
+)
+_LEG_MOTORS = {"hip_x": 40, "hip_z": 40, "hip_y": 120, "knee": 80, "ankle_x": 20, "ankle_y": 20}
+_ARM_MOTORS = {"shoulder1": 20, "shoulder2": 20, "elbow": 40}
+MOTORS = {
+    **{"abdomen_y": 40, "abdomen_z": 40, "abdomen_x": 40},
+    **{f"{side}_{joint}": torque for side in ("right", "left") for joint, torque in _LEG_MOTORS.items()},
+    **{f"{side}_{joint}": torque for side in ("right", "left") for joint, torque in _ARM_MOTORS.items()},
+}
+"""Torque of each motor at full command [N m]."""
+
 ARM_JOINTS = (
     "right_shoulder1",
     "right_shoulder2",

@@ -4,25 +4,40 @@ from __future__ import annotations
 
 import numpy as np
 
+from coachable.envs.humanoid.model import EXTREMITIES, JOINTS, MOTORS
 from coachable.envs.humanoid.simulation import Kinematics
+from coachable.signals import Signal
 
-# Name, width and scale of each group, in order. Scales bring joint velocities (tens of rad/s) to the size of the rest.
-OBSERVATION_GROUPS: tuple[tuple[str, int, float], ...] = (
-    ("joint_angles", 21, 1.0),
-    ("head_height", 1, 1.0),
-    ("extremities", 12, 1.0),
-    ("torso_vertical", 3, 1.0),
-    ("com_velocity", 3, 1.0),
-    ("velocity", 27, 0.1),
-    ("pelvis_orientation", 4, 1.0),
-    ("expected_foot", 2, 1.0),
-    ("knee_range", 4, 1.0),
-    ("step_start", 2, 1.0),
-    ("stride_start", 2, 1.0),
-    ("step_timer", 1, 1.0),
+VELOCITY_SCALE = 0.1  # brings joint velocities (tens of rad/s) to the size of the rest
+_METRES, _TURNS = f"{1 / VELOCITY_SCALE:g} m/s", f"{1 / VELOCITY_SCALE:g} rad/s"
+_AXES = ("forward", "left", "up")  # of the course, or of the torso's own frame
+OBSERVATION_GROUPS = (
+    Signal("joint_angles", 21, "rad", JOINTS),
+    Signal("head_height", 1, "m"),
+    Signal("extremities", 12, "m", tuple(f"{body}_{axis}" for body in EXTREMITIES for axis in _AXES)),
+    Signal("torso_vertical", 3, "", ("of_forward_axis", "of_left_axis", "of_up_axis")),
+    Signal("com_velocity", 3, "m/s", _AXES),
+    Signal(
+        "velocity",
+        27,
+        (*[_METRES] * 3, *[_TURNS] * 24),
+        (*(f"root_{axis}" for axis in _AXES), *(f"root_turn_{axis}" for axis in "xyz"), *JOINTS),
+    ),
+    Signal("pelvis_orientation", 4, "", ("w", "x", "y", "z")),
+    Signal("expected_foot", 2, "", ("right", "left")),
+    Signal("knee_range", 4, "rad", ("smallest_right", "smallest_left", "largest_right", "largest_left")),
+    Signal("step_start", 2, "m", ("forward", "left")),
+    Signal("stride_start", 2, "m", ("forward", "left")),
+    Signal("step_timer", 1, "longest step"),
 )
-OBSERVATION_SIZE = sum(width for _, width, _ in OBSERVATION_GROUPS)
-OBSERVATION_SCALE = np.concatenate([np.full(width, scale) for _, width, scale in OBSERVATION_GROUPS])
+"""Blocks of the observation, in order; vectors are relative to the course."""
+
+ACTION_GROUPS = (Signal("motors", len(MOTORS), tuple(f"{torque} N m" for torque in MOTORS.values()), tuple(MOTORS)),)
+
+OBSERVATION_SIZE = sum(group.width for group in OBSERVATION_GROUPS)
+OBSERVATION_SCALE = np.concatenate(
+    [np.full(group.width, VELOCITY_SCALE if group.name == "velocity" else 1.0) for group in OBSERVATION_GROUPS]
+)
 
 
 def rotate_to_course(vectors: np.ndarray, course: np.ndarray) -> np.ndarray:

@@ -174,7 +174,7 @@ class RacingEnv(EnvBase):
         self.episode = torch.zeros(self.races, dtype=torch.int64, device=place)
         self.seeds = torch.zeros(self.races, dtype=torch.int64, device=place)
         self.observation_size = sum(
-            width for _, width in observation_groups(opponents, self.garage.pooled, course_points, curvature)
+            group.width for group in observation_groups(opponents, self.garage.pooled, course_points, curvature)
         )
         self._observation = torch.zeros(rows, self.observation_size, device=place)
         self._set_seed(seed)

@@ -12,7 +12,7 @@ from coachable.coach.phrases.fitting import fitting
 from coachable.coach.session.live_episodes import TIME_IS_UP
 from coachable.coach.session.recording import Recording, ReplayMismatch
 from coachable.coach.session.session import CoachSession
-from coachable.domain import load_domain
+from coachable.domain import Push, load_domain
 from coachable.domains.humanoid import humanoid_style_space
 from coachable.keys import STYLE
 from coachable.styles import Choice, StyleRangeWarning, StyleReward, StyleSpace, Term, Weight
@@ -334,6 +334,39 @@ def test_bad_recordings(session):
     for text in ("", "[1]", "{}", "nonsense", "[" * 100_000):
         with pytest.raises(ValueError, match="no recording"):
             Recording.from_json(text)
+
+
+def test_pushes_are_limited_recorded_and_replayed(session):
+    def shove(env, forward, left):
+        env.position += forward
+
+    domain = replace(ECHO, push=Push(shove, largest=0.5, unit="m"))
+    pushed = CoachSession(session.policy, session.space, domain, seed=3)
+    before = pushed.base_env.position.item()
+    pushed.push(3.0, left=4.0)
+    assert pushed.base_env.position.item() == pytest.approx(before + 0.3), "0.5 m in its direction"
+    states = []
+    for _ in range(5):
+        pushed.step()
+        states.append(pushed.base_env.position.clone())
+    recording = Recording.from_json(pushed.recording().to_json())
+    assert recording.events == [{"step": 0, "push": [pytest.approx(0.3), pytest.approx(0.4)]}]
+    pushed.replay(recording)
+    pushed.step()
+    with pytest.raises(ValueError, match=r"a push of nan forward and 0\.0 left: expected numbers in m"):
+        pushed.push(math.nan)
+    assert pushed.replaying and pushed.base_env.position.equal(states[0])
+    for state in states[1:]:
+        pushed.step()
+        assert pushed.base_env.position.equal(state)
+    with pytest.raises(ValueError, match="echo has no push"):
+        session.push(1.0)
+    with pytest.raises(ValueError, match="the recording has a push: echo has none"):
+        session.replay(recording)
+    recording.events[0]["push"] = [1.0, 0.0]
+    with pytest.raises(ValueError, match=r"a push of \[1.0, 0.0\]: expected at most 0.5 m"):
+        pushed.replay(recording)
+    pushed.close()
 
 
 def test_seeding_starts_over(session):

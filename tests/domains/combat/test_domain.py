@@ -37,7 +37,7 @@ def test_measures_add_up(rollout):
 
 
 def test_groups_cover_the_observation(rollout):
-    assert sum(width for _, width in DOMAIN.observation_groups) == rollout["observation"].shape[-1]
+    assert sum(group.width for group in DOMAIN.observation_groups) == rollout["observation"].shape[-1]
 
 
 @pytest.mark.parametrize("options", [{}, {"num_enemies": 2, "machines": ["Sunwing"], "sites": ["Shining-wastes"]}])
@@ -60,7 +60,7 @@ def test_the_domain_is_as_it_was_trained():
     assert [style_label(cell) for cell in domain.cells()] == ["default", "melee", "skykiller", "no skykiller"]
     env = domain.make_env(num_envs=3, seed=0)
     assert (env.observation, env.episode_steps, env.batch_size) == ("small", 20, (3,))
-    assert sum(width for _, width in domain.observation_groups) == env.reset()["observation"].shape[-1]
+    assert sum(group.width for group in domain.observation_groups) == env.reset()["observation"].shape[-1]
 
 
 class _Idle:

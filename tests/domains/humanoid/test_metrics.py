@@ -33,12 +33,12 @@ def transition(pose="t_pose", asked=0.5, angles=None, struck=True, length=0.5, s
     centre = torch.from_numpy(pose_bounds_deg()[POSES.index(pose)].mean(1)).float()
     features[0, :6] = torch.deg2rad(centre if angles is None else angles)
     features[0, COMPLETED], features[0, LENGTH] = float(struck), length
-    observation = torch.zeros(1, sum(width for _, width, _ in OBSERVATION_GROUPS))
+    observation = torch.zeros(1, sum(group.width for group in OBSERVATION_GROUPS))
     first = 0
-    for name, width, _ in OBSERVATION_GROUPS:
-        if name == "com_velocity":
+    for group in OBSERVATION_GROUPS:
+        if group.name == "com_velocity":
             observation[0, first], observation[0, first + 1] = speed, 0.1
-        first += width
+        first += group.width
     measured = torch.zeros(1, WALK_SIZE)
     for column, value in (walk or {}).items():
         measured[0, column] = value

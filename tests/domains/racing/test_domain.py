@@ -26,7 +26,7 @@ def test_a_domain_makes_measures_and_draws(family):
     assert all(set(cell) == set(space.names) for cell in domain.cells())
     env = coachable_env(domain.make_env(num_envs=4, seed=0), space, domain.make_reward(space), seed=0)
     data = env.rollout(3, break_when_any_done=False)
-    assert sum(width for _, width in domain.observation_groups) == data["observation"].shape[-1]
+    assert sum(group.width for group in domain.observation_groups) == data["observation"].shape[-1]
     records = [domain.measures.step(data[:, t]) for t in range(3)]
     record = {name: torch.stack([r[name] for r in records]) for name in records[0]}
     steered = data["action"][..., 0].T
@@ -53,7 +53,7 @@ def test_who_learnt_among_others_is_measured_alone_and_coached_among_others():
     domain = load_domain("racing_resources", {"env": {"track": "ring", "cars": 3}})
     alone, before = domain.make_env(num_envs=4, seed=0), load_domain("racing_resources", {"env": {"track": "ring"}})
     seen = alone.reset()["observation"]
-    assert alone.cars == 1 and seen.shape[-1] == sum(width for _, width in domain.observation_groups)
+    assert alone.cars == 1 and seen.shape[-1] == sum(group.width for group in domain.observation_groups)
     assert torch.equal(seen[:, :-33], before.make_env(num_envs=4, seed=0).reset()["observation"])
     assert not seen[:, -33:].any()
     coached = domain.make_env(num_envs=1, seed=0, **domain.coached)
@@ -68,7 +68,7 @@ def test_drivers_of_many_circuits_are_shown_on_their_familys_or_on_the_users(tmp
     domain = load_domain("racing_resources", settings)
     env = domain.make_env(num_envs=2, seed=0)
     assert [track.name for track in env.tracks] == ["lakeside"]
-    assert sum(width for _, width in domain.observation_groups) == env.observation_size
+    assert sum(group.width for group in domain.observation_groups) == env.observation_size
     assert training_tracks("resources", settings["env"]) == SETS["training"]
     points = [(150 * math.cos(a / 20), 150 * math.sin(a / 20), 6, 6) for a in range(126)]
     (tmp_path / "own.csv").write_text("\n".join(",".join(map(str, point)) for point in points))
@@ -104,7 +104,7 @@ def test_a_domain_is_as_its_training_made_it():
     domain = load_domain("racing_resources", {"env": {**settings, "episode_steps": 20, "course_points": 5}})
     env = domain.make_env(num_envs=2, seed=0)
     assert (env.tracks[0].name, env.num_envs, domain.episode_steps) == ("ring", 2, 20)
-    assert sum(width for _, width in domain.observation_groups) == env.observation_size
+    assert sum(group.width for group in domain.observation_groups) == env.observation_size
 
 
 @pytest.mark.parametrize(

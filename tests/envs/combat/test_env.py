@@ -50,7 +50,7 @@ def test_specs_hold(options):
 
 def test_observation_sizes_are_the_designs():
     assert (observation_size("full"), observation_size("small")) == (629, 190)
-    widths = dict(observation_groups("full"))
+    widths = {group.name: group.width for group in observation_groups("full")}
     assert widths["Active weapon + ammo"] == 21
     assert widths["Traps: pose + inventory"] == 52
     assert widths["Enemy parts pose"] + widths["Enemy parts health"] == 132

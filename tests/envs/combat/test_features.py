@@ -31,7 +31,7 @@ def seen(env, observation="full"):
     """Numbers by name of their group."""
     s = env.state
     ammo = env._ammo[s.weapon * AMMO_SLOTS + s.section].T
-    groups = dict(observation_groups(observation))
+    groups = {group.name: group.width for group in observation_groups(observation)}
     row = observe(s, env.traits, ammo, observation, 4500)[0].split(list(groups.values()))
     return {name: values.tolist() for name, values in zip(groups, row, strict=True)}
 
@@ -139,7 +139,8 @@ def test_the_nearer_enemy_comes_first_and_the_dead_one_last():
     env = fight(("Ravager", "Sunwing"))
     stand(env, 0, 0.0, 9.0)
     stand(env, 1, 6.0, 0.0, up=6.0)
-    names = [name for name, _ in observation_groups("full") if f"{name} 2" in dict(observation_groups("full"))]
+    everything = [group.name for group in observation_groups("full")]
+    names = [name for name in everything if f"{name} 2" in everything]
     found = seen(env)
     types = found["Enemy type"].index(1.0), found["Enemy type 2"].index(1.0)
     assert types == (MACHINE_NAMES.index("Sunwing"), MACHINE_NAMES.index("Ravager"))

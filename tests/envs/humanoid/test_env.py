@@ -9,6 +9,7 @@ from torchrl.envs.utils import check_env_specs
 from coachable.domains.humanoid import gait_style_space, humanoid_style_reward, humanoid_style_space
 from coachable.envs.humanoid import HumanoidEnv
 from coachable.envs.humanoid.features import BEARING, SPEED
+from coachable.envs.humanoid.model import JOINTS, MOTORS, build_model
 from coachable.envs.humanoid.observation import OBSERVATION_GROUPS, suite_observation
 from coachable.transforms import TaskImpersonation, coachable_env
 
@@ -257,7 +258,14 @@ def test_only_speeds_of_joints_are_scaled():
     np.testing.assert_allclose(seen[:, 40:67], 0.1 * simulation.velocities, atol=1e-6)
     np.testing.assert_allclose(seen[:, 67:71], kinematics.pelvis_quaternion, atol=1e-6)
     np.testing.assert_allclose(seen[:, 71:], env.gait.observe(), atol=1e-6)
-    assert sum(width for _, width, _ in OBSERVATION_GROUPS) == 82
+    assert sum(group.width for group in OBSERVATION_GROUPS) == 82
+
+
+def test_joints_and_motors_have_the_names_of_the_model():
+    model = build_model().dynamics
+    assert [model.joint(i).name for i in range(1, model.njnt)] == list(JOINTS)
+    motors = {model.actuator(i).name: gear for i, gear in enumerate(model.actuator_gear[:, 0])}
+    assert list(motors.items()) == list(MOTORS.items())
 
 
 def test_threads_share_the_physics_and_change_no_number():

@@ -47,7 +47,7 @@ def test_specs_hold(options):
     env = RacingEnv(num_envs=2 * options.get("cars", 1), seed=0, track="ring", **options)
     check_env_specs(env, seed=0)
     groups = observation_groups(env.cars > 1, env.garage.pooled)
-    assert env.observation_size == sum(width for _, width in groups)
+    assert env.observation_size == sum(group.width for group in groups)
 
 
 def test_the_same_seed_gives_the_same_races_and_another_does_not():

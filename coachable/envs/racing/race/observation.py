@@ -14,21 +14,82 @@ from coachable.envs.racing.physics.dynamics import WheelSet
 from coachable.envs.racing.physics.powertrain import engine_speed, full_torque, gear_ratio
 from coachable.envs.racing.physics.state import HEATS, SPINS, WEARS, CarState
 from coachable.envs.racing.race.run import Others, Run, TyreView
+from coachable.signals import Signal
 
 COURSE_POINTS = 20
 COURSE_TIME = 6.0  # [s] of travel that the course points cover
 _COURSE_SPEED_MIN = 10.0  # [m/s], so that the course points of a slow car are not all beside it
 CURVATURE_SCALE = 30.0  # [m], radius of a tight corner
 OPPONENTS = 4
-_OPPONENT_GROUPS = (("opponents", 8 * OPPONENTS), ("slipstream", 1))
-OPPONENT_COLUMNS = sum(width for _, width in _OPPONENT_GROUPS)
 _SEEN = 150.0  # [m]
+_OF_OPPONENT = {
+    "forward": "asinh(m / 2) / 4",
+    "left": "asinh(m / 2) / 4",
+    "forward_speed": "20 m/s",
+    "left_speed": "20 m/s",
+    "heading_sine": "",
+    "heading_cosine": "",
+    "gap": "100 m",
+    "is_seen": "",
+}
+_OPPONENT_GROUPS = (
+    Signal(
+        "opponents",
+        8 * OPPONENTS,
+        tuple(_OF_OPPONENT.values()) * OPPONENTS,
+        tuple(f"{name}_{k + 1}" for k in range(OPPONENTS) for name in _OF_OPPONENT),
+    ),
+    Signal("slipstream", 1),
+)
+OPPONENT_COLUMNS = sum(group.width for group in _OPPONENT_GROUPS)
+
+_WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
+_OWN_GROUPS = (
+    Signal(
+        "motion",
+        5,
+        ("50 m/s", "20 m/s", "2 rad/s", "20 m/s^2", "20 m/s^2"),
+        ("forward_speed", "left_speed", "yaw_rate", "forward_acceleration", "left_acceleration"),
+    ),
+    Signal("tyre_load", 4, "5 kN", _WHEELS),
+    Signal("slip_ratio", 4, "1/3", _WHEELS),
+    Signal("slip_angle", 4, "1/3, as a tangent", _WHEELS),
+    Signal(
+        "place",
+        5,
+        ("", "", "half width of the track", "", ""),
+        ("lap_sine", "lap_cosine", "left_of_middle", "heading_sine", "heading_cosine"),
+    ),
+    Signal("flags", 3, "", ("off_track", "at_wall", "in_contact")),
+    Signal(
+        "controls",
+        7,
+        ("full lock", *[""] * 6),
+        ("wheel_angle", "throttle", "brake", "steering", "pedals", "steering_before", "pedals_before"),
+    ),
+    Signal("powertrain", 3, ("highest engine speed", "8 gears", "full torque"), ("engine_speed", "gear", "torque")),
+    Signal("tyre_heat", 4, "60 degC above 90 degC", _WHEELS),
+    Signal("tyre_wear", 4, "", _WHEELS),
+    Signal("tyre_grip", 4, "1.5", _WHEELS),
+    Signal("fuel", 1, "100 l"),
+    Signal("compound", len(COMPOUNDS), "", COMPOUNDS),
+)
+_CAR = Signal(
+    "car",
+    8,
+    ("1500 kg", "500 kW", "600 N m", "", "1.5", "3 m^2", "m^2", ""),
+    ("mass", "power", "torque", "front_axle_share", "grip", "lift_area", "drag_area", "front_drive_share"),
+)
+
+ACTION_GROUPS = (
+    Signal("controls", 2, ("full lock to the left", "full throttle, or brake if negative"), ("steering", "pedals")),
+)
 
 
 def observation_groups(
     opponents: bool, pool: bool, course_points: int = COURSE_POINTS, curvature: bool = False
-) -> tuple[tuple[str, int], ...]:
-    """Return name and width of each block of the observation, in order; those of opponents come last.
+) -> tuple[Signal, ...]:
+    """Return the blocks of the observation, in order; those of opponents come last.
 
     Args:
         opponents: Whether drivers see opponents.
@@ -36,29 +97,13 @@ def observation_groups(
         course_points: Number of points of each edge of the track.
         curvature: Whether drivers see the curvature of the track ahead, and not where on the lap they are.
     """
-    groups = [
-        ("motion", 5),
-        ("tyre_load", 4),
-        ("slip_ratio", 4),
-        ("slip_angle", 4),
-        ("place", 5),
-        ("flags", 3),
-        ("controls", 7),
-        ("powertrain", 3),
-        ("tyre_heat", 4),
-        ("tyre_wear", 4),
-        ("tyre_grip", 4),
-        ("fuel", 1),
-        ("compound", len(COMPOUNDS)),
-    ]
-    if pool:
-        groups.append(("car", 8))
-    groups.append(("course", 4 * course_points))
+    edges = [f"{edge}_{axis}" for edge in ("left_edge", "right_edge") for axis in ("forward", "left")]
+    points = tuple(f"{edge}_{point + 1}" for edge in edges for point in range(course_points))
+    groups = [*_OWN_GROUPS, *([_CAR] if pool else []), Signal("course", 4 * course_points, "100 m", points)]
     if curvature:
-        groups.append(("curvature", course_points))
-    if opponents:
-        groups += _OPPONENT_GROUPS
-    return tuple(groups)
+        bends = tuple(f"middle_{point + 1}" for point in range(course_points))
+        groups.append(Signal("curvature", course_points, "1/30 m", bends))
+    return (*groups, *(_OPPONENT_GROUPS if opponents else ()))
 
 
 def own_columns(name: str) -> slice:
@@ -71,10 +116,10 @@ def own_columns(name: str) -> slice:
         KeyError: If there is no such block.
     """
     first = 0
-    for block, width in observation_groups(False, pool=False):
-        if block == name:
-            return slice(first, first + width)
-        first += width
+    for block in observation_groups(False, pool=False):
+        if block.name == name:
+            return slice(first, first + block.width)
+        first += block.width
     raise KeyError(f"no block {name!r} in the observation")
 
 

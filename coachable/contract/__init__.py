@@ -1,0 +1,1 @@
+"""Contract of an exported model, and running such a model without trusting it."""
