@@ -107,7 +107,7 @@ def make_training(name: str, workers: int, out: Path) -> Trainer:
     if group != "direct":
         arguments.append(f"collector.num_collectors={workers}")
     if group == "ray":
-        arguments.append(f"collector.cpus_per_worker={min(1.0, (os.cpu_count() or 1) / workers)}")
+        arguments.append(f"collector.cpus_per_worker={_cores(workers)}")
     arguments += ["threads.simulator=1", "threads.learner=1", f"run_dir={out / f'{name}_{workers}_{time.time():.0f}'}"]
     from humanoid_sac import build
 
@@ -123,9 +123,11 @@ def _torchrl_ray(train: Trainer, workers: int) -> Any:
     """Makes TorchRL's own collector on Ray, each of whose batches is 64 transitions of one worker."""
     from torchrl.collectors import Collector
 
+    from coachable.cluster.connection import Connection
+
+    Connection(None, workers, _cores(workers), patience=300.0)  # ends with this process or the collector
     actor = train.learner.loss_module.actor_network
     factories = [HumanoidFactory(seed) for seed in range(workers)]
-    ray_options = {"include_dashboard": False, "log_to_driver": False, "logging_level": "error", "num_cpus": workers}
     collector: Any = Collector(
         factories,
         actor,
@@ -135,7 +137,7 @@ def _torchrl_ray(train: Trainer, workers: int) -> Any:
         frames_per_batch=64,
         total_frames=sys.maxsize,
         collector_kwargs=[{"auto_register_policy_transforms": False} for _ in factories],
-        ray_init_config=ray_options,
+        remote_configs={"num_cpus": _cores(workers), "num_gpus": 0, "memory": 2**20},
     )
     collector.update_policy_weights_(actor)
     return collector
@@ -156,6 +158,10 @@ class HumanoidFactory:
         space = humanoid_style_space()
         env = HumanoidEnv(num_envs=8, seed=self.seed, num_threads=1)
         return coachable_env(env, space, humanoid_style_reward(space), EpisodeSums(), seed=self.seed)
+
+
+def _cores(workers: int) -> float:
+    return min(1.0, (os.cpu_count() or 1) / workers)
 
 
 def _step(train: Trainer, batches: Any) -> None:

@@ -122,7 +122,8 @@ class ClusterCollector(AsyncCollector):
         Raises:
             ClusterError: If no worker could be had for `patience` seconds.
         """
-        self.after_update(self._updates)
+        if self._offered < 0:
+            self.after_update(self._updates)
         self.workers.start()
         while True:
             yield self._take()
@@ -155,14 +156,12 @@ class ClusterCollector(AsyncCollector):
         }
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the numbers of env-steps and updates, and how often each worker was started."""
-        starts = [slot.starts for slot in self.workers.slots]
-        return {"frames": self._frames, "updates": self._updates, "starts": starts}
+        """Return the number of env-steps and how often each worker was started."""
+        return {"frames": self._frames, "starts": [slot.starts for slot in self.workers.slots]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned; workers draw other random numbers than before the interruption."""
         self._frames = self._asked = int(state.get("frames", 0))
-        self._updates = int(state.get("updates", 0))
         for slot, starts in zip(self.workers.slots, state.get("starts", []), strict=False):
             slot.starts = int(starts)
 

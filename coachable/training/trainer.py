@@ -136,6 +136,8 @@ class Trainer:
         if self.frames == 0:
             self.log.rewind(0)  # drops rows of a training that was killed before its first checkpoint
         self.progress.start(self.frames, self.learner.updates)
+        if isinstance(self.collector, AsyncCollector):
+            self.collector.after_update(self.learner.updates)  # of a checkpoint, if this training is resumed
         batches = iter(self.collector)
         try:
             self.learner.check_weights()
