@@ -60,7 +60,7 @@ class FightLog:
         self.request, self.damage, self.in_frost = record["request"], record["damage"], record["in_frost"]
         self.brittle, self.chilled, self.counted = record["brittle"], record["chilled"], record["counted"]
         self.player, self.machine, self.alive = record["player"], record["machine"], record["alive"]
-        self.won: np.ndarray = (record["won"] & record["alive"]).any(0)
+        self.won = np.asarray((record["won"] & record["alive"]).any(0))
 
     def timeline(self, fight: int) -> list[dict[str, Any]]:
         """Return one fight with a row per step, for `draw_timeline`."""
