@@ -230,9 +230,9 @@ def _actions(contract: Contract, recorded: Recorded, probe: np.ndarray) -> Itera
         alike = [column for column, factor in entries if abs(factor - middle) <= 0.1 * abs(middle)]
         width = blocks[entries[0][0]].width
         if len(alike) > 1 and 2 * len(alike) > len(entries) and 3 * len(alike) > width:
-            text = f"{block} has about {middle:.2g} times the effect, seen in {len(alike)} of {width} entries"
+            text = f"{block}: about {middle:.2g} times the effect, seen in {len(alike)} of {width} entries"
         else:
-            text = _listed([f"{names[column]} has about {factor:.2g} times the effect" for column, factor in entries])
+            text = _listed([f"{names[column]}: about {factor:.2g} times the effect" for column, factor in entries])
         yield Diagnosis("scale of the action", text)
 
 

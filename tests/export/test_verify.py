@@ -108,8 +108,8 @@ PENDULUM_MISTAKES = {
         ACTION_ORDER,
         "motors: right acts as 2 times motors: left",
     ),
-    "motors are weak": ({"force": lambda a: 0.5 * a}, ACTION_SCALE, "motors has about 0.5 times the effect"),
-    "a motor is reversed": ({"force": lambda a: a * [1, -1]}, ACTION_SCALE, "motors: right has about -1 times"),
+    "motors are weak": ({"force": lambda a: 0.5 * a}, ACTION_SCALE, "motors: about 0.5 times the effect"),
+    "a motor is reversed": ({"force": lambda a: a * [1, -1]}, ACTION_SCALE, "motors: right: about -1 times"),
 }
 
 
@@ -191,7 +191,7 @@ class Frames(HumanoidEnv):
     [
         (Joints, ORDER, "joint_angles: right_hip_x holds joint_angles: left_hip_x"),
         (Velocities, SCALE, "all of velocity: 10 times what was recorded"),
-        (Torques, ACTION_SCALE, "motors has about 2 times the effect"),
+        (Torques, ACTION_SCALE, "motors: about 2 times the effect"),
         (Motors, ACTION_ORDER, "motors: abdomen_y acts as motors: abdomen_z"),
         (Frames, RATE, "a step lasts 0.05 s instead of 0.025 s"),
     ],
