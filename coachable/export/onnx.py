@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import logging
 import math
 import os
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,7 +14,7 @@ from torch import Tensor
 
 from coachable import __version__
 from coachable.domain import domain_names
-from coachable.extras import how_to_install
+from coachable.export.graph import import_onnx, quietly
 from coachable.files import CheckpointError, space_named
 from coachable.networks.plain import DeterministicAction
 from coachable.styles import StyleSpace
@@ -53,7 +51,7 @@ def export(source: str | Path, out: Path) -> float:
             `TOLERANCE`; no file is written then.
         OSError: If writing fails; the message says how much space is needed.
     """
-    onnx = _import_onnx()
+    onnx = import_onnx()
     agent = load_policy(source)
     plain = DeterministicAction(agent.actor).eval()
     metadata = metadata_of(agent, plain)
@@ -146,23 +144,7 @@ def _trace(plain: DeterministicAction) -> Any:
     # The example has two rows, because torch.export would treat a batch of one as a constant.
     example = (torch.zeros(2, plain.observation_dim), torch.zeros(2, plain.style_dim))
     batch = torch.export.Dim("batch")
-    before = logging.root.manager.disable
-    logging.disable(logging.WARNING)  # the exporter lists optional packages
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the exporter's own deprecations
-            names = {"input_names": ["observation", "style"], "output_names": list(plain.output_names)}
-            options = {"dynamic_shapes": ({0: batch}, {0: batch}), "external_data": False, "verbose": False}
-            return torch.onnx.export(plain, example, dynamo=True, **names, **options)
-    finally:
-        logging.disable(before)
-
-
-def _import_onnx() -> Any:
-    try:
-        import onnx
-        import onnxruntime  # noqa: F401
-        import onnxscript  # noqa: F401
-    except ImportError as error:
-        raise ImportError(f"{error.name} is missing: {how_to_install('export')}") from error
-    return onnx
+    names = {"input_names": ["observation", "style"], "output_names": list(plain.output_names)}
+    options = {"dynamic_shapes": ({0: batch}, {0: batch}), "external_data": False, "verbose": False}
+    with quietly():
+        return torch.onnx.export(plain, example, dynamo=True, **names, **options)

@@ -1,0 +1,102 @@
+"""ONNX graphs from functions, also from functions that compute with NumPy."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from coachable.extras import how_to_install
+
+__all__ = ["graph_of", "import_onnx", "quietly"]
+
+
+def graph_of(function: nn.Module, example: Mapping[str, Tensor], outputs: Sequence[str]) -> Any:
+    """Return the ONNX model of a module that may convert tensors to NumPy arrays and compute with them.
+
+    Code that simulates with NumPy can thus be exported as it is, instead of being written a second time. Sizes are
+    those of the example; branches and the types of containers must not depend on values.
+
+    Args:
+        function: Module without parameters, from tensors to a tuple of tensors.
+        example: Inputs by name, in the order of the arguments.
+        outputs: Names of the outputs.
+
+    Returns:
+        The model, an `onnx.ModelProto`.
+
+    Raises:
+        ImportError: If the extra `export` is not installed.
+    """
+    import_onnx()
+    inputs = tuple(example.values())
+    found: list[tuple[Any, Sequence[Any]]] = []
+
+    def keep(graph: Any, _: Any) -> Any:
+        def run(*values: Any) -> Any:
+            found.append((graph, values))
+            return graph(*values)
+
+        return run
+
+    # Dynamo turns NumPy's functions into torch's. Arrays that the code finds elsewhere become inputs of its graph.
+    with quietly():
+        torch.compile(function, backend=keep, fullgraph=True, dynamic=False)(*inputs)
+        ((graph, values),) = found
+        program = torch.export.export(_Captured(graph, values, inputs), inputs).run_decompositions()
+        names = {"input_names": list(example), "output_names": list(outputs)}
+        model = torch.onnx.export(program, dynamo=True, external_data=False, verbose=False, **names).model_proto
+    for node in model.graph.node:  # where in the source it comes from, which names folders
+        node.doc_string = ""
+        del node.metadata_props[:]
+    del model.graph.value_info[:]
+    return model
+
+
+class _Captured(nn.Module):
+    """Captured graph whose further inputs are constants."""
+
+    def __init__(self, graph: Any, values: Sequence[Any], inputs: Sequence[Tensor]) -> None:
+        super().__init__()
+        self.graph = graph
+        self._places = [next((i for i, own in enumerate(inputs) if own is value), None) for value in values]
+        for k, value in enumerate(values):
+            if self._places[k] is None:
+                self.register_buffer(f"constant_{k}", torch.as_tensor(value))
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        places = enumerate(self._places)
+        return self.graph(*(getattr(self, f"constant_{k}") if i is None else inputs[i] for k, i in places))
+
+
+@contextlib.contextmanager
+def quietly() -> Iterator[None]:
+    """Keep the exporter from logging which optional packages are missing, and from warning about itself."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(before)
+
+
+def import_onnx() -> Any:
+    """Import the package onnx.
+
+    Raises:
+        ImportError: If the extra `export` is not installed; the message says how to install it.
+    """
+    try:
+        import onnx
+        import onnxruntime  # noqa: F401
+        import onnxscript  # noqa: F401
+    except ImportError as error:
+        raise ImportError(f"{error.name} is missing: {how_to_install('export')}") from error
+    return onnx
