@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -33,7 +34,7 @@ def graph_of(function: nn.Module, example: Mapping[str, Tensor], outputs: Sequen
     Raises:
         ImportError: If the extra `export` is not installed.
     """
-    import_onnx()
+    onnx = import_onnx()
     inputs = tuple(example.values())
     found: list[tuple[Any, Sequence[Any]]] = []
 
@@ -55,7 +56,21 @@ def graph_of(function: nn.Module, example: Mapping[str, Tensor], outputs: Sequen
         node.doc_string = ""
         del node.metadata_props[:]
     del model.graph.value_info[:]
+    _replace_cosines(onnx, model.graph)
     return model
+
+
+def _replace_cosines(onnx: Any, graph: Any) -> None:
+    """Compute cosines as sines, because the runtime of browsers has no cosine in float64."""
+    cosines = [node for node in graph.node if node.op_type == "Cos"]
+    if cosines:
+        quarter = onnx.helper.make_tensor("quarter_turn", onnx.TensorProto.DOUBLE, (), [math.pi / 2])
+        graph.initializer.append(quarter)
+    for node in cosines:
+        (angle,), shifted = node.input, f"{node.name}_shifted"
+        place = list(graph.node).index(node)
+        node.op_type, node.input[0] = "Sin", shifted
+        graph.node.insert(place, onnx.helper.make_node("Add", [angle, "quarter_turn"], [shifted], f"{node.name}_add"))
 
 
 class _Captured(nn.Module):
