@@ -156,6 +156,7 @@ class Page {
   /** Say so if the computer is slower than real time. */
   #pace(elapsed, simulated) {
     this.rate = 0.95 * (this.rate ?? 1) + 0.05 * (simulated / Math.max(elapsed, 0.001));
+    if (this.rate < 0.7) this.scene?.spare();
     at("pace").textContent = this.rate < 0.9 ? `${this.rate.toFixed(1)} × real time` : "";
   }
 

@@ -53,7 +53,7 @@ export class Panel {
       if (meter) meter.style.width = `${100 * (mean ?? 0)}%`;
       if (pointer) {
         pointer.hidden = mean === null;
-        if (mean !== null) pointer.style.setProperty("--at", positionOf(pointer.entry, mean));
+        if (mean !== null) pointer.style.setProperty("--at", placeOf(pointer.entry, mean));
       }
       if (steps) drawSteps(steps, readout.last(measure.name), this.asked[measure.parameter], pointer.entry.to);
     }
@@ -94,7 +94,7 @@ export class Panel {
     listening(input, "input", () => ask(entry.name, Number(input.value)));
     const asked = make("output", { for: id, class: "asked", "aria-live": "off" });
     const slider = make("div", { class: entry.style ? "slider ranged" : "slider" }, input);
-    const [low, high] = [positionOf(entry, entry.low), positionOf(entry, entry.high)];
+    const [low, high] = [placeOf(entry, entry.low), placeOf(entry, entry.high)];
     slider.style.setProperty("--low", entry.style ? low : "0%");
     slider.style.setProperty("--high", entry.style ? high : "0%");
     const outside = make("p", { class: "outside", hidden: "" }, "Outside of the trained range: the agent has never been asked for this.");
@@ -107,7 +107,7 @@ export class Panel {
     if (entry.style) {
       for (const value of [entry.low, entry.high]) {
         const end = make("span", { class: "ends", "aria-hidden": "true" }, textOf(entry, value));
-        end.style.left = positionOf(entry, value);
+        end.style.left = placeOf(entry, value);
         slider.append(end);
       }
     }
@@ -172,7 +172,7 @@ function drawSteps(svg, values, asked, top) {
 }
 
 /** Where a value lies below a slider, whose thumb does not go quite to the ends. */
-function positionOf({ from, to }, value) {
+function placeOf({ from, to }, value) {
   const share = Math.min(Math.max((value - from) / (to - from), 0), 1);
   return `calc(12px + ${share.toFixed(4)} * (100% - 24px))`;
 }

@@ -45,6 +45,7 @@ export class Scene {
     this.marks = new THREE.Group();
     this.scene.add(this.sun, this.sun.target, this.fill, this.ground, this.marks, ...this.parts.map(({ mesh }) => mesh));
     this.target = new THREE.Vector3(0, 0, 0.85);
+    this.drawn = 0; // [ms] when the picture was drawn last
     this.dark = matchMedia("(prefers-color-scheme: dark)");
     this.dark.addEventListener("change", () => this.#paint());
     this.#paint();
@@ -102,9 +103,12 @@ export class Scene {
       mesh.quaternion.slerpQuaternions(from.turn, to.turn, share);
     }
     const [x, y] = this.goal;
-    const far = Math.hypot(x - this.target.x, y - this.target.y) > 2;
-    this.target.x += (x - this.target.x) * (far ? 1 : 0.15);
-    this.target.y += (y - this.target.y) * (far ? 1 : 0.15);
+    const now = performance.now();
+    const near = Math.hypot(x - this.target.x, y - this.target.y) < 1;
+    const pull = near ? 1 - Math.exp(-0.008 * (now - this.drawn)) : 1;
+    this.drawn = now;
+    this.target.x += (x - this.target.x) * pull;
+    this.target.y += (y - this.target.y) * pull;
     this.ground.position.set(Math.round(this.target.x), Math.round(this.target.y), 0);
     this.sun.position.copy(this.target).add(offset);
     this.sun.target.position.copy(this.target);
@@ -117,11 +121,19 @@ export class Scene {
     this.renderer.render(this.scene, this.camera);
   }
 
+  /** Draw with less detail from now on, because the computer is too slow. */
+  spare() {
+    if (this.sparing) return;
+    this.sparing = true;
+    this.width = null; // measured anew by the next picture
+    this.sun.castShadow = false;
+  }
+
   #fit() {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     if (this.width === width && this.height === height) return;
     [this.width, this.height] = [width, height];
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    this.renderer.setPixelRatio(this.sparing ? 0.5 : Math.min(devicePixelRatio, 2));
     this.renderer.setSize(width, height, false);
     this.camera.aspect = width / Math.max(height, 1);
     this.camera.updateProjectionMatrix();
