@@ -123,7 +123,12 @@ def _parser() -> argparse.ArgumentParser:
     _add_rollout(explain)
 
     export = command("export", _export, "write the policy as one ONNX file, to run it without torch", _SOURCE_HELP)
-    _add_out(export, "policy.onnx")
+    target = export.add_mutually_exclusive_group()
+    target.add_argument("--out", type=Path, default=Path("policy.onnx"), help="(default: %(default)s)")
+    text = "write a page instead, on which the agent acts in the visitor's browser"
+    target.add_argument("--web", type=Path, metavar="FOLDER", help=text)
+    text = "with --web: folder with the files of other projects, like node_modules (default: npm fetches them)"
+    export.add_argument("--assets", type=Path, metavar="FOLDER", help=text)
 
     verify = command("verify", _verify, "check an exported model, and an environment, against the model's contract")
     verify.add_argument("file", type=Path, help="a file of coachable export")
@@ -235,6 +240,16 @@ def _report(options: argparse.Namespace) -> int:
 
 
 def _export(options: argparse.Namespace) -> int:
+    if options.web is not None:
+        from coachable.export.web.page import export_page
+
+        size = export_page(options.source, options.web, options.assets)
+        print(
+            f"wrote {options.web} ({size / 1e6:.1f} MB); see it with: python3 -m http.server --directory {options.web}"
+        )
+        return 0
+    if options.assets is not None:
+        raise ValueError("--assets is for the page: expected --web FOLDER, too")
     from coachable.export.onnx import export
 
     difference = export(options.source, options.out)

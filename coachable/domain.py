@@ -225,6 +225,7 @@ class Domain:
     coached: Mapping[str, Any] = field(default_factory=dict)
     evaluation: Callable[..., str] | None = None
     make_scene: Callable[..., Any] | None = None
+    make_web: Callable[[StyleSpace], Any] | None = None
 
     def styled_env(
         self,

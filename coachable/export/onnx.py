@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -16,12 +14,11 @@ import torch
 from torch import Tensor
 
 from coachable import __version__
-from coachable.contract import model as exported
 from coachable.contract.contract import Contract
 from coachable.contract.model import OnnxRun
 from coachable.domain import Domain, domain_names
+from coachable.export.graph import import_onnx, quietly
 from coachable.export.recorder import Rig, record
-from coachable.extras import how_to_install
 from coachable.files import CheckpointError, space_named
 from coachable.networks.plain import DeterministicAction
 from coachable.signals import Signal
@@ -170,26 +167,7 @@ def _trace(plain: DeterministicAction) -> Any:
     # The example has two rows, because torch.export would treat a batch of one as a constant.
     example = (torch.zeros(2, plain.observation_dim), torch.zeros(2, plain.style_dim))
     batch = torch.export.Dim("batch")
-    before = logging.root.manager.disable
-    logging.disable(logging.WARNING)  # the exporter lists optional packages
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the exporter's own deprecations
-            names = {"input_names": ["observation", "style"], "output_names": list(plain.output_names)}
-            options = {"dynamic_shapes": ({0: batch}, {0: batch}), "external_data": False, "verbose": False}
-            return torch.onnx.export(plain, example, dynamo=True, **names, **options)
-    finally:
-        logging.disable(before)
-
-
-def import_onnx() -> Any:
-    """Return `onnx`.
-
-    Raises:
-        ImportError: If a package of the extra `export` is not installed; the message names it.
-    """
-    try:
-        import onnxscript  # noqa: F401
-    except ImportError as error:
-        raise ImportError(f"{error.name} is missing: {how_to_install('export')}") from error
-    return exported.import_onnx()
+    names = {"input_names": ["observation", "style"], "output_names": list(plain.output_names)}
+    options = {"dynamic_shapes": ({0: batch}, {0: batch}), "external_data": False, "verbose": False}
+    with quietly():
+        return torch.onnx.export(plain, example, dynamo=True, **names, **options)

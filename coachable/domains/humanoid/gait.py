@@ -10,6 +10,7 @@ from coachable.domains.humanoid.families import humanoid_family
 from coachable.domains.humanoid.metrics import GaitMeasures
 from coachable.domains.humanoid.plane import evaluate_gait
 from coachable.domains.humanoid.styles import POSES
+from coachable.domains.humanoid.web import GAIT_MEASURES, humanoid_web
 from coachable.domains.humanoid.words import GAIT_WORDS
 from coachable.envs.humanoid.env import HumanoidEnv
 
@@ -31,4 +32,5 @@ DOMAIN = replace(
     units=dict(humanoid.DOMAIN.units) | {"speed_error": "m/s"},
     words=GAIT_WORDS,
     evaluation=evaluate_gait,
+    make_web=partial(humanoid_web, measures=GaitMeasures(), shown=GAIT_MEASURES, step_max=_FAMILY.options["step_max"]),
 )

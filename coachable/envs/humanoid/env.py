@@ -23,12 +23,10 @@ from coachable.envs.humanoid.features import (
 from coachable.envs.humanoid.gait import GaitTracker
 from coachable.envs.humanoid.model import CONTROL_STEP, NUM_ACTIONS, NUM_POSITIONS
 from coachable.envs.humanoid.observation import (
-    OBSERVATION_SCALE,
     OBSERVATION_SIZE,
     cosine_to_course,
-    orientation_to_course,
+    observe,
     rotate_to_course,
-    suite_observation,
 )
 from coachable.envs.humanoid.rewards import COSTS, bearing_reward, move_reward, walk_costs
 from coachable.envs.humanoid.simulation import HumanoidSimulation, Kinematics
@@ -314,8 +312,5 @@ class HumanoidEnv(EnvBase):
 
     def _observe(self, kinematics: Kinematics, rows: np.ndarray) -> np.ndarray:
         """Return the scaled observation (len(rows), 82) float32 of the states that `kinematics` belongs to."""
-        course = self.course[rows]
-        suite = suite_observation(self.simulation.positions[rows], self.simulation.velocities[rows], kinematics, course)
-        pelvis = orientation_to_course(kinematics.pelvis_quaternion, course)
-        values = np.concatenate([suite, pelvis, self.gait.observe()[rows]], axis=1) * OBSERVATION_SCALE
-        return values.astype(np.float32)
+        positions, velocities = self.simulation.positions[rows], self.simulation.velocities[rows]
+        return observe(positions, velocities, kinematics, self.course[rows], self.gait.observe()[rows])

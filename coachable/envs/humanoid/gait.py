@@ -200,7 +200,7 @@ class GaitTracker:
             (N, 11): one-hot of the expected foot 2, smallest and largest angle of each knee since the step began 4
             [rad], start vectors of the step and of the stride 4 [m], time since the last strike / step_max 1, up to 2.
         """
-        onehot = np.eye(2)[self.expected]
+        onehot = np.stack([self.expected == 0, self.expected == 1], axis=1)
         timer = np.minimum(self.clock * CONTROL_STEP / self.step_max, 2.0)
         return np.concatenate(
             [onehot, self.knee_min, self.knee_max, self.step_vector, self.stride_vector, timer[:, None]], axis=1

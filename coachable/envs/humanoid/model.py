@@ -106,34 +106,39 @@ def load_spec() -> mujoco.MjSpec:
     return mujoco.MjSpec.from_string(text, include=common)
 
 
+def dynamics_spec() -> mujoco.MjSpec:
+    """Return the specification of the model that integrates."""
+    spec = _without_sensors()
+    for foot in FEET:  # a sphere around the foot: a touch sensor adds up the contacts of its body within its site
+        spec.body(foot).add_site(name=foot, pos=((HEEL + TOE) / 2, 0, 0), size=(0.2, 0, 0))
+        spec.add_sensor(name=foot, type=mujoco.mjtSensor.mjSENS_TOUCH, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=foot)
+    return spec
+
+
+def kinematics_spec() -> mujoco.MjSpec:
+    """Return the specification of the model whose sensors are the geometry of a state, without forces."""
+    spec = _without_sensors()
+    _add_sensors(spec)
+    bits = mujoco.mjtDisableBit
+    spec.option.disableflags |= int(
+        bits.mjDSBL_CONSTRAINT | bits.mjDSBL_CONTACT | bits.mjDSBL_ACTUATION | bits.mjDSBL_GRAVITY
+    )
+    return spec
+
+
+def _without_sensors() -> mujoco.MjSpec:
+    spec = load_spec()
+    for sensor in list(spec.sensors):
+        spec.delete(sensor)
+    # Without auto-reset a diverging state stays visible instead of turning silently into the initial one.
+    spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    return spec
+
+
 @cache
 def build_model() -> HumanoidModel:
     """Compile the dynamics and kinematics models, once for all simulations of a process: only states change."""
-    dynamics_spec = load_spec()
-    for sensor in list(dynamics_spec.sensors):
-        dynamics_spec.delete(sensor)
-    for foot in FEET:  # a sphere around the foot: a touch sensor adds up the contacts of its body within its site
-        dynamics_spec.body(foot).add_site(name=foot, pos=((HEEL + TOE) / 2, 0, 0), size=(0.2, 0, 0))
-        dynamics_spec.add_sensor(
-            name=foot, type=mujoco.mjtSensor.mjSENS_TOUCH, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=foot
-        )
-    dynamics = dynamics_spec.compile()
-    # Without auto-reset a diverging state stays visible instead of turning silently into the initial one.
-    dynamics.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-
-    kinematics_spec = load_spec()
-    for sensor in list(kinematics_spec.sensors):
-        kinematics_spec.delete(sensor)
-    _add_sensors(kinematics_spec)
-    kinematics = kinematics_spec.compile()
-    bits = mujoco.mjtDisableBit
-    kinematics.opt.disableflags |= int(
-        bits.mjDSBL_AUTORESET
-        | bits.mjDSBL_CONSTRAINT
-        | bits.mjDSBL_CONTACT
-        | bits.mjDSBL_ACTUATION
-        | bits.mjDSBL_GRAVITY
-    )
+    dynamics, kinematics = dynamics_spec().compile(), kinematics_spec().compile()
     sensors = {
         kinematics.sensor(i).name: slice(
             int(kinematics.sensor_adr[i]), int(kinematics.sensor_adr[i] + kinematics.sensor_dim[i])

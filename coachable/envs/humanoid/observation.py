@@ -106,3 +106,21 @@ def suite_observation(
         ],
         axis=1,
     )
+
+
+def observe(
+    positions: np.ndarray, velocities: np.ndarray, kinematics: Kinematics, course: np.ndarray, gait: np.ndarray
+) -> np.ndarray:
+    """Return the scaled observation (N, 82) float32.
+
+    Args:
+        positions: (N, 28) generalised positions.
+        velocities: (N, 27) generalised velocities.
+        kinematics: geometry of the same N states.
+        course: (N,) [rad].
+        gait: (N, 11) from `GaitTracker.observe`.
+    """
+    suite = suite_observation(positions, velocities, kinematics, course)
+    pelvis = orientation_to_course(kinematics.pelvis_quaternion, course)
+    values = np.concatenate([suite, pelvis, gait], axis=1) * OBSERVATION_SCALE
+    return values.astype(np.float32)

@@ -59,6 +59,37 @@ class Kinematics:
     pelvis_quaternion: np.ndarray
 
 
+def read_kinematics(readings: np.ndarray, model: HumanoidModel) -> Kinematics:
+    """Return the geometry of M states from the sensors (M, S) of the kinematics model."""
+
+    def read(name: str) -> np.ndarray:
+        return readings[:, model.sensors[name]]
+
+    feet = np.stack([read(f"{foot}_position") for foot in FEET], axis=1)
+    # Height of the capsule end points: position + x * (x axis)_z + y * (y axis)_z.
+    axis_x = np.stack([read(f"{foot}_x_axis") for foot in FEET], axis=1)
+    axis_y = np.stack([read(f"{foot}_y_axis")[:, 2] for foot in FEET], axis=1)
+    points = model.foot_points  # (2, 4, 2)
+    heights = axis_x[..., 2:] * points[..., 0] + axis_y[..., None] * points[..., 1]
+    # What touches the ground first stays where it is while the rest of the foot comes down around it.
+    end = np.where(axis_x[..., 2] < 0, TOE, HEEL)[..., None]
+    ahead = axis_x[..., :2]
+    level = ahead / np.maximum(np.linalg.norm(ahead, axis=-1, keepdims=True), 1e-6)
+    soles = feet[..., :2] + end * ahead + ((HEEL + TOE) / 2 - end) * level
+    return Kinematics(
+        torso_axes=np.stack([read(f"torso_{axis}_axis") for axis in "xyz"], axis=-1),
+        torso_position=read("torso_position"),
+        head_height=read("head_position")[:, 2],
+        extremities=np.stack([read(f"{limb}_position") for limb in EXTREMITIES], axis=1),
+        feet=feet,
+        foot_clearance=feet[..., 2] + heights.min(axis=-1) - FOOT_RADIUS,
+        foot_pitch=-np.arcsin(np.clip(axis_x[..., 2], -1.0, 1.0)),
+        soles=soles,
+        com_velocity=read("com_velocity"),
+        pelvis_quaternion=read("pelvis_quaternion"),
+    )
+
+
 class HumanoidSimulation:
     """N humanoids as one array of MuJoCo states.
 
@@ -146,34 +177,7 @@ class HumanoidSimulation:
     def kinematics_of(self, states: np.ndarray) -> Kinematics:
         """Return the geometry of any (M, nstate) states."""
         _, readings = self._rollout.rollout(self.model.kinematics, self._kinematics_data, states, nstep=1)
-        readings = readings[:, 0]
-
-        def read(name: str) -> np.ndarray:
-            return readings[:, self.model.sensors[name]]
-
-        feet = np.stack([read(f"{foot}_position") for foot in FEET], axis=1)
-        # Height of the capsule end points: position + x * (x axis)_z + y * (y axis)_z.
-        axis_x = np.stack([read(f"{foot}_x_axis") for foot in FEET], axis=1)
-        axis_y = np.stack([read(f"{foot}_y_axis")[:, 2] for foot in FEET], axis=1)
-        points = self.model.foot_points  # (2, 4, 2)
-        heights = axis_x[..., 2:] * points[..., 0] + axis_y[..., None] * points[..., 1]
-        # What touches the ground first stays where it is while the rest of the foot comes down around it.
-        end = np.where(axis_x[..., 2] < 0, TOE, HEEL)[..., None]
-        ahead = axis_x[..., :2]
-        level = ahead / np.maximum(np.linalg.norm(ahead, axis=-1, keepdims=True), 1e-6)
-        soles = feet[..., :2] + end * ahead + ((HEEL + TOE) / 2 - end) * level
-        return Kinematics(
-            torso_axes=np.stack([read(f"torso_{axis}_axis") for axis in "xyz"], axis=-1),
-            torso_position=read("torso_position"),
-            head_height=read("head_position")[:, 2],
-            extremities=np.stack([read(f"{limb}_position") for limb in EXTREMITIES], axis=1),
-            feet=feet,
-            foot_clearance=feet[..., 2] + heights.min(axis=-1) - FOOT_RADIUS,
-            foot_pitch=-np.arcsin(np.clip(axis_x[..., 2], -1.0, 1.0)),
-            soles=soles,
-            com_velocity=read("com_velocity"),
-            pelvis_quaternion=read("pelvis_quaternion"),
-        )
+        return read_kinematics(readings[:, 0], self.model)
 
     def count_contacts(self, state: np.ndarray) -> int:
         """Return the number of contacts of one state, for the search for collision-free postures."""

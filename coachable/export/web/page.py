@@ -1,0 +1,137 @@
+"""`coachable export --web`: write a folder that any static host serves, in which an agent acts in the browser."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Any
+
+from coachable import __version__
+from coachable.export.graph import graph_of, import_onnx
+from coachable.export.onnx import TOLERANCE, export
+from coachable.export.web.part import WebPart
+from coachable.export.web.third_party import packages, provide
+from coachable.training.weights import LoadedPolicy, domain_of, load_policy
+
+__all__ = ["SCHEMA_VERSION", "export_page", "manifest_of"]
+
+SCHEMA_VERSION = 1
+"""Version of `manifest.json`."""
+
+_OUTPUTS = ("observation", "measured", "mark", "memory_after", "terminated")
+_MODELS = {"dynamics": "dynamics.xml", "kinematics": "kinematics.xml"}
+_GRAPHS = {"policy": "policy.onnx", "features": "features.onnx"}
+_VENDORED = "third_party"
+
+
+def export_page(source: str | Path, out: Path, assets: Path | None = None) -> int:
+    """Write the page of an agent.
+
+    The folder contains the page's own files, the physics as XML, the policy and the features as ONNX, `manifest.json`
+    with everything else that the page has to know, and the pinned files of other projects in `third_party`.
+
+    Args:
+        source: Checkpoint, run folder, weights file, or the name of a domain that ships with weights.
+        out: Folder to write into; files of the same names are replaced.
+        assets: Folder with the files of other projects, see `coachable.export.web.third_party.provide`.
+
+    Returns:
+        Size of all files of the page [byte].
+
+    Raises:
+        ImportError: If the extra `export` is not installed.
+        ValueError: If the agent's domain has no page.
+        CheckpointError: If the source does not hold a usable policy.
+        OSError: If the files of other projects cannot be fetched, or writing fails.
+    """
+    onnx = import_onnx()
+    agent = load_policy(source)
+    part = _part_of(agent)
+    if out.exists() and not out.is_dir():
+        raise NotADirectoryError(f"{out} is a file: expected a folder, or a name that is free")
+    vendored = provide(assets)
+    features = graph_of(part.features, part.example, _OUTPUTS)
+    onnx.checker.check_model(features)
+    out.mkdir(parents=True, exist_ok=True)
+    export(source, out / _GRAPHS["policy"])
+    (out / _GRAPHS["features"]).write_bytes(features.SerializeToString())
+    for name, text in (("dynamics", part.dynamics), ("kinematics", part.kinematics)):
+        (out / _MODELS[name]).write_text(text, encoding="utf-8")
+    with as_file(files("coachable.export.web") / "static") as own:
+        shutil.copytree(own, out, dirs_exist_ok=True)
+    for name, file in vendored.items():
+        target = out / _VENDORED / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, target)
+    (out / _VENDORED / "LICENSES.txt").write_text(_licenses(), encoding="utf-8")
+    manifest = manifest_of(agent, part)
+    manifest["downloads"] = [_download(out, name) for name in (*_MODELS.values(), *_GRAPHS.values())]
+    manifest["downloads"] += [_download(out, f"{_VENDORED}/{name}") for name in vendored]
+    (out / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")
+    return sum(file.stat().st_size for file in out.rglob("*") if file.is_file())
+
+
+def manifest_of(agent: LoadedPolicy, part: WebPart) -> dict[str, Any]:
+    """Return what the page has to know besides models and graphs.
+
+    Args:
+        agent: Agent from `load_policy`.
+        part: The domain's part of the page.
+    """
+    space, domain = agent.space, domain_of(agent)
+    controls = [
+        {
+            "name": control.parameter.name,
+            "low": control.parameter.low,
+            "high": control.parameter.high,
+            "unit": control.parameter.unit,
+            "help": control.parameter.help,
+            "default": control.parameter.default,
+            "circular": control.circular,
+        }
+        for control in domain.controls
+    ]
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "coachable_version": __version__,
+        "domain": domain.name,
+        "frames": agent.metadata["frames"],
+        "title": part.title,
+        "summary": part.summary,
+        "style_space": json.loads(space.to_json()),
+        "default_style": space.default.tolist(),
+        "presets": {name: dict(style) for name, style in domain.words.presets.items()},
+        "controls": controls,
+        "measures": [vars(measure) for measure in part.measures],
+        "models": _MODELS,
+        "graphs": _GRAPHS,
+        "physics": dict(part.physics),
+        "push": dict(part.push),
+        "followed": part.followed,
+        "terminated": part.terminated,
+        "starts": [dict(start) for start in part.starts],
+        "largest_difference": TOLERANCE,
+        "packages": [{"name": p.name, "version": p.version, "license": p.license, "home": p.home} for p in packages()],
+    }
+
+
+def _part_of(agent: LoadedPolicy) -> WebPart:
+    domain = domain_of(agent)
+    if domain.make_web is None:
+        raise ValueError(f"the domain {domain.name} has no page for the browser: expected one that declares `make_web`")
+    return domain.make_web(agent.space)
+
+
+def _download(out: Path, name: str) -> dict[str, Any]:
+    return {"file": name, "bytes": (out / name).stat().st_size}
+
+
+def _licenses() -> str:
+    """Return the notices that the licences of the vendored files ask for."""
+    blocks = [f"{p.name} {p.version}\n{p.copyright}\nLicence: {p.license}\n{p.home}\n" for p in packages()]
+    mit = (files("coachable.export.web") / "MIT.txt").read_text(encoding="utf-8")
+    apache = "The Apache License 2.0 is at https://www.apache.org/licenses/LICENSE-2.0\n"
+    model = "The humanoid's model is from dm_control, Copyright The dm_control Authors, Apache-2.0.\n"
+    return "\n".join([*blocks, model, apache, "MIT License\n", mit])

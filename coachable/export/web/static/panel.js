@@ -1,0 +1,194 @@
+// The coach's panel: requests as controls made from the declaration, and beside each what is measured.
+
+import { isOutside, textOf, withUnit, words } from "./request.js";
+
+const SVG = "http://www.w3.org/2000/svg";
+
+export class Panel {
+  /**
+   * @param {HTMLFormElement} form  Receives the controls.
+   * @param {HTMLElement} others  Receives the measures that belong to no request.
+   * @param {object[]} entries  From `entriesOf`.
+   * @param {object[]} measures  The manifest's measures.
+   * @param {(name: string, value: number | string) => void} ask  Called when the visitor asks for something.
+   */
+  constructor(form, others, entries, measures, ask) {
+    this.entries = entries;
+    this.measures = measures;
+    this.shown = new Map();
+    for (const entry of entries) {
+      const own = measures.filter((measure) => measure.parameter === entry.name);
+      form.append(entry.options ? this.#choice(entry, own, ask) : this.#number(entry, own, ask));
+    }
+    for (const measure of measures.filter(({ parameter }) => !parameter)) {
+      others.append(make("div", {}, make("dt", {}, words(measure.text)), this.#value(measure, "dd")));
+    }
+  }
+
+  /** Show what is asked for. */
+  request(request) {
+    for (const entry of this.entries) {
+      const { inputs, asked, outside } = this.shown.get(`request ${entry.name}`);
+      const value = request[entry.name];
+      for (const input of inputs) {
+        if (entry.options) input.checked = input.value === value;
+        else {
+          input.value = value;
+          input.setAttribute("aria-valuetext", textOf(entry, value));
+        }
+      }
+      if (asked) asked.textContent = textOf(entry, value);
+      if (outside) outside.hidden = !isOutside(entry, value);
+    }
+    this.asked = request;
+  }
+
+  /** Show what was measured. */
+  measured(readout) {
+    for (const measure of this.measures) {
+      const { value, pointer, meter, steps } = this.shown.get(`measure ${measure.name}`);
+      const mean = readout.mean(measure.name);
+      value.textContent = mean === null ? "…" : textOfMeasure(measure, mean);
+      value.dataset.value = mean ?? "";
+      if (meter) meter.style.width = `${100 * (mean ?? 0)}%`;
+      if (pointer) {
+        pointer.hidden = mean === null;
+        if (mean !== null) pointer.style.setProperty("--at", placeOf(pointer.entry, mean));
+      }
+      if (steps) drawSteps(steps, readout.last(measure.name), this.asked[measure.parameter], pointer.entry.to);
+    }
+  }
+
+  /** One sentence on each request with a measure, for a screen reader. */
+  sentences(readout) {
+    return this.measures
+      .filter(({ parameter, name }) => parameter && readout.mean(name) !== null)
+      .map((measure) => {
+        const entry = this.entries.find(({ name }) => name === measure.parameter);
+        const mean = textOfMeasure(measure, readout.mean(measure.name));
+        return `${entry.label}: ${textOf(entry, this.asked[entry.name])} requested, ${measure.text} ${mean}.`;
+      })
+      .join(" ");
+  }
+
+  #choice(entry, measures, ask) {
+    const inputs = entry.options.map((value) =>
+      listening(make("input", { type: "radio", name: entry.name, value }), "change", () => ask(entry.name, value)),
+    );
+    const options = inputs.map((input) => make("label", {}, input, make("span", {}, words(input.value))));
+    this.shown.set(`request ${entry.name}`, { inputs });
+    return make(
+      "fieldset",
+      { class: "request" },
+      make("legend", {}, entry.label),
+      make("p", { class: "help" }, entry.help),
+      make("div", { class: "options" }, ...options),
+      ...measures.flatMap((measure) => this.#line(measure)),
+    );
+  }
+
+  #number(entry, measures, ask) {
+    const id = `request-${entry.name}`;
+    const attributes = { type: "range", id, name: entry.name, min: entry.from, max: entry.to, step: entry.step };
+    const input = make("input", { ...attributes, "aria-describedby": `${id}-help` });
+    listening(input, "input", () => ask(entry.name, Number(input.value)));
+    const asked = make("output", { for: id, class: "asked", "aria-live": "off" });
+    const slider = make("div", { class: entry.style ? "slider ranged" : "slider" }, input);
+    const [low, high] = [placeOf(entry, entry.low), placeOf(entry, entry.high)];
+    slider.style.setProperty("--low", entry.style ? low : "0%");
+    slider.style.setProperty("--high", entry.style ? high : "0%");
+    const outside = make("p", { class: "outside", hidden: "" }, "Outside of the trained range: the agent has never been asked for this.");
+    const lines = measures.flatMap((measure) => {
+      const pointer = make("div", { class: "pointer", hidden: "" });
+      pointer.entry = entry;
+      slider.append(pointer);
+      return this.#line(measure, pointer);
+    });
+    if (entry.style) {
+      for (const value of [entry.low, entry.high]) {
+        const end = make("span", { class: "ends", "aria-hidden": "true" }, textOf(entry, value));
+        end.style.left = placeOf(entry, value);
+        slider.append(end);
+      }
+    }
+    this.shown.set(`request ${entry.name}`, { inputs: [input], asked, outside });
+    const range = entry.style ? `; trained from ${textOf(entry, entry.low)} to ${textOf(entry, entry.high)}` : "";
+    const heading = make("label", { class: "name", for: id }, entry.label);
+    const help = make("p", { class: "help", id: `${id}-help` }, entry.help, make("span", { class: "unseen" }, range));
+    const top = make("div", { class: "row" }, heading, asked);
+    return make("div", { class: "request" }, top, help, slider, outside, ...lines);
+  }
+
+  /** A measure below its request. */
+  #line(measure, pointer) {
+    const value = this.#value(measure, "output");
+    const shown = this.shown.get(`measure ${measure.name}`);
+    shown.pointer = pointer;
+    const parts = [make("div", { class: "row" }, make("span", { class: "help" }, words(measure.text)), value)];
+    if (measure.share) {
+      shown.meter = make("div", {});
+      parts.push(make("div", { class: "meter", "aria-hidden": "true" }, shown.meter));
+    }
+    if (measure.at_marks) {
+      shown.steps = document.createElementNS(SVG, "svg");
+      shown.steps.setAttribute("class", "steps");
+      shown.steps.setAttribute("aria-hidden", "true");
+      parts.push(shown.steps);
+    }
+    return parts;
+  }
+
+  #value(measure, tag) {
+    const value = make(tag, { class: "found", id: `measured-${measure.name}`, "aria-live": "off" }, "…");
+    this.shown.set(`measure ${measure.name}`, { value });
+    return value;
+  }
+}
+
+/** Bars of the last values, with a line at the request. */
+function drawSteps(svg, values, asked, top) {
+  const signature = `${values.join()} ${asked} ${svg.clientWidth}`;
+  if (svg.dataset.signature === signature) return;
+  svg.dataset.signature = signature;
+  const [width, height, foot] = [svg.clientWidth || 300, 84, 16];
+  const scale = (height - foot - 4) / top;
+  const column = width / 8;
+  const draw = (tag, attributes, text = "") => {
+    const shape = document.createElementNS(SVG, tag);
+    for (const [name, value] of Object.entries(attributes)) shape.setAttribute(name, value);
+    shape.textContent = text;
+    return shape;
+  };
+  const bars = values.flatMap((value, i) => {
+    const size = Math.max(value, 0) * scale;
+    const x = i * column;
+    return [
+      draw("rect", { x: x + 5, y: height - foot - size, width: column - 10, height: size, rx: 3, opacity: 0.45 + 0.55 * ((i + 1) / values.length) }),
+      draw("text", { x: x + column / 2, y: height - 3 }, value.toFixed(2)),
+    ];
+  });
+  const y = height - foot - asked * scale;
+  svg.replaceChildren(...bars, draw("line", { x1: 0, x2: width, y1: y, y2: y }));
+}
+
+/** Where a value lies below a slider, whose thumb does not go quite to the ends. */
+function placeOf({ from, to }, value) {
+  const share = Math.min(Math.max((value - from) / (to - from), 0), 1);
+  return `calc(12px + ${share.toFixed(4)} * (100% - 24px))`;
+}
+
+function textOfMeasure({ share, unit }, value) {
+  return share ? `${Math.round(100 * value)} % of the time` : withUnit(value.toFixed(2), unit);
+}
+
+function make(tag, attributes, ...children) {
+  const element = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+  element.append(...children);
+  return element;
+}
+
+function listening(element, event, react) {
+  element.addEventListener(event, react);
+  return element;
+}

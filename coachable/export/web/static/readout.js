@@ -1,0 +1,43 @@
+// What was measured since the latest request, over the last seconds and over the last marks on the ground.
+
+const SECONDS = 3; // over which shares and means are taken
+const MARKS = 8; // of which values are kept
+
+export class Readout {
+  /** @param {object[]} measures  The manifest's measures. */
+  constructor(measures) {
+    this.measures = measures;
+    this.clear();
+  }
+
+  /** Forget everything: a request or an episode begins. */
+  clear() {
+    this.rows = [];
+    this.marked = new Map(this.measures.map(({ name }) => [name, []]));
+  }
+
+  /** Add what was measured at a time [s]; NaN is no value. */
+  add(time, values) {
+    this.rows.push({ time, values });
+    while (this.rows[0].time < time - SECONDS) this.rows.shift();
+    this.measures.forEach(({ name, at_marks }, i) => {
+      if (!at_marks || Number.isNaN(values[i])) return;
+      const kept = this.marked.get(name);
+      kept.push(values[i]);
+      if (kept.length > MARKS) kept.shift();
+    });
+  }
+
+  /** The last values of a measure that is taken at marks. */
+  last(name) {
+    return this.marked.get(name);
+  }
+
+  /** Mean of a measure, or null if there is no value. */
+  mean(name) {
+    const index = this.measures.findIndex((measure) => measure.name === name);
+    const values = this.measures[index].at_marks ? this.last(name) : this.rows.map((row) => row.values[index]);
+    const known = values.filter((value) => !Number.isNaN(value));
+    return known.length ? known.reduce((sum, value) => sum + value, 0) / known.length : null;
+  }
+}

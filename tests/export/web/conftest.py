@@ -1,0 +1,43 @@
+"""The humanoid's page, written once for all tests of this folder."""
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+
+
+@pytest.fixture(scope="session")
+def site(tmp_path_factory):
+    pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    from coachable.export.web.page import export_page
+    from coachable.export.web.third_party import provide
+
+    try:
+        provide()
+    except OSError as error:
+        pytest.skip(str(error))
+    folder = tmp_path_factory.mktemp("page") / "site"
+    export_page("humanoid", folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def drive(site):
+    """Run a task of drive.mjs with the page's code."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("node is not installed")
+
+    def run(name, **task):
+        text = json.dumps({"name": name, **task})
+        command = [node, str(HERE / "drive.mjs"), str(site)]
+        done = subprocess.run(command, input=text, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr[-2000:]
+        return json.loads(done.stdout)
+
+    return run

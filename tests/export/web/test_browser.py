@@ -1,0 +1,141 @@
+"""The page in headless Chromium: it starts, follows its sliders, and asks no other site for anything."""
+
+import functools
+import http.server
+import json
+import shutil
+import subprocess
+import threading
+import time
+
+import pytest
+
+pytestmark = pytest.mark.slow  # a browser without a graphics card draws for a minute
+
+LENGTHS = (0.40, 0.55)
+OFFSET = 0.06  # [m], by which the shipped agent misses a request at most, see docs/domains/humanoid.md
+
+
+class Browser:
+    """Chromium with one page, driven by its DevTools protocol."""
+
+    def __init__(self, folder, size):
+        client = pytest.importorskip("websockets.sync.client")
+        chromium = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+        if chromium is None:
+            pytest.skip("chromium is not installed")
+        flags = ["--headless=new", "--no-sandbox", "--remote-debugging-port=0", f"--user-data-dir={folder}"]
+        flags += ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        flags += ["--disable-background-networking", f"--window-size={size[0]},{size[1]}"]
+        self.process = subprocess.Popen([chromium, *flags, "about:blank"], stderr=subprocess.DEVNULL)
+        port_file = folder / "DevToolsActivePort"
+        wait_for(lambda: port_file.is_file() and "\n" in port_file.read_text(), 60)
+        port, path = port_file.read_text().split()[:2]
+        self.socket = client.connect(f"ws://127.0.0.1:{port}{path}", max_size=None)
+        self.number, self.events, self.session = 0, [], None
+        target = self.call("Target.createTarget", url="about:blank")["targetId"]
+        self.session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        for domain in ("Network", "Page", "Runtime"):
+            self.call(f"{domain}.enable")
+
+    def call(self, method, **parameters):
+        self.number += 1
+        message = {"id": self.number, "method": method, "params": parameters}
+        self.socket.send(json.dumps(message | ({"sessionId": self.session} if self.session else {})))
+        while True:
+            answer = json.loads(self.socket.recv(timeout=120))
+            if answer.get("id") == self.number:
+                assert "error" not in answer, answer
+                return answer["result"]
+            self.events.append(answer)
+
+    def evaluate(self, expression):
+        result = self.call("Runtime.evaluate", expression=expression, returnByValue=True)
+        assert "exceptionDetails" not in result, result
+        return result["result"].get("value")
+
+    def close(self):
+        self.socket.close()
+        self.process.terminate()
+        self.process.wait(30)
+
+
+def wait_for(condition, seconds):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.2)
+
+
+@pytest.fixture
+def address(site):
+    class Quiet(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, *_):
+            pass
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=str(site)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}/"
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.fixture
+def browser(tmp_path):
+    browser = Browser(tmp_path, (480, 640))
+    yield browser
+    browser.close()
+
+
+def test_the_page_follows_its_sliders_and_asks_no_other_site(browser, address):
+    browser.call("Page.navigate", url=f"{address}#pose=t_pose&step_length={LENGTHS[0]}")
+    wait_for(lambda: browser.evaluate("document.getElementById('loading')?.hidden === true"), 120)
+    assert browser.evaluate("document.querySelector('input[value=t_pose]').checked")
+    measured = []
+    for length in LENGTHS:
+        browser.evaluate(
+            f"(() => {{ const slider = document.getElementById('request-step_length'); slider.value = {length};"
+            " slider.dispatchEvent(new Event('input')); })()"
+        )
+        assert browser.evaluate("document.getElementById('measured-step_length').dataset.value") == ""
+        begin = seconds(browser)
+        wait_for(lambda begin=begin: seconds(browser) > begin + 8 or seconds(browser) < begin, 240)
+        assert seconds(browser) > begin, "the walker fell"
+        measured.append(float(browser.evaluate("document.getElementById('measured-step_length').dataset.value")))
+    for length, value in zip(LENGTHS, measured, strict=True):
+        assert abs(value - length) < OFFSET
+    assert measured[1] - measured[0] == pytest.approx(LENGTHS[1] - LENGTHS[0], abs=0.05)
+    assert float(browser.evaluate("document.getElementById('measured-pose_held').dataset.value")) > 0.8
+    assert f"step_length={LENGTHS[1]:.2f}" in browser.evaluate("location.hash")
+    sent = [e["params"]["request"]["url"] for e in browser.events if e.get("method") == "Network.requestWillBeSent"]
+    foreign = [url for url in sent if not url.startswith((address, "data:", "blob:", "about:"))]
+    assert len(sent) > 10 and foreign == []
+    assert not [e for e in browser.events if e.get("method") == "Runtime.exceptionThrown"]
+
+
+def seconds(browser):
+    """Time on the page's clock."""
+    return float(browser.evaluate("parseFloat(document.getElementById('clock').textContent)"))
+
+
+@pytest.mark.parametrize("width", [360, 1920])
+def test_nothing_is_wider_than_the_window_and_everything_has_a_name(browser, address, width):
+    metrics = {"width": width, "height": 740, "deviceScaleFactor": 1, "mobile": width == 360}
+    browser.call("Emulation.setDeviceMetricsOverride", **metrics)
+    preference = [{"name": "prefers-reduced-motion", "value": "reduce"}]
+    browser.call("Emulation.setEmulatedMedia", features=preference)
+    browser.call("Page.navigate", url=address)
+    wait_for(lambda: browser.evaluate("document.getElementById('loading')?.hidden === true"), 120)
+    assert browser.evaluate("document.documentElement.scrollWidth") <= width
+    unnamed = (
+        "[...document.querySelectorAll('input, button, output')]"
+        ".filter(e => !(e.labels?.length || e.textContent.trim() || e.ariaLabel)).length"
+    )
+    assert browser.evaluate(unnamed) == 0
+    small = (
+        "[...document.querySelectorAll('button, .options label, input[type=range]')]"
+        ".filter(e => e.getBoundingClientRect().height < 44).length"
+    )
+    assert browser.evaluate(small) == 0
+    assert browser.evaluate("document.getElementById('pause').textContent") == "Walk on"  # it waits to be started
+    assert seconds(browser) == 0

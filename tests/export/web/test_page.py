@@ -1,0 +1,104 @@
+"""The folder of the page: what is in it, where files of other projects come from, and the page's arithmetic."""
+
+import json
+import shutil
+import subprocess
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+from coachable.cli import main
+from coachable.export.web import third_party
+
+STATIC = Path(str(files("coachable.export.web"))) / "static"
+
+
+def test_the_page_is_small_and_names_no_folder_of_this_machine(site):
+    written = [file for file in site.rglob("*") if file.is_file()]
+    assert sum(file.stat().st_size for file in written) < 25e6
+    for file in written:
+        if "third_party" not in file.parts:
+            content = file.read_bytes()
+            assert str(Path.home()).encode() not in content and str(STATIC).encode() not in content, file
+    manifest = json.loads((site / "manifest.json").read_text())
+    for download in manifest["downloads"]:
+        assert (site / download["file"]).stat().st_size == download["bytes"]
+
+
+def test_a_domain_without_a_page_says_so(capsys, tmp_path):
+    pytest.importorskip("onnxscript")
+    assert main(["export", "combat", "--web", str(tmp_path / "site")]) == 2
+    assert "the domain combat has no page for the browser" in capsys.readouterr().err
+    assert not (tmp_path / "site").exists()
+
+
+def test_assets_belong_to_the_page(capsys, tmp_path):
+    assert main(["export", "humanoid", "--assets", str(tmp_path)]) == 2
+    assert "expected --web FOLDER" in capsys.readouterr().err
+
+
+def test_changed_files_of_other_projects_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"mujoco\.js is missing or is not the file of @mujoco/mujoco 3\.14\.0"):
+        third_party.provide(tmp_path)
+    file = tmp_path / "@mujoco/mujoco/mujoco.js"
+    file.parent.mkdir(parents=True)
+    file.write_text("something else")
+    with pytest.raises(ValueError, match="is not the file of"):
+        third_party.provide(tmp_path)
+
+
+def test_without_npm_one_sentence_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(FileNotFoundError, match=r"install Node\.js 20, or name a folder with the files by --assets"):
+        third_party.provide()
+
+
+def test_an_archive_with_another_hash_is_refused():
+    with pytest.raises(OSError, match="has another hash"):
+        list(third_party._unpack(third_party.packages()[0], b"something else"))
+
+
+SCRIPT = """
+import assert from "node:assert/strict";
+const { entriesOf, defaultsOf, thetaOf, controlsOf, fragmentOf, fromFragment, isOutside } = await import(REQUEST);
+const { Readout } = await import(READOUT);
+const manifest = {
+  style_space: { parameters: [
+    { kind: "choice", name: "pose", options: ["up", "down"], default: "up" },
+    { kind: "setpoint", name: "step_length", low: 0.3, high: 0.65, unit: "m", default: 0.475 },
+  ] },
+  controls: [{ name: "course", low: -180, high: 180, unit: "deg", default: 0 }],
+};
+const entries = entriesOf(manifest);
+const request = { ...defaultsOf(entries), pose: "down", step_length: 0.5 };
+assert.deepEqual(thetaOf(entries, request), [0, 1, 0.5]);
+assert.deepEqual(controlsOf(entries, request), [0]);
+assert.equal(fragmentOf(entries, request), "#pose=down&step_length=0.50&course=0");
+assert.deepEqual(fromFragment(entries, fragmentOf(entries, request), defaultsOf(entries)), request);
+const foreign = fromFragment(entries, "#pose=<b>&step_length=1e9&course=NaN&x=1", request);
+assert.deepEqual(foreign, { pose: "down", step_length: entries[1].to, course: 0 });
+assert.ok(isOutside(entries[1], 0.66) && !isOutside(entries[1], 0.65) && !isOutside(entries[2], 180));
+const readout = new Readout([{ name: "held" }, { name: "length", at_marks: true }]);
+assert.equal(readout.mean("held"), null);
+[[0, 0, NaN], [2, 1, 0.4], [4, 1, 0.6]].forEach(([time, ...values]) => readout.add(time, values));
+assert.equal(readout.mean("held"), 1); // the first row has left the window
+assert.equal(readout.mean("length"), 0.5);
+assert.deepEqual(readout.last("length"), [0.4, 0.6]);
+readout.clear();
+assert.equal(readout.mean("length"), null);
+"""
+
+
+def test_requests_links_and_readouts():
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("node is not installed")
+    script = SCRIPT
+    for name in ("request", "readout"):
+        script = script.replace(name.upper(), json.dumps((STATIC / f"{name}.js").as_uri()))
+    done = subprocess.run(
+        [node, "--input-type=module", "--no-warnings"], input=script, capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
