@@ -17,10 +17,15 @@ from coachable.cli import _parser
 ROOT = Path(__file__).resolve().parents[1]
 CONFIGS = ROOT / "recipes" / "configs"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-LINKED = [*PAGES, ROOT / "CHANGELOG.md", *sorted((ROOT / "coachable").glob("pretrained/*/MODEL_CARD.md"))]
+LINKED = [
+    *PAGES,
+    ROOT / "CHANGELOG.md",
+    ROOT / "SECURITY.md",
+    *sorted((ROOT / "coachable").glob("pretrained/*/MODEL_CARD.md")),
+]
 RECIPES = sorted(path.stem for path in (ROOT / "recipes").glob("*.py") if (CONFIGS / f"{path.stem}.yaml").is_file())
 
-_FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
+_FENCE = re.compile(r"^```(\{?[\w-]*\}?)[^\n]*\n(.*?)^```", re.DOTALL | re.MULTILINE)
 _LINK = re.compile(r"!?\[(?:[^\[\]]|\[[^\]]*\])*\]\(([^)\s]+)\)")
 _PROGRAMS = ("python", "python3", "coachable", "pytest")
 

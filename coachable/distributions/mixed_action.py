@@ -129,7 +129,7 @@ class MixedAction(Distribution):
         return self._join(one_hots, axes), torch.as_tensor(log_prob)
 
     def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Draw hard actions (*sample_shape, ..., action_dim) without gradient."""
+        """Draw hard actions `(*sample_shape, ..., action_dim)` without gradient."""
         with torch.no_grad():
             return self._expanded(sample_shape).hard_action()
 

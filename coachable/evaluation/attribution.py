@@ -102,7 +102,7 @@ def rank_groups(
 ) -> list[Ranking]:
     """Rank the groups by their importance for the outputs, by SHAP and by saliency.
 
-    Saliency (Simonyan et al. 2014) is the mean of |d output / d input| over a group's entries and over the outputs:
+    Saliency (Simonyan et al. 2014) is the mean of `|d output / d input|` over a group's entries and over the outputs:
     how much a small change of an input changes the action. SHAP (Lundberg and Lee 2017) is estimated by expected
     gradients with the recorded states as baselines: a group's contribution is the sum over its entries of how far they
     move an output from its mean, as an absolute value, averaged over the outputs. Both are first averaged along each

@@ -24,7 +24,7 @@ class Layer:
 
     @property
     def tensors(self) -> int:
-        """Return the number of parameters: weight, bias, and the layer norm's scale and shift."""
+        """Return the number of parameters, which are weight, bias, and the layer norm's scale and shift."""
         return 4 if self.norm else 2
 
     @property

@@ -126,7 +126,7 @@ class StratifiedSampler(Sampler):
 
         Returns:
             Slots `(batch_size,)`, and `{"table": (batch_size,)}`, with `priority_weight` if prioritised. The weight is
-            `(n P(i))^-beta` over the largest one of the batch. n is the number of records of the table, P(i) the
+            ``(n P(i))^-beta`` over the largest one of the batch. n is the number of records of the table, P(i) the
             probability within it.
         """
         device = getattr(storage, "device", None)

@@ -32,7 +32,7 @@ class TaskWeights:
         progress: Reward per metre along the track; there is none while the car is off course.
         off_course: Penalty per second with three wheels off the track, times the squared speed in km/h.
         wall: Penalty per second against a wall, times the squared speed in km/h.
-        tyre_slip: Penalty on Σ min(|slip ratio|, 1) |slip angle|.
+        tyre_slip: Penalty on `Σ min(|slip ratio|, 1) |slip angle|`.
         passing: Reward per metre gained on cars nearby.
         contact: Penalty of any contact.
         rear_end: Penalty of contact with a car ahead, times the squared relative speed.
