@@ -51,8 +51,9 @@ def graph_of(function: nn.Module, example: Mapping[str, Tensor], outputs: Sequen
         torch.compile(function, backend=keep, fullgraph=True, dynamic=False)(*inputs)
         ((graph, values),) = found
         program = torch.export.export(_Captured(graph, values, inputs), inputs).run_decompositions()
-        names = {"input_names": list(example), "output_names": list(outputs)}
-        exported = torch.onnx.export(program, dynamo=True, external_data=False, verbose=False, **names).model_proto
+        names: dict[str, Any] = {"input_names": list(example), "output_names": list(outputs)}
+        written: Any = torch.onnx.export(program, dynamo=True, external_data=False, verbose=False, **names)
+    exported = written.model_proto
     for node in exported.graph.node:  # where in the source it comes from, which names folders
         node.doc_string = ""
         del node.metadata_props[:]

@@ -167,7 +167,7 @@ def _trace(plain: DeterministicAction) -> Any:
     # The example has two rows, because torch.export would treat a batch of one as a constant.
     example = (torch.zeros(2, plain.observation_dim), torch.zeros(2, plain.style_dim))
     batch = torch.export.Dim("batch")
-    names = {"input_names": ["observation", "style"], "output_names": list(plain.output_names)}
-    options = {"dynamic_shapes": ({0: batch}, {0: batch}), "external_data": False, "verbose": False}
+    names: dict[str, Any] = {"input_names": ["observation", "style"], "output_names": list(plain.output_names)}
+    options: dict[str, Any] = {"dynamic_shapes": ({0: batch}, {0: batch}), "external_data": False, "verbose": False}
     with quietly():
         return torch.onnx.export(plain, example, dynamo=True, **names, **options)

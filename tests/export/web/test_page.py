@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from coachable.cli import main
+from coachable.domain import load_domain
 from coachable.export.web import third_party
 
 STATIC = Path(str(files("coachable.export.web"))) / "static"
@@ -31,6 +32,16 @@ def test_a_domain_without_a_page_says_so(capsys, tmp_path):
     assert main(["export", "combat", "--web", str(tmp_path / "site")]) == 2
     assert "the domain combat has no page for the browser" in capsys.readouterr().err
     assert not (tmp_path / "site").exists()
+
+
+def test_a_walker_with_a_styled_speed_measures_it():
+    domain = load_domain("humanoid_gait")
+    assert domain.make_web is not None
+    part = domain.make_web(domain.make_space())
+    observation, measured, mark, memory, terminated = part.features(*part.example.values())
+    assert [measure.parameter for measure in part.measures] == ["pose", "step_length", "speed"]
+    shapes = [tuple(result.shape) for result in (observation, measured, mark, memory, terminated)]
+    assert shapes == [(1, 82), (1, 3), (1, 5), tuple(part.example["memory"].shape), (1,)]
 
 
 def test_assets_belong_to_the_page(capsys, tmp_path):
