@@ -143,7 +143,7 @@ def _match(
     column: int, wanted: np.ndarray, found: np.ndarray, size: np.ndarray, candidates: Sequence[int]
 ) -> _Match | None:
     factor = _factor(wanted[:, column], found)
-    if factor and _fits(factor * wanted[:, column], found, factor, size[column]):
+    if _fits(wanted[:, column], found, factor):
         return _Match(column, column, factor)
     equal = [(float(np.abs(wanted[:, k] - found).max()), k) for k in candidates if k != column]
     error, source = min(equal, key=lambda pair: pair[0], default=(np.inf, column))
@@ -151,8 +151,7 @@ def _match(
         return _Match(column, source, 1.0)
     for source in candidates:
         factor = _factor(wanted[:, source], found)
-        moves = np.ptp(wanted[:, source]) > 0.0
-        if factor and moves and _fits(factor * wanted[:, source], found, factor, size[source]):
+        if np.ptp(wanted[:, source]) > TOLERANCE and _fits(wanted[:, source], found, factor):
             return _Match(column, source, factor)
     return None
 
@@ -163,8 +162,10 @@ def _factor(wanted: np.ndarray, found: np.ndarray) -> float:
     return float(wanted @ found) / square if square > 1e-12 else 0.0
 
 
-def _fits(wanted: np.ndarray, found: np.ndarray, factor: float, size: float) -> bool:
-    return bool((np.abs(wanted - found) <= TOLERANCE * size * abs(factor)).all())
+def _fits(wanted: np.ndarray, found: np.ndarray, factor: float) -> bool:
+    """Return whether one column is a multiple of another that is large enough to tell."""
+    tells = factor != 0.0 and np.abs(wanted).max() > TOLERANCE
+    return bool(tells and (np.abs(factor * wanted - found) <= TOLERANCE * np.abs(found).max()).all())
 
 
 def _control_rate(contract: Contract, recorded: Recorded, repeat: Callable[..., np.ndarray]) -> Diagnosis | None:
