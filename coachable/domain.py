@@ -17,6 +17,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, Transform
 
 from coachable.defaults import EnvPictures, RewardMeasures, steps_per_episode, style_grid, time_per_step
+from coachable.scene.frame import Stage
 from coachable.styles import Setpoint, StyleReward, StyleSpace
 from coachable.transforms import CoachableEnv, coachable_env
 
@@ -95,6 +96,33 @@ class Control:
 
 
 @dataclass(frozen=True)
+class Disturbance:
+    """Disturbance of the agent from outside that lasts a moment, such as a push.
+
+    Attributes:
+        strength: Name of the disturbance, and range, unit and usual value of its strength.
+        directions: Names of the directions.
+        apply: Function `(env, direction, strength)` that disturbs the agent from the next step on.
+    """
+
+    strength: Setpoint
+    directions: Sequence[str]
+    apply: Callable[[EnvBase, str, float], None]
+
+    def check(self, direction: str, strength: float) -> None:
+        """Check that there is such a direction and strength.
+
+        Raises:
+            ValueError: If there is not.
+        """
+        name, low, high = self.strength.name, self.strength.low, self.strength.high
+        if direction not in self.directions:
+            raise ValueError(f"{name} has no direction {direction!r}: expected one of {list(self.directions)}")
+        if not low <= strength <= high:
+            raise ValueError(f"{name} = {strength}: expected a number in [{low:g}, {high:g}] {self.strength.unit}")
+
+
+@dataclass(frozen=True)
 class Words:
     """Words for a domain, in addition to the names and help texts of its styles.
 
@@ -148,8 +176,8 @@ class Domain:
         make_reward: `(space) -> StyleReward`; a recipe may pass further settings.
         measures: Measured style; by default `RewardMeasures`, from the terms of the style reward.
         make_renderer: `(width, height) -> Renderer`; by default `EnvPictures`, the environment's own pictures.
-        make_scene: `(server, session) -> coachable.coach.page.views.View`, which draws the page in 3-D; None shows the
-            renderer's pictures.
+        make_stage: `() -> coachable.scene.frame.Stage`, the scene that the page shows in 3-D; None shows the renderer's
+            pictures.
         grid: Values of each style parameter, of which the evaluation grid has all combinations, or a list of styles by
             parameter name. By default a few values over each parameter's evaluation range.
         control_step: Duration of one env step [s]; by default from the environment's attributes, or 1.
@@ -162,6 +190,8 @@ class Domain:
         observation_groups: Name and width of each block of the observation, in order, for explanations; by default
             every entry is a group of its own.
         controls: Live controls, which are steered while the agent acts.
+        disturbances: What may disturb the agent while it acts.
+        window: Time over which a session measures the style [s].
         words: Words for the domain, for phrases and presets.
         as_trained: Function from `env` of a training's configuration to this domain with these settings (such as the
             machines or cars); None if trainings do not differ.
@@ -185,11 +215,13 @@ class Domain:
     units: Mapping[str, str] = field(default_factory=dict)
     observation_groups: Sequence[tuple[str, int]] = ()
     controls: Sequence[Control] = ()
+    disturbances: Sequence[Disturbance] = ()
+    window: float = 2.0
     words: Words = field(default_factory=Words)
     as_trained: Callable[[Mapping[str, Any]], Domain] | None = None
     coached: Mapping[str, Any] = field(default_factory=dict)
     evaluation: Callable[..., str] | None = None
-    make_scene: Callable[..., Any] | None = None
+    make_stage: Callable[[], Stage] | None = None
 
     def styled_env(
         self,

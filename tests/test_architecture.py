@@ -22,12 +22,13 @@ BASE = {"extras", "files", "finite", "gl", "keys", "offscreen", "ranges", "third
 # Of each room, the rooms below it that it may import; what these may import it may, too.
 ROOMS = {
     "styles": set(),
+    "scene": set(),  # what there is to see
     "distributions": {"styles"},
     "networks": {"distributions"},
     "losses": {"networks"},
     "replay": {"networks"},
     "transforms": {"networks"},
-    "defaults": {"transforms"},  # what a `Domain` leaves out
+    "defaults": {"transforms", "scene"},  # what a `Domain` leaves out
     "domain": {"defaults"},  # the type of a declaration
     "training": {"domain", "losses", "replay"},
     "fast": {"losses", "training"},

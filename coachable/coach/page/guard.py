@@ -25,6 +25,8 @@ import websockets.asyncio.server as server
 from websockets import Headers
 from websockets.http11 import Request, Response
 
+from coachable.coach.page.looks import dressed
+
 _THIS_MACHINE = ("localhost", "127.0.0.1", "::1")
 _EVERYWHERE = ("", "*", "0.0.0.0", "::")
 _HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([^\[\]:@/\s]+))(?::\d{1,5})?", re.IGNORECASE)
@@ -92,6 +94,7 @@ class Guard:
                 return _refused(http.HTTPStatus.SERVICE_UNAVAILABLE, f"{_CONNECTIONS} browsers are connected already")
             response = answer(connection, request)
             if response is not None:
+                response = dressed(response)
                 response.headers.update(_protection(request.headers["Host"]))
             return response
 

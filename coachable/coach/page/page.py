@@ -8,29 +8,32 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from coachable.coach.page.film import FilmStudio
 from coachable.coach.page.views import View, make_view
-from coachable.coach.page.widgets import Chart, MeasuredText, ParameterWidget, write
+from coachable.coach.page.widgets import Chart, MeasuredText, ParameterWidget, label, write
 from coachable.coach.phrases.grammar import Understanding
 from coachable.coach.session.loop import LiveLoop
 from coachable.coach.session.plan import read_plan
 from coachable.coach.session.readout import StyleReport, measures_by_parameter
 from coachable.coach.session.recording import Recording
 from coachable.coach.session.session import CoachSession
+from coachable.domain import Disturbance
 from coachable.evaluation.wording import readable, readable_number
 from coachable.styles import Parameter
 
 if TYPE_CHECKING:
     import viser
 
-_FRAMES_PER_SECOND = 30.0
+_FRAMES_PER_SECOND = 45.0  # at most
 _REPORTS_PER_SECOND = 5.0
+_OVERLAYS_PER_SECOND = 10.0
 _FILM_SECONDS = 10.0
 _SPEEDS = (0.1, 4.0)
 _LONGEST_PHRASE, _LONGEST_PLAN, _LONGEST_NAME = 200, 2000, 40  # characters
 _PRESETS = 50
+_STRENGTHS = 20  # of a disturbance, that the slider can have
 _LARGEST_FILE = 8 << 20  # [byte]
 _S = TypeVar("_S", str, bytes)
 _T = TypeVar("_T")
@@ -50,17 +53,20 @@ class CoachPage:
     Attributes:
         loop: Loop that steps the session.
         widgets: Widgets by parameter name, including the live controls.
+        disturbances: Slider of the strength and buttons of the directions, by the disturbance's name.
     """
 
     def __init__(self, server: viser.ViserServer, session: CoachSession) -> None:
         self.server, self.session = server, session
-        self.loop = LiveLoop(session, self._on_step, on_stop=self._close_view)
+        self.loop = LiveLoop(session, self._on_step, on_stop=self._close_view, on_wait=self._draw)
         self._view: View | None = None
         self._reading = threading.Lock()
         self._studio = FilmStudio(session, lambda note: write(self.film_note, escaped(note)))
-        self._frame_due = self._report_due = 0.0
+        self._frame_due = self._report_due = self._overlay_due = 0.0
         self.widgets: dict[str, ParameterWidget] = {}
         self.measured: dict[str, MeasuredText] = {}
+        self.disturbances: dict[str, tuple[Any, Any]] = {}
+        self.overlay = server.gui.add_html("")
         self.status = server.gui.add_markdown("")
         self._add_run()
         tabs = server.gui.add_tab_group()
@@ -97,12 +103,31 @@ class CoachPage:
                 for control in self.session.domain.controls:
                     name = control.parameter.name
                     self._add_widget(control.parameter, self.session.controls[name], self._steer)
+        for disturbance in self.session.domain.disturbances:
+            self._add_disturbance(disturbance)
         folder = self.server.gui.add_folder("Requested and measured")
         self.chart = Chart(self.server, folder, self.session.space, self.loop.show)
+        self.view_folder = self.server.gui.add_folder("View")
 
     def _add_widget(self, parameter: Parameter, value: float | str, request: Callable[[ParameterWidget], None]) -> None:
         name = parameter.name
         self.widgets[name] = ParameterWidget(self.server, parameter, value, lambda: request(self.widgets[name]))
+
+    def _add_disturbance(self, disturbance: Disturbance) -> None:
+        """Add a slider for the strength of a disturbance, and a button for each direction."""
+        gui, name, strength = self.server.gui, disturbance.strength.name, disturbance.strength
+        with gui.add_folder(f"{readable(name).capitalize()} the agent"):
+            step = (strength.high - strength.low) / _STRENGTHS
+            usual = cast(float, strength.default)
+            slider = gui.add_slider(label(strength), strength.low, strength.high, step, usual)
+            buttons = gui.add_button_group("towards", tuple(disturbance.directions))
+        self.disturbances[name] = slider, buttons
+
+        def disturb(_event: object) -> None:
+            direction, force = str(buttons.value), float(slider.value)
+            self.loop.submit(lambda session: session.disturb(name, direction, force))
+
+        buttons.on_click(disturb)
 
     def _set(self, widget: ParameterWidget) -> None:
         def change(session: CoachSession) -> None:
@@ -246,10 +271,19 @@ class CoachPage:
             self._show(self.session.report())
         # The view comes last: if it fails, the read-outs still show the problem.
         if self._view is None:
-            self._view = make_view(self.server, self.session)
-        if now >= self._frame_due or self.loop.paused:
+            with self.view_folder:
+                self._view = make_view(self.server, self.session)
+        self._draw()
+
+    def _draw(self) -> None:
+        """Update the view, unless that was done a moment ago; the loop calls this in its thread."""
+        now = time.perf_counter()
+        if self._view is not None and (now >= self._frame_due or self.loop.paused):
             self._frame_due = now + 1.0 / _FRAMES_PER_SECOND
-            self._view.update()
+            self._view.update(self.loop.share)
+            if now >= self._overlay_due or self.loop.paused:
+                self._overlay_due = now + 1.0 / _OVERLAYS_PER_SECOND
+                write(self.overlay, self._view.overlay)
 
     def _show(self, report: StyleReport) -> None:
         with self.server.atomic():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from coachable.domain import Control
+from coachable.coach.session.influences import Influences
 from coachable.styles import Choice, Parameter, StyleSpace
 
 SCHEMA_VERSION = 1
@@ -36,7 +36,7 @@ class Recording:
         controls: Live controls at the start, by name.
         endless: Whether time limits were ignored.
         events: `{"step": k, ...}` in order, each applied before step k (from 0), with one of `style` (changed
-            parameters), `controls` (changed controls) and `reset` (true).
+            parameters), `controls` (changed controls), `disturbance` (name, direction and strength) and `reset` (true).
         steps: Number of steps.
         checks: Pairs of a step and the checksum of the observation after it, with which a replay is compared.
     """
@@ -79,16 +79,17 @@ class Recording:
         recording.checks = [(step, checksum) for step, checksum in recording.checks]
         return recording
 
-    def check(self, domain: str, space: StyleSpace, controls: Mapping[str, Control]) -> None:
+    def check(self, domain: str, space: StyleSpace, influences: Influences) -> None:
         """Check that a session can replay this recording.
 
         Args:
             domain: Name of the session's domain.
             space: Its style space.
-            controls: Its live controls, by name.
+            influences: Its live controls and disturbances.
 
         Raises:
-            ValueError: If the session has another domain, or lacks a style parameter, a control or a value.
+            ValueError: If the session has another domain, or lacks a style parameter, a control, a disturbance or a
+                value.
         """
         if self.domain != domain:
             raise ValueError(f"the recording belongs to {self.domain!r}, this session to {domain!r}")
@@ -101,10 +102,11 @@ class Recording:
                     raise ValueError(f"the recording asks for {name} = {value!r}, which lies outside the trained range")
         for steering in (self.controls, *(event.get("controls", {}) for event in self.events)):
             for name, value in steering.items():
-                if name not in controls:
-                    raise ValueError(f"no live control named {name!r}: {domain} has {list(controls)}")
-                if controls[name].fit(value) != value:
+                if influences.fitted({name: value})[name] != value:
                     raise ValueError(f"the recording steers {name} = {value}, which lies outside its range")
+        for event in self.events:
+            if "disturbance" in event:
+                influences.disturbance(**event["disturbance"])
 
     def save(self, file: Path | str) -> Path:
         """Write the recording to a JSON file, whose folder is created if missing, and return the path."""
@@ -164,7 +166,15 @@ _SHARED: dict[str, Callable[[Any], bool]] = {
     "style": lambda value: isinstance(value, dict) and all(isinstance(v, str) or _is_number(v) for v in value.values()),
     "controls": lambda value: isinstance(value, dict) and all(map(_is_number, value.values())),
 }
-_EVENT = {**_SHARED, "step": _is_count, "reset": lambda value: value is True}
+
+
+def _is_disturbance(value: Any) -> bool:
+    names = {"name": str, "direction": str}
+    fits = isinstance(value, dict) and set(value) == {*names, "strength"} and _is_number(value["strength"])
+    return fits and all(isinstance(value[name], kind) for name, kind in names.items())
+
+
+_EVENT = {**_SHARED, "step": _is_count, "disturbance": _is_disturbance, "reset": lambda value: value is True}
 _SCHEMA = {
     **_SHARED,
     **dict.fromkeys(("domain", "source"), lambda value: isinstance(value, str)),

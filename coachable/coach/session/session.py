@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 
 from coachable.coach.phrases.fitting import fitting
 from coachable.coach.phrases.grammar import StyleGrammar, Understanding
+from coachable.coach.session.influences import Influences
 from coachable.coach.session.live_episodes import LiveEpisodes
 from coachable.coach.session.readout import MeasuredWindow, StyleReport
 from coachable.coach.session.recording import Recording, check_seed, is_trained
@@ -40,7 +41,7 @@ class CoachSession:
         style: First request, by parameter name; other parameters have the space's default.
         strict: Whether to raise for a request outside the trained range instead of clamping it with a warning.
         endless: Whether to continue when the domain's time limit is reached.
-        window: Length of the measured window [s].
+        window: Length of the measured window [s]; by default the domain's.
 
     Attributes:
         policy: The policy; you may replace it between steps.
@@ -68,17 +69,17 @@ class CoachSession:
         style: Mapping[str, float | str] | None = None,
         strict: bool = False,
         endless: bool = True,
-        window: float = 2.0,
+        window: float | None = None,
     ) -> None:
         self.policy, self.space, self.domain, self.source = policy, space, domain, source
         parameters = [*space.parameters, *(control.parameter for control in domain.controls)]
         words = fitting(domain.words, parameters)
-        self.strict, self.hold, self.window = strict, True, window
+        self.strict, self.hold = strict, True
+        self.window = window = domain.window if window is None else window
         self._episodes = LiveEpisodes(domain, space, endless=endless, terminated=words.terminated)
         self.presets: dict[str, dict[str, Any]] = {"default": space.describe(space.default)}
         self.presets |= {name: dict(style) for name, style in words.presets.items()}
-        self._controls = {control.parameter.name: control for control in domain.controls}
-        self._control_values = {name: cast(float, c.parameter.default) for name, c in self._controls.items()}
+        self._influences = Influences(domain)
         self.grammar = StyleGrammar(parameters, words.vocabulary, words.examples)
         self._understood: Understanding | None = None
         self._recent = MeasuredWindow(domain.measures, round(window / domain.control_step))
@@ -109,7 +110,7 @@ class CoachSession:
     @property
     def controls(self) -> dict[str, float]:
         """Values of the live controls, by name, in their units."""
-        return dict(self._control_values)
+        return dict(self._influences.values)
 
     def set(self, **values: float | str) -> None:
         """Request another style from the next observation on; parameters that are not named keep their values.
@@ -139,12 +140,19 @@ class CoachSession:
         Raises:
             ValueError: For an unknown control or NaN.
         """
-        for name in values:
-            if name not in self._controls:
-                raise ValueError(f"no live control named {name!r}: {self.domain.name} has {list(self._controls)}")
-        fitted = {name: self._controls[name].fit(float(value)) for name, value in values.items()}
+        fitted = self._influences.fitted(values)
         self._timeline.take_over()
         self._apply({"controls": fitted})
+
+    def disturb(self, name: str, direction: str, strength: float | None = None) -> None:
+        """Disturb the agent from the next step on, for example push it; None is the usual strength.
+
+        Raises:
+            ValueError: If the domain has no such disturbance, direction or strength.
+        """
+        event = self._influences.disturbance(name, direction, strength)
+        self._timeline.take_over()
+        self._apply({"disturbance": event})
 
     def say(self, phrase: str) -> Understanding:
         """Request a style in words: "shorter steps, arms up", "0.4 m", "a bit more", or a preset's name.
@@ -173,7 +181,9 @@ class CoachSession:
             ValueError: In strict mode, for a number outside the trained range.
         """
         style = {name: value for name, value in understood.changes.items() if name in self.space}
-        controls = {name: float(value) for name, value in understood.changes.items() if name in self._controls}
+        controls = {
+            name: float(value) for name, value in understood.changes.items() if name in self._influences.controls
+        }
         if style:
             self.set(**style)
         if controls:
@@ -228,13 +238,18 @@ class CoachSession:
         self._complied_at: int | None = None
         self._generator = torch.Generator().manual_seed(seed)
         self._episodes.seed(seed)
-        self._steer_env()
+        self._influences.steer(self.base_env)
         self._begin_episode()
 
     @property
     def step_count(self) -> int:
         """Number of steps since the session was last seeded."""
         return self._timeline.step
+
+    @property
+    def episode(self) -> int:
+        """Number of the episode, from 1."""
+        return self._episodes.number
 
     @torch.no_grad()
     def step(self) -> TensorDictBase:
@@ -328,9 +343,9 @@ class CoachSession:
             ValueError: If the recording belongs to another domain, style space or set of controls; the session is
                 then unchanged.
         """
-        recording.check(self.domain.name, self.space, self._controls)
+        recording.check(self.domain.name, self.space, self._influences)
         self._theta, self._outside = self.space.make(strict=True, **recording.style), {}
-        self._control_values |= recording.controls
+        self._influences.values |= recording.controls
         self._episodes.endless = recording.endless
         self.reset(recording.seed)
         self._timeline.repeat(recording)
@@ -350,9 +365,12 @@ class CoachSession:
         if "style" in event:
             self._request(self.space.make(**(self.style | event["style"])), event["style"])
         if "controls" in event:
-            self._control_values |= event["controls"]
-            self._steer_env()
+            self._influences.values |= event["controls"]
+            self._influences.steer(self.base_env)
             self._timeline.note({"controls": dict(event["controls"])})
+        if "disturbance" in event:
+            self._influences.disturb(self.base_env, event["disturbance"])
+            self._timeline.note({"disturbance": dict(event["disturbance"])})
         if "reset" in event:
             self._timeline.note({"reset": True})
             self._begin_episode()
@@ -376,10 +394,6 @@ class CoachSession:
             self._request(drawn, self.space.describe(drawn))
         self._episodes.begin(self._theta)
         self._recent.clear()
-
-    def _steer_env(self) -> None:
-        for name, value in self._control_values.items():
-            self._controls[name].apply(self.base_env, value)
 
     def _seconds(self, step: int) -> float:
         return (step - self._steps_at_request) * self.domain.control_step

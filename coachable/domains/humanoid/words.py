@@ -1,10 +1,12 @@
 """Words of the coach's commands to the humanoid, and the control of its course."""
 
 import math
+from typing import Any, cast
 
+import numpy as np
 from torchrl.envs import EnvBase
 
-from coachable.domain import Control, Words
+from coachable.domain import Control, Disturbance, Words
 from coachable.styles import Setpoint
 
 
@@ -14,6 +16,21 @@ def _steer(env: EnvBase, course_deg: float) -> None:
 
 COURSE = Control(
     Setpoint("course", -180.0, 180.0, unit="deg", help="direction of walking, left is positive"), _steer, circular=True
+)
+
+_DIRECTIONS = {"forward": 0.0, "left": 90.0, "back": 180.0, "right": -90.0}  # [deg], from the course
+
+
+def _push(env: EnvBase, direction: str, force: float) -> None:
+    humanoid = cast(Any, env)
+    angle = humanoid.course + math.radians(_DIRECTIONS[direction])
+    humanoid.push_torso(force * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1))
+
+
+PUSH = Disturbance(
+    Setpoint("push", 10.0, 200.0, unit="N", default=100.0, help="force on the torso for 0.2 s"),
+    tuple(_DIRECTIONS),
+    _push,
 )
 
 _VOCABULARY = {
