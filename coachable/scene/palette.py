@@ -14,7 +14,7 @@ SKY: Colour = (86, 180, 233)
 GREEN: Colour = (0, 158, 115)
 YELLOW: Colour = (240, 228, 66)
 BLUE: Colour = (0, 114, 178)
-VERMILLION: Colour = (213, 94, 0)
+VERMILION: Colour = (213, 94, 0)
 PURPLE: Colour = (204, 121, 167)
 
 WHITE: Colour = (240, 240, 236)
@@ -23,7 +23,7 @@ STEEL: Colour = (118, 124, 132)
 SLATE: Colour = (74, 80, 88)
 INK: Colour = (34, 37, 43)
 
-REQUESTED, MEASURED = VERMILLION, (10, 122, 186)
+REQUESTED, MEASURED = VERMILION, (10, 122, 186)
 """What was asked for and what was measured, in charts, scenes and films; the blue is lighter, for the dark page."""
 
 

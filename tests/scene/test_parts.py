@@ -126,7 +126,7 @@ def luminance(colour):
 
 @pytest.mark.parametrize("kind", [None, *BLINDNESS])
 def test_hues_are_distinct_for_the_colour_blind(kind):
-    hues = ("ORANGE", "SKY", "GREEN", "YELLOW", "BLUE", "VERMILLION", "PURPLE", "INK", "WHITE")
+    hues = ("ORANGE", "SKY", "GREEN", "YELLOW", "BLUE", "VERMILION", "PURPLE", "INK", "WHITE")
     seen = np.eye(3) if kind is None else np.array(BLINDNESS[kind])
     labs = {name: lab(seen @ linear(getattr(palette, name))) for name in hues}
     for one in hues:

@@ -38,7 +38,7 @@ _STYLE = """
 }
 .gauges:empty { display: none; }
 .gauge { display: flex; gap: 8px; align-items: center; }
-.gauge b { flex: 0 0 7.2em; font-weight: 400; opacity: 0.85; }
+.gauge b { flex: 0 0 9.5em; font-weight: 400; opacity: 0.85; white-space: nowrap; }
 .gauge span { position: relative; flex: 1; min-width: 9em; height: 1.45em; border-radius: 3px; overflow: hidden; }
 .gauge span:has(i) { background: rgba(255, 255, 255, 0.16); }
 .gauge i { position: absolute; inset: 0 auto 0 0; }
@@ -53,7 +53,7 @@ _STYLE = """
 .legend i { flex: none; width: 14px; height: 14px; border-radius: 3px; border: 1px solid rgba(128, 128, 128, 0.7); }
 @media (max-width: 576px) {
   .gauges { top: 6px; bottom: auto; left: 6px; font-size: 10px; line-height: 1.35; min-width: 0; padding: 3px 6px; }
-  .gauge b { flex-basis: 6em; }
+  .gauge b { flex-basis: 8.5em; }
   .gauge span { min-width: 7em; }
   [style*="width: 20em"] { width: 100% !important; }
   .map { left: auto; right: 6px; top: 6px; width: 90px; height: 90px; }

@@ -15,7 +15,7 @@ from coachable.scene.parts import Parts, about_x, about_y, about_z, towards
 QUADRUPED, BIPED, SERPENT, UPRIGHT = "quadruped", "biped", "serpent", "upright"
 METAL, JOINT, ARMOUR = (158, 164, 172), (70, 75, 82), (222, 224, 224)
 _SWING = 0.5  # [rad], of a leg to either side
-_STRIDE = 1.6  # radii, distance in which a leg swings once to and fro
+_STRIDE = 1.6  # radii, distance in which a leg swings once forward and back
 PLAYER = palette.BLUE
 _SKIN = (224, 180, 150)
 
@@ -256,7 +256,7 @@ def removable(kind: int, radius: float, offset: np.ndarray) -> Parts:
     return parts
 
 
-PART_COLOURS: tuple[Colour, ...] = (palette.SKY, palette.VERMILLION, palette.YELLOW)
+PART_COLOURS: tuple[Colour, ...] = (palette.SKY, palette.VERMILION, palette.YELLOW)
 """Colours of shields (plates), weapons (barrels that point forward) and canisters."""
 
 

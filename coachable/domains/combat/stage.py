@@ -27,14 +27,14 @@ ELEMENT_COLOURS: dict[str, Colour] = {
     "frost": palette.SKY,
     "shock": palette.YELLOW,
     "plasma": palette.PURPLE,
-    "fire": palette.VERMILLION,
+    "fire": palette.VERMILION,
     "adhesive": palette.ORANGE,
     "blast": palette.INK,
 }
 LAMPS: dict[int, Colour] = {
     IDLE: palette.SKY,
     TELEGRAPH: palette.YELLOW,
-    ACTIVE: palette.VERMILLION,
+    ACTIVE: palette.VERMILION,
     RECOVER: palette.WHITE,
     STAGGERED: palette.PURPLE,
 }
@@ -42,6 +42,7 @@ _PLAIN = palette.SILVER  # ammunition without an element
 _BAR = (2.4, 0.26)  # [m], health bar
 _SHOWN = 0.05  # build-up of an element from which it is shown
 _BOUND_POSTS = 48
+_AHEAD = 7.0  # [m], largest distance of the focus from the player
 _ARC = math.radians(60.0)  # of a bite, to either side
 _RAYS = 15
 
@@ -49,7 +50,7 @@ _RAYS = 15
 class CombatStage:
     """Scene of one fight of a `CombatEnv` or of an environment around it; see `coachable.scene.frame.Stage`."""
 
-    viewpoint = Viewpoint(distance=24.0, elevation=34.0, azimuth=-70.0, far=320.0, height=1.0)
+    viewpoint = Viewpoint(distance=27.0, elevation=34.0, azimuth=-70.0, far=320.0, height=1.0)
     legend = (
         *((colour, name) for name, colour in ELEMENT_COLOURS.items()),
         *zip(PART_COLOURS, ("shields (plates)", "weapons (barrels)", "canisters"), strict=True),
@@ -83,7 +84,8 @@ class CombatStage:
             self._add_machine(parts, glows, labels, env, s, row, enemy)
         marks = _ground_marks(s, glows)
         here, nearest = s["position"], s["enemy_position"][:, _nearest(s)]
-        middle = here + np.clip(0.5 * (nearest - here), -12.0, 12.0)
+        apart = nearest - here
+        middle = here + apart * min(0.5, _AHEAD / max(float(np.hypot(*apart)), 1e-6))  # both are seen, if they are near
         return Frame(
             parts=parts,
             focus=(*middle.tolist(), self.viewpoint.height),
@@ -116,6 +118,7 @@ class CombatStage:
         leaning = 0.6 if s["timers"][DODGE] > 0 else 0.0
         figure = player(WEAPONS[weapon], colour, self._walk(-1, place), leaning)
         parts.figure(figure, (*place, 0.0), about_z(yaw))
+        parts.cylinder((*place, 0.03), (1.6, 1.6, 0.03), palette.mixed(PLAYER, palette.WHITE, 0.3))
         wheel = AMMO_SLOTS * weapon + section
         rounds = float(s["magazine"][wheel])
         fired = self._rounds is not None and self._rounds[0] == wheel and rounds < self._rounds[1]
@@ -167,8 +170,8 @@ class CombatStage:
         for slot in range(c.SHOT_SLOTS):
             if s["land_timer"][slot, enemy] > 0:
                 target = s["shot_point"][:, slot, enemy]
-                glows.cylinder((*target, 0.08), (2 * c.SHOT_RADIUS, 2 * c.SHOT_RADIUS, 0.08), palette.VERMILLION)
-                glows.rod(above(ground, radius), (*target, 0.3), 0.05, palette.VERMILLION)
+                glows.cylinder((*target, 0.08), (2 * c.SHOT_RADIUS, 2 * c.SHOT_RADIUS, 0.08), palette.VERMILION)
+                glows.rod(above(ground, radius), (*target, 0.3), 0.05, palette.VERMILION)
 
 
 def _combat(env: EnvBase) -> CombatEnv:
@@ -203,7 +206,7 @@ def _health_bar(parts: Parts, place: np.ndarray, share: float, azimuth: float) -
     share, across = min(max(share, 0.0), 1.0), math.radians(azimuth) + math.pi / 2
     along = np.array([math.cos(across), math.sin(across), 0.0])
     length, height = _BAR
-    colour = palette.GREEN if share > 0.5 else palette.ORANGE if share > 0.25 else palette.VERMILLION
+    colour = palette.GREEN if share > 0.5 else palette.ORANGE if share > 0.25 else palette.VERMILION
     parts.box(place, (length + 0.1, 0.08, height + 0.1), palette.INK, about_z(across))
     filled = place + (share - 1.0) * length / 2 * along
     parts.box(filled, (max(share * length, 1e-3), 0.14, height), colour, about_z(across))
@@ -243,7 +246,7 @@ def _ground_marks(s: Mapping[str, np.ndarray], glows: Parts) -> Parts:
     for index in range(_BOUND_POSTS):
         angle = 2 * math.pi * index / _BOUND_POSTS
         place = anchor + c.BOUND_RADIUS * np.array([math.cos(angle), math.sin(angle)])
-        marks.box((*place, 0.05), (0.14, 2.0, 0.06), palette.VERMILLION, about_z(angle))
+        marks.box((*place, 0.05), (0.14, 2.0, 0.06), palette.VERMILION, about_z(angle))
     return marks
 
 

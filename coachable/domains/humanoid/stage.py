@@ -152,8 +152,8 @@ class HumanoidStage:
         if size > 0:
             torso = above(self._data.qpos[:3], 0.1)
             tail = torso - (0.15 + _PUSH_SCALE * size) * force / size
-            glows.rod(tail, torso - 0.15 * force / size, 0.03, palette.VERMILLION)
-            glows.ball(torso - 0.15 * force / size, (0.12,) * 3, palette.VERMILLION)
+            glows.rod(tail, torso - 0.15 * force / size, 0.03, palette.VERMILION)
+            glows.ball(torso - 0.15 * force / size, (0.12,) * 3, palette.VERMILION)
         return glows
 
     def _body(self) -> Parts:

@@ -61,7 +61,7 @@ def body(kind: str, length: float, width: float, colour: Colour) -> Parts:
     parts.box((0.0, 0.0, 0.63), (0.90 * length, 0.10 * width, 0.03), dark)  # stripe
     for side in (-1, 1):
         parts.box((0.495 * length, side * 0.33 * width, 0.50), (0.03, 0.18 * width, 0.10), palette.WHITE)
-        parts.box((-0.475 * length, side * 0.33 * width, 0.54), (0.03, 0.20 * width, 0.10), palette.VERMILLION)
+        parts.box((-0.475 * length, side * 0.33 * width, 0.54), (0.03, 0.20 * width, 0.10), palette.VERMILION)
     if kind == GRAND_TOURER:
         parts.box((0.48 * length, 0.0, 0.16), (0.08 * length, 0.98 * width, 0.04), palette.INK)  # splitter
         parts.box((-0.46 * length, 0.0, 1.16), (0.09 * length, 0.96 * width, 0.05), palette.INK)  # wing

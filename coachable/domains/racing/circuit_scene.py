@@ -11,7 +11,7 @@ from coachable.scene.palette import Colour
 from coachable.scene.parts import Parts, Surface, about_z
 
 GRASS, RUN_OFF, TARMAC = (126, 150, 104), (158, 156, 148), (88, 91, 97)
-KERB: tuple[Colour, Colour] = (palette.VERMILLION, palette.WHITE)
+KERB: tuple[Colour, Colour] = (palette.VERMILION, palette.WHITE)
 _WALL = (190, 194, 200)
 _LINE = (0.10, 0.35)  # [m], from the edge inwards
 _KERB_WIDTH, _KERB_CURVATURE = 1.3, 1.0 / 300.0  # [m], [1/m]: kerbs are where the track bends more

@@ -175,13 +175,13 @@ def _gauges(state: np.ndarray, slip: np.ndarray) -> Sequence[Gauge]:
             "slip angle",
             f"{angle:.0f}°{', sliding' if sliding else ''}",
             angle / _FULL["slip"],
-            palette.VERMILLION if sliding else palette.BLUE,
+            palette.VERMILION if sliding else palette.BLUE,
         ),
         Gauge("fuel", f"{fuel:.1f} l", fuel / _FULL["fuel"], palette.ORANGE),
         Gauge(
             "tyres worn",
             " ".join(f"{value:.0f}" for value in wear) + " %",
             worn,
-            palette.VERMILLION if worn > _WORN else palette.SKY,
+            palette.VERMILION if worn > _WORN else palette.SKY,
         ),
     )

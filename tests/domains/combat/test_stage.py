@@ -76,7 +76,7 @@ def test_a_removed_part_is_gone(env):
     kinds = env.traits.part_type[:, :, 0, 0]
     for kind, colour in enumerate(PART_COLOURS):
         slots = torch.nonzero(kinds[kind] > 0)[:, 0]
-        # The lamps and the health bar have other colours; yellow and vermillion are used by parts alone here.
+        # The lamps and the health bar have other colours; yellow and vermilion are used by parts alone here.
         count = len(shown(before.parts, colour)) - (2 if colour == LAMPS[IDLE] else 0)
         assert count >= len(slots) > 0
         env.state.count[slots[0], 0, 0] = 0
@@ -95,11 +95,11 @@ def test_the_health_bar_shrinks_and_changes_colour(env):
     env.state.enemy_hp[:] = 39.0
     hurt = stage.frame(env)
     assert len(shown(hurt.parts, palette.GREEN)) == 0
-    assert shown(hurt.parts, palette.VERMILLION)[:, 0].min() == pytest.approx(0.24)
+    assert shown(hurt.parts, palette.VERMILION)[:, 0].min() == pytest.approx(0.24)
     assert hurt.labels[0].text == "Lancehorn 39 HP"
 
 
-@pytest.mark.parametrize("phase, colour", [(TELEGRAPH, palette.YELLOW), (ACTIVE, palette.VERMILLION)])
+@pytest.mark.parametrize("phase, colour", [(TELEGRAPH, palette.YELLOW), (ACTIVE, palette.VERMILION)])
 def test_attacks_mark_the_ground_that_they_reach(env, phase, colour):
     stage = CombatStage()
     assert len(stage.frame(env).glows) == 0
