@@ -52,7 +52,8 @@ _STYLE = """
 .legend div { display: flex; gap: 8px; align-items: center; }
 .legend i { flex: none; width: 14px; height: 14px; border-radius: 3px; border: 1px solid rgba(128, 128, 128, 0.7); }
 @media (max-width: 576px) {
-  .gauges { top: 6px; bottom: auto; left: 6px; font-size: 10px; line-height: 1.35; min-width: 0; padding: 3px 6px; }
+  .gauges { top: 6px; bottom: auto; left: 6px; font-size: 10px; line-height: 1.35; min-width: 0; padding: 3px 6px;
+    background: rgba(34, 37, 43, 0.55); }
   .gauge b { flex-basis: 8.5em; }
   .gauge span { min-width: 7em; }
   [style*="width: 20em"] { width: 100% !important; }
