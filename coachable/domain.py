@@ -18,6 +18,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, Transform
 
 from coachable.defaults import EnvPictures, RewardMeasures, steps_per_episode, style_grid, time_per_step
+from coachable.scene.frame import Stage
 from coachable.signals import Signal
 from coachable.styles import Setpoint, StyleReward, StyleSpace
 from coachable.transforms import CoachableEnv, coachable_env
@@ -177,8 +178,8 @@ class Domain:
         make_reward: `(space) -> StyleReward`; a recipe may pass further settings.
         measures: Measured style; by default `RewardMeasures`, from the terms of the style reward.
         make_renderer: `(width, height) -> Renderer`; by default `EnvPictures`, the environment's own pictures.
-        make_scene: `(server, session) -> coachable.coach.page.views.View`, which draws the page in 3-D; None shows the
-            renderer's pictures.
+        make_stage: `() -> coachable.scene.frame.Stage`, the scene that the page shows in 3-D; None shows the renderer's
+            pictures.
         grid: Values of each style parameter, of which the evaluation grid has all combinations, or a list of styles by
             parameter name. By default a few values over each parameter's evaluation range.
         control_step: Duration of one env step [s]; by default from the environment's attributes, or 1.
@@ -193,6 +194,7 @@ class Domain:
         action_groups: Blocks of the action, in order, for exported models.
         controls: Live controls, which are steered while the agent acts.
         push: Push that a coach may give the agent; None if the environment has none.
+        window: Time over which a session measures the style [s].
         words: Words for the domain, for phrases and presets.
         as_trained: Function from `env` of a training's configuration to this domain with these settings (such as the
             machines or cars); None if trainings do not differ.
@@ -219,12 +221,13 @@ class Domain:
     action_groups: Sequence[Signal] = ()
     controls: Sequence[Control] = ()
     push: Push | None = None
+    window: float = 2.0
     words: Words = field(default_factory=Words)
     as_trained: Callable[[Mapping[str, Any]], Domain] | None = None
     on_track: Callable[[Path], Domain] | None = None
     coached: Mapping[str, Any] = field(default_factory=dict)
     evaluation: Callable[..., str] | None = None
-    make_scene: Callable[..., Any] | None = None
+    make_stage: Callable[[], Stage] | None = None
     make_web: Callable[[StyleSpace], Any] | None = None
 
     def styled_env(

@@ -4,7 +4,7 @@ __all__ = ["EXTRAS", "how_to_install"]
 
 # Distributions by extra.
 EXTRAS = {
-    "ui": ("viser", "mjviser"),
+    "ui": ("viser",),
     "video": ("av",),
     "export": ("onnx", "onnxruntime", "onnxscript"),
     "explain": ("captum",),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
@@ -23,6 +24,7 @@ class OffscreenMujoco:
         model: Compiled model, with an offscreen buffer of at least the size of the image.
         width: Image width [px].
         height: Image height [px].
+        most: Largest number of geoms of a picture.
 
     Raises:
         RenderingError: If no OpenGL library is installed; the message names the package to install.
@@ -31,12 +33,12 @@ class OffscreenMujoco:
         camera: The model's first camera, or a free one that shows the whole model if it has none.
     """
 
-    def __init__(self, model: mujoco.MjModel, width: int, height: int) -> None:
+    def __init__(self, model: mujoco.MjModel, width: int, height: int, most: int = 1000) -> None:
         self._model = model
         self._gl = _make_gl_context(width, height)
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
-        self._scene = mujoco.MjvScene(model, maxgeom=1000)
+        self._scene = mujoco.MjvScene(model, maxgeom=most)
         for slow in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._scene.flags[slow] = False  # they take most of the time of software rendering
         self._option = mujoco.MjvOption()
@@ -46,10 +48,19 @@ class OffscreenMujoco:
         if model.ncam:
             self.camera.type, self.camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
 
-    def draw(self, data: mujoco.MjData) -> np.ndarray:
-        """Return an image (height, width, 3) uint8 of a state."""
+    def draw(self, data: mujoco.MjData, decorate: Callable[[mujoco.MjvScene], None] = lambda scene: None) -> np.ndarray:
+        """Draw a state.
+
+        Args:
+            data: The state.
+            decorate: Function that adds geoms to the scene.
+
+        Returns:
+            An image (height, width, 3) uint8.
+        """
         everything = mujoco.mjtCatBit.mjCAT_ALL
         mujoco.mjv_updateScene(self._model, data, self._option, None, self.camera, everything, self._scene)
+        decorate(self._scene)
         self._gl.make_current()
         mujoco.mjr_render(self._viewport, self._scene, self._context)
         image = np.empty((self._viewport.height, self._viewport.width, 3), dtype=np.uint8)

@@ -22,13 +22,14 @@ BASE = {"code_version", "extras", "files", "finite", "gl", "keys", "offscreen", 
 # Of each room, the rooms below it that it may import; what these may import it may, too.
 ROOMS = {
     "styles": set(),
+    "scene": set(),  # what there is to see
     "distributions": {"styles"},
     "networks": {"distributions"},
     "contract": {"networks"},  # of exported models
     "losses": {"networks"},
     "replay": {"networks"},
     "transforms": {"networks"},
-    "defaults": {"transforms"},  # what a `Domain` leaves out
+    "defaults": {"transforms", "scene"},  # what a `Domain` leaves out
     "domain": {"defaults"},  # the type of a declaration
     "training": {"contract", "domain", "losses", "replay"},
     "fast": {"losses", "training"},

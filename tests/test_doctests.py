@@ -9,7 +9,7 @@ import pytest
 import coachable
 
 MODULES = sorted(module.name for module in pkgutil.walk_packages(coachable.__path__, "coachable.") if not module.ispkg)
-EXTRAS = ("viser", "mjviser", "av", "onnx", "onnxruntime", "onnxscript", "captum", "gymnasium")
+EXTRAS = ("viser", "av", "onnx", "onnxruntime", "onnxscript", "captum", "gymnasium")
 
 
 @pytest.mark.parametrize("name", MODULES)

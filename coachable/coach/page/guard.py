@@ -27,6 +27,7 @@ from websockets import Headers
 from websockets.http11 import Request, Response
 
 from coachable.coach.page.api import PATH, PROTOCOL, CoachApi
+from coachable.coach.page.looks import dressed
 
 _THIS_MACHINE = ("localhost", "127.0.0.1", "::1")
 _EVERYWHERE = ("", "*", "0.0.0.0", "::")
@@ -111,6 +112,7 @@ class Guard:
                 return _refused(http.HTTPStatus.SERVICE_UNAVAILABLE, f"{_CONNECTIONS} browsers are connected already")
             response = self._read(request) or answer(connection, request)
             if response is not None:
+                response = dressed(response)
                 response.headers.update(_protection(request.headers["Host"]))
             return response
 

@@ -21,18 +21,22 @@ from coachable.coach.session.plan import read_plan
 from coachable.coach.session.readout import StyleReport, measures_by_parameter
 from coachable.coach.session.recording import Recording
 from coachable.coach.session.session import CoachSession
+from coachable.domain import Push
 from coachable.evaluation.wording import readable, readable_number
 from coachable.styles import Parameter
 
 if TYPE_CHECKING:
     import viser
 
-_FRAMES_PER_SECOND = 30.0
+_FRAMES_PER_SECOND = 45.0  # at most
 _REPORTS_PER_SECOND = 5.0
+_OVERLAYS_PER_SECOND = 10.0
 _FILM_SECONDS = 10.0
 _SPEEDS = (0.1, 4.0)
 _LONGEST_PHRASE, _LONGEST_PLAN, _LONGEST_NAME = 200, 2000, 40  # characters
 _PRESETS = 50
+_STRENGTHS = 20  # of a push, that the slider can have
+_DIRECTIONS = {"forward": (1.0, 0.0), "left": (0.0, 1.0), "back": (-1.0, 0.0), "right": (0.0, -1.0)}  # of a push
 _LARGEST_FILE = 8 << 20  # [byte]
 _S = TypeVar("_S", str, bytes)
 _T = TypeVar("_T")
@@ -52,18 +56,21 @@ class CoachPage:
     Attributes:
         loop: Loop that steps the session.
         widgets: Widgets by parameter name, including the live controls.
+        push_strength: Slider of the strength of a push, where the domain has one.
+        push_buttons: Buttons of its directions.
     """
 
     def __init__(self, server: viser.ViserServer, session: CoachSession) -> None:
         self.server, self.session = server, session
-        self.loop = LiveLoop(session, self._on_step, on_stop=self._close_view)
+        self.loop = LiveLoop(session, self._on_step, on_stop=self._close_view, on_wait=self._draw)
         self._api = CoachApi(self.loop)
         self._view: View | None = None
         self._reading = threading.Lock()
         self._studio = FilmStudio(session, lambda note: write(self.film_note, escaped(note)))
-        self._frame_due = self._report_due = 0.0
+        self._frame_due = self._report_due = self._overlay_due = 0.0
         self.widgets: dict[str, ParameterWidget] = {}
         self.measured: dict[str, MeasuredText] = {}
+        self.overlay = server.gui.add_html("")
         self.status = server.gui.add_markdown("")
         self._add_run()
         tabs = server.gui.add_tab_group()
@@ -101,12 +108,30 @@ class CoachPage:
                 for control in self.session.domain.controls:
                     name = control.parameter.name
                     self._add_widget(control.parameter, self.session.controls[name], self._steer)
+        if self.session.domain.push is not None:
+            self._add_push(self.session.domain.push)
         folder = self.server.gui.add_folder("Requested and measured")
         self.chart = Chart(self.server, folder, self.session.space, self.loop.show)
+        self.view_folder = self.server.gui.add_folder("View")
 
     def _add_widget(self, parameter: Parameter, value: float | str, request: Callable[[ParameterWidget], None]) -> None:
         name = parameter.name
         self.widgets[name] = ParameterWidget(self.server, parameter, value, lambda: request(self.widgets[name]))
+
+    def _add_push(self, push: Push) -> None:
+        """Add a slider for the strength of a push, and a button for each direction."""
+        gui = self.server.gui
+        with gui.add_folder("Push the agent"):
+            step = push.largest / _STRENGTHS
+            self.push_strength = gui.add_slider(f"strength [{push.unit}]", step, push.largest, step, push.largest / 2)
+            self.push_buttons = gui.add_button_group("towards", tuple(_DIRECTIONS))
+
+        def push_agent(_event: object) -> None:
+            forward, left = _DIRECTIONS[self.push_buttons.value]
+            strength = float(self.push_strength.value)
+            self.loop.submit(lambda session: session.push(forward * strength, left * strength))
+
+        self.push_buttons.on_click(push_agent)
 
     def _set(self, widget: ParameterWidget) -> None:
         def change(session: CoachSession) -> None:
@@ -253,10 +278,19 @@ class CoachPage:
             self._show(report)
         # The view comes last: if it fails, the read-outs still show the problem.
         if self._view is None:
-            self._view = make_view(self.server, self.session)
-        if now >= self._frame_due or self.loop.paused:
+            with self.view_folder:
+                self._view = make_view(self.server, self.session)
+        self._draw()
+
+    def _draw(self) -> None:
+        """Update the view, unless that was done a moment ago; the loop calls this in its thread."""
+        now = time.perf_counter()
+        if self._view is not None and (now >= self._frame_due or self.loop.paused):
             self._frame_due = now + 1.0 / _FRAMES_PER_SECOND
-            self._view.update()
+            self._view.update(self.loop.share)
+            if now >= self._overlay_due or self.loop.paused:
+                self._overlay_due = now + 1.0 / _OVERLAYS_PER_SECOND
+                write(self.overlay, self._view.overlay)
 
     def _show(self, report: StyleReport) -> None:
         with self.server.atomic():

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 from coachable.extras import how_to_install
+from coachable.scene.palette import BLUE
 
 if TYPE_CHECKING:
     import viser
@@ -45,7 +46,7 @@ def make_server(host: str = "127.0.0.1", port: int = 8080) -> viser.ViserServer:
     try:
         import viser
     except ImportError as error:
-        raise ImportError(f"the page needs viser and mjviser: {how_to_install('ui')}") from error
+        raise ImportError(f"the page needs viser: {how_to_install('ui')}") from error
     from coachable.coach.page.guard import Guard
 
     class LocalServer(viser.ViserServer):
@@ -60,8 +61,7 @@ def make_server(host: str = "127.0.0.1", port: int = 8080) -> viser.ViserServer:
     if not guard.active:
         server.stop()
         raise ImportError(f"viser {viser.__version__} starts its server in a way that the page cannot guard")
-    blue = (31, 119, 180)
-    server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large", brand_color=blue)
+    server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large", brand_color=BLUE)
     server.gui.set_panel_label("coachable")
     server.gui.main_panel.dock_right()
     return server

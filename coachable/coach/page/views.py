@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from coachable.coach.page.scene_view import PHONE, SceneView
 from coachable.coach.session.session import CoachSession
 
 if TYPE_CHECKING:
@@ -18,14 +19,23 @@ _DRAWING_SHARE = 0.3  # largest share of the loop's time for drawing
 _PICTURE_SIZE = (800, 600)  # [px]
 _BORDER = 235  # grey
 _ASPECTS = (0.25, 4.0)  # of windows that pictures are fitted to
-PHONE = 576  # [px]; in narrower windows viser's panel covers the lower right
 
 
 class View(Protocol):
-    """View of a session, used only in the thread that steps it."""
+    """View of a session, used only in the thread that steps it.
 
-    def update(self) -> None:
-        """Show the current state."""
+    Attributes:
+        overlay: HTML that is laid over the view.
+    """
+
+    overlay: str
+
+    def update(self, share: float = 1.0) -> None:
+        """Show the present state.
+
+        Args:
+            share: Share of the control step that has passed; views that can show states between two steps use it.
+        """
         ...
 
     def close(self) -> None:
@@ -36,13 +46,15 @@ class View(Protocol):
 class PictureView:
     """Pictures of the domain's renderer as the background of the page, drawn while a browser is connected."""
 
+    overlay = ""
+
     def __init__(self, server: viser.ViserServer, session: CoachSession) -> None:
         self._server, self._session = server, session
         self._renderer = session.domain.make_renderer(*_PICTURE_SIZE)
         self._renderer.draw(session.env)  # raises here if it cannot draw
         self._due = 0.0
 
-    def update(self) -> None:
+    def update(self, share: float = 1.0) -> None:
         """See `View.update`."""
         now, clients = time.perf_counter(), self._server.get_clients()
         if now < self._due or not clients:
@@ -84,10 +96,12 @@ def padded(picture: np.ndarray, aspect: float, upper_left: bool = False) -> np.n
 class NoView:
     """Note that says why the agent cannot be shown; coaching works without a view."""
 
+    overlay = ""
+
     def __init__(self, server: viser.ViserServer, reason: str) -> None:
         server.gui.add_markdown(f"**No view:** {reason}")
 
-    def update(self) -> None:
+    def update(self, share: float = 1.0) -> None:
         """See `View.update`."""
 
     def close(self) -> None:
@@ -97,6 +111,8 @@ class NoView:
 def make_view(server: viser.ViserServer, session: CoachSession) -> View:
     """Make the domain's 3-D view if it has one, else a view of its renderer's pictures, else a note with the reason."""
     try:
-        return (session.domain.make_scene or PictureView)(server, session)
+        if session.domain.make_stage is not None:
+            return SceneView(server, session, session.domain.make_stage())
+        return PictureView(server, session)
     except (ImportError, RuntimeError) as error:  # an extra or an OpenGL library is missing
         return NoView(server, str(error))

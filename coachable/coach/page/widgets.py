@@ -11,6 +11,8 @@ import numpy as np
 
 from coachable.coach.session.readout import StyleReport, measures_by_parameter
 from coachable.evaluation.wording import readable, readable_number
+from coachable.scene import palette
+from coachable.scene.palette import css
 from coachable.styles import Choice, Parameter, StyleSpace, Weight
 
 if TYPE_CHECKING:
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
 _SLIDER_STEPS = 200
 _SPAN = 30.0  # [s] of simulated time that the chart shows
 _HISTORY = 150  # points of the chart
-_REQUESTED, _MEASURED = "#d62728", "#1f77b4"
+_REQUESTED, _MEASURED = css(palette.REQUESTED), css(palette.MEASURED)
 
 
 class ParameterWidget:
@@ -98,7 +100,7 @@ class MeasuredText:
         shown = [f"{self._name(m)}**{self._value(m, values[m])}**" for m in measures if m in values]
         found = "no measure of its own" if report.seconds and not measures else "not measured yet"
         if shown:
-            found = f"measured {', '.join(shown)}"
+            found = f"measured {', '.join(shown)} in {report.seconds:.1f} s"
         text = " · ".join(filter(None, [found, trained(self.parameter)]))
         outside = report.outside.get(name)
         if outside is not None:

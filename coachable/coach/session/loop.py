@@ -14,6 +14,7 @@ from coachable.coach.session.session import CoachSession
 
 _LATE = 0.25  # [s], the loop does not catch up on longer delays
 _IDLE = 0.05  # [s], longest time between checks of the queue
+_FRAME = 1.0 / 30.0  # [s], longest time between two calls of `on_wait`
 _WAITING = 256  # changes in the queue, further ones are refused
 
 
@@ -29,6 +30,7 @@ class LiveLoop:
         on_step: Called in the loop's thread after each step and after each submitted change.
         pause_at_end: How long an ended episode is shown before the next one begins [s].
         on_stop: Called in the loop's thread when it ends.
+        on_wait: Called in the loop's thread about 30 times per second while it waits for the next step.
 
     Attributes:
         speed: Simulated seconds per second, a finite number above 0.
@@ -42,8 +44,11 @@ class LiveLoop:
         on_step: Callable[[], None] = lambda: None,
         pause_at_end: float = 1.0,
         on_stop: Callable[[], None] = lambda: None,
+        on_wait: Callable[[], None] = lambda: None,
     ) -> None:
-        self.session, self.on_step, self.pause_at_end, self.on_stop = session, on_step, pause_at_end, on_stop
+        self.session, self.on_step, self.pause_at_end = session, on_step, pause_at_end
+        self.on_stop, self.on_wait = on_stop, on_wait
+        self._stepped = 0.0
         self._speed = 1.0
         self.paused = False
         self.problem = ""
@@ -116,6 +121,13 @@ class LiveLoop:
             return 0.0
         return (len(moments) - 1) * self.session.domain.control_step / (moments[-1] - moments[0])
 
+    @property
+    def share(self) -> float:
+        """Share of the control step that has passed since the last step, 1 while paused and between episodes."""
+        if self.paused or self.session.ended is not None:
+            return 1.0
+        return min(1.0, (time.perf_counter() - self._stepped) * self.speed / self.session.domain.control_step)
+
     def _run(self) -> None:
         due = time.perf_counter()
         while not self._stopping.is_set():
@@ -126,12 +138,15 @@ class LiveLoop:
                 due = now
                 self._steps.clear()
             elif now >= due:
+                self._stepped = now
                 self._attempt(lambda session: session.step())
                 due = self._next(due, now)
                 changed = True  # a failed step has a problem to show
             if changed:
                 self._attempt(lambda _: self.on_step(), pause=False)  # the agent continues if the display fails
-            time.sleep(_IDLE if self.paused else min(_IDLE, max(0.0, due - time.perf_counter())))
+            elif not self.paused:
+                self._attempt(lambda _: self.on_wait(), pause=False)
+            time.sleep(_IDLE if self.paused else min(_FRAME, max(0.0, due - time.perf_counter())))
         self.on_stop()
 
     def _next(self, due: float, now: float) -> float:

@@ -40,7 +40,7 @@ class CoachSession:
         style: First request, by parameter name; other parameters have the space's default.
         strict: Whether to raise for a request outside the trained range instead of clamping it with a warning.
         endless: Whether to continue when the domain's time limit is reached.
-        window: Length of the measured window [s].
+        window: Length of the measured window [s]; by default the domain's.
 
     Attributes:
         policy: The policy; you may replace it between steps.
@@ -68,12 +68,13 @@ class CoachSession:
         style: Mapping[str, float | str] | None = None,
         strict: bool = False,
         endless: bool = True,
-        window: float = 2.0,
+        window: float | None = None,
     ) -> None:
         self.policy, self.space, self.domain, self.source = policy, space, domain, source
         parameters = [*space.parameters, *(control.parameter for control in domain.controls)]
         words = fitting(domain.words, parameters)
-        self.strict, self.hold, self.window = strict, True, window
+        self.strict, self.hold = strict, True
+        self.window = window = domain.window if window is None else window
         self._episodes = LiveEpisodes(domain, space, endless=endless, terminated=words.terminated)
         self.presets: dict[str, dict[str, Any]] = {"default": space.describe(space.default)}
         self.presets |= {name: dict(style) for name, style in words.presets.items()}
@@ -249,6 +250,11 @@ class CoachSession:
     def step_count(self) -> int:
         """Number of steps since the session was last seeded."""
         return self._timeline.step
+
+    @property
+    def episode(self) -> int:
+        """Number of the episode, from 1."""
+        return self._episodes.number
 
     @torch.no_grad()
     def step(self) -> TensorDictBase:

@@ -10,13 +10,14 @@ from typing import Any
 from coachable.domain import Domain
 from coachable.domains.combat.fights import evaluate_fights
 from coachable.domains.combat.metrics import CombatMeasures
-from coachable.domains.combat.render import CombatRenderer
+from coachable.domains.combat.stage import CombatStage
 from coachable.domains.combat.styles import combat_style_reward, combat_style_space, single_styles
 from coachable.domains.combat.words import WORDS
 from coachable.envs.combat.constants import CONTROL_STEP, EPISODE_STEPS
 from coachable.envs.combat.env import CombatEnv
 from coachable.envs.combat.features import observation_groups
 from coachable.envs.combat.gamepad import ACTION_GROUPS
+from coachable.scene.renderer import SceneRenderer
 
 
 def make_combat_env(
@@ -55,7 +56,9 @@ DOMAIN = Domain(
     make_space=combat_style_space,
     make_reward=combat_style_reward,
     measures=CombatMeasures(),
-    make_renderer=CombatRenderer,
+    make_renderer=partial(SceneRenderer, CombatStage),
+    make_stage=CombatStage,
+    window=20.0,
     grid=single_styles(combat_style_space()),
     control_step=CONTROL_STEP,
     episode_steps=EPISODE_STEPS,

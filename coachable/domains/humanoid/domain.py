@@ -6,14 +6,14 @@ from functools import partial
 
 from coachable.domain import Domain
 from coachable.domains.humanoid.metrics import HumanoidMeasures
-from coachable.domains.humanoid.render import HumanoidRenderer
-from coachable.domains.humanoid.scene import HumanoidScene
+from coachable.domains.humanoid.stage import HumanoidStage
 from coachable.domains.humanoid.styles import POSES, humanoid_style_reward, humanoid_style_space
 from coachable.domains.humanoid.web import humanoid_web
 from coachable.domains.humanoid.words import COURSE, PUSH, WORDS
 from coachable.envs.humanoid.env import EPISODE_STEPS, HumanoidEnv
 from coachable.envs.humanoid.model import CONTROL_STEP
 from coachable.envs.humanoid.observation import ACTION_GROUPS, OBSERVATION_GROUPS
+from coachable.scene.renderer import SceneRenderer
 
 DOMAIN = Domain(
     name="humanoid",
@@ -21,8 +21,8 @@ DOMAIN = Domain(
     make_space=humanoid_style_space,
     make_reward=humanoid_style_reward,
     measures=HumanoidMeasures(),
-    make_renderer=HumanoidRenderer,
-    make_scene=HumanoidScene,
+    make_renderer=partial(SceneRenderer, HumanoidStage),
+    make_stage=HumanoidStage,
     make_web=partial(humanoid_web, measures=HumanoidMeasures()),
     grid={"pose": POSES, "step_length": (0.30, 0.35, 0.40, 0.45, 0.50, 0.55, 0.60, 0.65)},
     control_step=CONTROL_STEP,

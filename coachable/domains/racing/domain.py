@@ -11,13 +11,14 @@ from typing import Any
 from coachable.domain import Domain
 from coachable.domains.racing.families import home_track, racing_family
 from coachable.domains.racing.metrics import RacingMeasures
-from coachable.domains.racing.render import RacingRenderer
+from coachable.domains.racing.stage import RacingStage
 from coachable.domains.racing.words import WORDS
 from coachable.envs.racing.circuit.track import Track
 from coachable.envs.racing.env import EPISODE_STEPS
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
 from coachable.envs.racing.race.observation import ACTION_GROUPS, COURSE_POINTS, observation_groups
 from coachable.envs.racing.race.scenarios import rolling_start
+from coachable.scene.renderer import SceneRenderer
 
 # Options of a training's environment that do not apply when an agent is shown or measured.
 _OF_TRAINING = ("_target_", "family", "num_envs", "scenarios", "conditions", "weights", "driver")
@@ -72,7 +73,9 @@ def racing_domain(
         make_space=make_space,
         make_reward=make_reward,
         measures=RacingMeasures(family),
-        make_renderer=RacingRenderer,
+        make_renderer=partial(SceneRenderer, RacingStage),
+        make_stage=RacingStage,
+        window=10.0,
         grid=grid,
         control_step=CONTROL_STEP,
         episode_steps=EPISODE_STEPS,

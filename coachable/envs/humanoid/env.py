@@ -128,6 +128,11 @@ class HumanoidEnv(EnvBase):
         rows = np.any(force != 0, axis=1)
         self.push[rows], self._push_left[rows] = force[rows], _PUSH_STEPS
 
+    @property
+    def pushing(self) -> np.ndarray:
+        """Force (N, 3) with which each torso will be pushed in the next control step [N], as far as it is known."""
+        return np.where(self._push_left[:, None] > 0, self.push, 0.0)
+
     # -- TorchRL ---------------------------------------------------------------------------------------------------
 
     def _make_specs(self) -> None:

@@ -1,9 +1,11 @@
 """The page through viser, without a browser: widgets reach the session, and show what it says."""
 
+import gzip
 import math
 import socket
 import threading
 import time
+import urllib.request
 import warnings
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -17,12 +19,15 @@ import msgspec  # noqa: E402, viser brings it
 import websockets.sync.client as websockets  # noqa: E402, viser brings it
 
 from coachable.coach.page import film as film_module  # noqa: E402
-from coachable.coach.page import views  # noqa: E402
+from coachable.coach.page import looks, scene_view, views  # noqa: E402
 from coachable.coach.page.page import CoachPage, verdict  # noqa: E402
 from coachable.coach.page.server import make_server  # noqa: E402
 from coachable.coach.session.readout import StyleReport  # noqa: E402
 from coachable.coach.session.session import CoachSession  # noqa: E402
-from coachable.domains.humanoid import scene as humanoid_scene  # noqa: E402
+from coachable.domains.combat.stage import CombatStage  # noqa: E402
+from coachable.domains.humanoid.stage import HumanoidStage  # noqa: E402
+from coachable.domains.racing.stage import RacingStage  # noqa: E402
+from coachable.scene.parts import Parts  # noqa: E402
 from coachable.styles import StyleRangeWarning  # noqa: E402
 from tests.coach.echo_domain import echo_session  # noqa: E402
 
@@ -85,7 +90,7 @@ def test_a_slider_acts_at_the_next_step(page):
     page._press("Step")
     do(page)
     assert page.session.step_count == 1
-    assert "measured **0.7 m**" in page.measured["target"].handle.content
+    assert "measured **0.7 m** in" in page.measured["target"].handle.content
     assert "**Request met**" in page.status.content
 
 
@@ -321,7 +326,7 @@ def test_what_is_shown_is_measured_or_says_that_it_is_not(page):
     page._press("Step")
     do(page)
     texts = {name: text.handle.content for name, text in page.measured.items()}
-    assert texts["target"] == "measured **0.5 m** · trained -0.8 to 0.8 m"
+    assert texts["target"] == "measured **0.5 m** in 0.1 s · trained -0.8 to 0.8 m"
     assert texts["mood"] == "no measure of its own"
     assert "pace **0.5 m/step**" in page.others.content, "the domain declares the unit"
     do(page, lambda session: session.set(target=-0.5))
@@ -449,7 +454,7 @@ def test_a_failing_step_pauses_and_says_so(page):
 
 
 def test_a_failing_view_leaves_the_read_outs(page, monkeypatch):
-    def torn():
+    def torn(share):
         raise RuntimeError("the canvas is torn")
 
     do(page)
@@ -543,36 +548,120 @@ def test_in_a_narrow_window_the_picture_lies_above_the_panel(server, monkeypatch
     session.close()
 
 
-def test_in_a_narrow_window_the_camera_shows_the_agent_above_the_panel():
-    camera = SimpleNamespace(image_width=400, position=humanoid_scene._START)
-    humanoid_scene._raise_agent(camera)
-    position, target = np.array(camera.position), np.array(camera.look_at)
+def test_the_page_has_its_own_title_and_icon(server):
+    request = urllib.request.Request(f"http://127.0.0.1:{server.get_port()}/", headers={"Accept-Encoding": "gzip"})
+    with urllib.request.urlopen(request) as answer:
+        assert answer.headers["Content-Encoding"] == "gzip" and "frame-ancestors 'none'" in str(answer.headers)
+        packed = gzip.decompress(answer.read()).decode()
+    plain = urllib.request.urlopen(f"http://127.0.0.1:{server.get_port()}/").read().decode()
+    for text in (packed, plain):
+        head = text[: text.index("</title>")]
+        assert head.endswith("<title>coachable") and looks.ICON in head and "Viser" not in head
+        assert "prefers-color-scheme: dark" in text and ".gauges {" in text
+
+
+@pytest.fixture
+def walker(server):
+    """A page with the humanoid, paused before its first step, and a browser that looks at it."""
+    server.gui.reset()
+    server.scene.reset()
+    session = CoachSession.open("humanoid", seed=1)
+    page = CoachPage(server, session)
+    page.loop.paused = True
+    page.start()
+    yield page
+    page.stop()
+    session.close()
+
+
+def test_a_push_reaches_the_agent_and_the_recording(walker):
+    slider, buttons = walker.push_strength, walker.push_buttons
+    assert (slider.min, slider.max, slider.value) == (10.0, 200.0, 100.0)
+    slider.value = 150.0
+    walker._press("Step")
+    do(walker)
+    buttons.value = "left"
+    do(walker)
+    assert walker.session.base_env.pushing[0] == pytest.approx([0.0, 150.0, 0.0])
+    event = {"step": 1, "push": [0.0, 150.0]}
+    assert walker.session.recording().events == [event]
+    assert walker.loop.problem == ""
+
+
+def test_the_camera_follows_turns_or_stays(server, monkeypatch):
+    server.gui.reset()
+    server.scene.reset()
+    session = CoachSession.open("humanoid", seed=1)
+    view = views.make_view(server, session)
+    assert isinstance(view, scene_view.SceneView)
+    view.update()
+    assert view.frame is None, "nobody looks"
+    monkeypatch.setattr(server, "get_clients", lambda: {0: None})
+    session.run(0.5)
+    view.update()
+    position = session.base_env.simulation.positions[0, :2].copy()
+    assert view._root.position[:2] == pytest.approx(-position)
+    assert view._ground.position[:2] == pytest.approx(np.round(position)), "the pattern of the ground stays in place"
+    assert "last steps" in view.overlay and '<div class="gauge">' in view.overlay
+
+    view.mode.value = scene_view.TURN
+    session.steer(course=90.0)
+    session.step()
+    view.update()
+    x, y = session.base_env.simulation.positions[0, :2]
+    assert view._root.position[:2] == pytest.approx([-y, x], abs=1e-5), "what lies ahead is ahead in the picture"
+
+    before = view._root.position.copy()
+    view.mode.value = scene_view.STAY
+    session.run(0.5)
+    view.update()
+    assert view._root.position == pytest.approx(before)
+    session.close()
+
+
+def test_slow_control_steps_are_drawn_in_between(server, monkeypatch):
+    """A fight has five states per second."""
+    server.gui.reset()
+    server.scene.reset()
+    monkeypatch.setattr(server, "get_clients", lambda: {0: None})
+    session = CoachSession.open("combat", seed=1)
+    view = views.make_view(server, session)
+    focus = []
+    for _ in range(2):
+        session.step()
+        view.update()
+        focus.append(np.asarray(view.frame.focus)[:2])
+    view.update(0.25)
+    assert -view._root.position[:2] == pytest.approx(focus[0] + 0.25 * (focus[1] - focus[0]), abs=1e-5)
+    session.close()
+
+
+def test_a_node_has_room_for_more_primitives(server):
+    server.scene.reset()
+    node = scene_view._Node(server, "/balls", "ball")
+    node.show(Parts())
+    assert node.handle is None
+    for count in (4, 6, 7, 2):
+        parts = Parts()
+        for index in range(count):
+            parts.ball((index, 0.0, 0.0), (1.0, 1.0, 1.0), (255, 188, 0))
+        node.show(parts)
+        shown = node.handle.batched_positions[:, 2] > -1.0
+        assert shown.sum() == count and len(shown) == (6 if count in (4, 6) else 11)
+        assert node.handle.batched_positions[shown, 0].tolist() == list(range(count))
+    assert node.handle.batched_colors[0].tolist() == [255, 128, 0], "linear, as viser wants them"
+
+
+@pytest.mark.parametrize("make", [HumanoidStage, RacingStage, CombatStage])
+def test_in_a_narrow_window_the_camera_shows_the_agent_above_the_panel(make):
+    viewpoint = make.viewpoint
+    position, target = scene_view.camera_of(viewpoint, narrow=True)
     ahead = (target - position) / np.linalg.norm(target - position)
     right = np.cross(ahead, [0.0, 0.0, 1.0])
     up = np.cross(right / np.linalg.norm(right), ahead)
     for height in (0.0, 2.0):  # from the soles to the hands
         seen = np.array([0.0, 0.0, height]) - position
-        share = (seen @ up) / (seen @ ahead) / np.tan(np.deg2rad(75.0) / 2)  # -1 below, 1 above
+        share = (seen @ up) / (seen @ ahead) / np.tan(np.deg2rad(45.0) / 2)  # -1 below, 1 above
         assert 0.2 < share < 1.0, "above the panel's 60 %"
-    for other in (
-        SimpleNamespace(image_width=1280, position=humanoid_scene._START),
-        SimpleNamespace(image_width=400, position=(1.0, 1.0, 1.0)),  # the user has moved it
-    ):
-        humanoid_scene._raise_agent(other)
-        assert not hasattr(other, "look_at")
-
-
-def test_the_humanoid_stays_in_the_middle_of_the_scene(server):
-    pytest.importorskip("mjviser")
-    server.scene.reset()
-    session = CoachSession.open("humanoid", seed=1)
-    view = views.make_view(server, session)
-    assert isinstance(view, humanoid_scene.HumanoidScene)
-    session.run(0.5)
-    view.update()
-    position = session.base_env.simulation.positions[0, :2]
-    assert view._scene.fixed_bodies_frame.position[:2] == pytest.approx(-position)
-    session.steer(course=90.0)
-    view.update()
-    assert view._arrow.points[0, :, 0] == pytest.approx(0.0)
-    session.close()
+    position, target = scene_view.camera_of(viewpoint)
+    assert np.linalg.norm(target - position) == pytest.approx(viewpoint.distance) and target[2] == viewpoint.height

@@ -320,6 +320,8 @@ def test_bad_recordings(session):
         ({"events": [{"step": 3, "reset": True}, {"step": 1, "reset": True}]}, "'events' is not what"),
         ({"events": 5}, "'events' is not what"),
         ({"controls": {"course": math.inf}}, "'controls' is not what"),
+        ({"events": [{"step": 0, "push": [1.0]}]}, "'events' is not what"),
+        ({"events": [{"step": 0, "push": [1.0, 0.0]}]}, "the recording has a push"),
         ({"checks": [[1, 2, 3]]}, "'checks' is not what"),
         ({"seed": -1}, "'seed' is not what"),
         ({"seed": 10**30}, "expected a whole number"),
@@ -434,6 +436,22 @@ class TestHumanoid:
         for bad, message in [({"course": math.nan}, "course = nan"), ({"altitude": 1.0}, "no live control named")]:
             with pytest.raises(ValueError, match=message):
                 humanoid.steer(**bad)
+
+    def test_a_push_lasts_a_moment_and_is_replayed(self, humanoid):
+        humanoid.steer(course=0.0)
+        humanoid.reset(seed=1)
+        humanoid.run(0.5)
+        humanoid.push(left=-100.0)
+        assert humanoid.base_env.pushing[0] == pytest.approx([0.0, -100.0, 0.0])
+        humanoid.run(0.25)
+        assert not humanoid.base_env.pushing.any()
+        velocity = humanoid.base_env.simulation.velocities[0, :2].copy()
+        recording = Recording.from_json(humanoid.recording().to_json())
+        assert [event["step"] for event in recording.events] == [20]
+        humanoid.replay(recording)
+        humanoid.run(0.75)
+        assert (humanoid.base_env.simulation.velocities[0, :2] == velocity).all()
+        assert not humanoid.replaying
 
     def test_a_replay_repeats_every_bit(self, humanoid):
         humanoid.reset(seed=5)

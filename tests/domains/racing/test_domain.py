@@ -11,11 +11,12 @@ from coachable.domain import load_domain
 from coachable.domains.racing.events import racing_events
 from coachable.domains.racing.families import family_env, family_style, training_tracks
 from coachable.domains.racing.metrics import RacingMeasures
-from coachable.domains.racing.render import RacingRenderer
+from coachable.domains.racing.stage import RacingStage
 from coachable.envs.racing import RacingEnv
 from coachable.envs.racing.circuit.circuits import SETS
 from coachable.envs.racing.race.referee import TELEMETRY
 from coachable.envs.racing.race.scenarios import Conditions
+from coachable.scene.renderer import SceneRenderer
 from coachable.transforms import coachable_env
 
 
@@ -93,8 +94,9 @@ def test_an_unknown_family_is_refused():
 def test_pictures_follow_the_car():
     env = RacingEnv(2, track="ring", seed=0)
     env.reset()
-    renderer = RacingRenderer(160, 120)
+    renderer = SceneRenderer(RacingStage, 160, 120)
     assert not np.array_equal(renderer.draw(env, 0), renderer.draw(env, 1))
+    renderer.close()
 
 
 def test_a_domain_is_as_its_training_made_it():

@@ -1,0 +1,1 @@
+"""What there is to see: scenes of primitives, drawn by the live page and by films."""
