@@ -50,8 +50,8 @@ def test_finished_trainings_are_shown_and_not_repeated(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_the_same_command_continues_what_ctrl_c_interrupted(tmp_path):
-    total = 4_000
-    arguments = ["train", "rare_targets", *TINY, f"train.total_frames={total}", "train.checkpoint_interval=0"]
+    total = 1_500
+    arguments = ["train", "rare_targets", *TINY, f"train.total_frames={total}", "train.checkpoint_interval=1"]
     command = [sys.executable, "-m", "coachable.cli", *arguments, "seeds=3,5", f"run_dir={tmp_path}"]
 
     def start():
