@@ -31,7 +31,7 @@ from coachable.training.stopping import stop_signals
 from coachable.training.throttle import Throttle
 from coachable.training.train_settings import TrainSettings
 from coachable.training.weights import require_same_agent
-from coachable.training.worker_errors import WorkerError, check_workers, worker_errors
+from coachable.training.worker_errors import WorkerError, update_workers, worker_errors
 
 __all__ = ["REPLAY_KEYS", "Trainer", "replay_keys"]
 
@@ -195,8 +195,7 @@ class Trainer:
                     self.owed -= 1.0
             # A single-process collector shares the learner's weights, and an `AsyncCollector` hears of every update.
             if not isinstance(self.collector, Collector | AsyncCollector):
-                check_workers(self.collector)
-                self.collector.update_policy_weights_()  # pyright: ignore[reportCallIssue]
+                update_workers(self.collector)
 
     def _update_once(self) -> None:
         batch = self.replay.sample(self.settings.batch_size).to(self._device)

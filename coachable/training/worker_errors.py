@@ -5,13 +5,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from threading import Thread
 from typing import Any
 
 from torchrl.collectors import Collector
 
-__all__ = ["ReportingCollector", "WorkerError", "check_workers", "worker_errors"]
+__all__ = ["ReportingCollector", "WorkerError", "check_workers", "update_workers", "worker_errors"]
 
 _LENGTH = 1000  # characters of a message: so few are written at once, so that messages of workers never mix
+_ANSWER = 0.5  # [s] after which a worker that has not taken new weights may have ended
 _GRACE = 3.0  # [s] between a worker's message and its end, longer than the workers need to take new weights
 
 
@@ -49,8 +51,6 @@ class ReportingCollector:
 def check_workers(collector: Any) -> None:
     """Raise the error with which a worker process ends.
 
-    Call this before you send new weights to the workers, because TorchRL waits forever for those that ended.
-
     Args:
         collector: Collector made by `make_collector`, with or without worker processes.
 
@@ -65,6 +65,36 @@ def check_workers(collector: Any) -> None:
     for process in collector.procs:
         if not process._closed and not process.is_alive():
             raise WorkerError(f"a worker process ended with exit status {process.exitcode}.")
+
+
+def update_workers(collector: Any) -> None:
+    """Send the policy's weights to all workers.
+
+    TorchRL waits forever for the answer of a worker that has ended, and therefore waits in a thread of its own here.
+
+    Args:
+        collector: Collector made by `make_collector` with worker processes.
+
+    Raises:
+        WorkerError: If a worker sent an error or ended without one, also while the weights were being sent.
+    """
+    check_workers(collector)
+    failures: list[Exception] = []
+
+    def send() -> None:
+        try:
+            collector.update_policy_weights_()
+        except Exception as error:
+            failures.append(error)
+
+    sending = Thread(target=send, daemon=True)
+    sending.start()
+    while sending.is_alive():
+        sending.join(_ANSWER)
+        if sending.is_alive():
+            check_workers(collector)
+    if failures:
+        raise failures[0]
 
 
 @contextmanager
