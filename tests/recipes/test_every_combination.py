@@ -171,10 +171,10 @@ def test_the_stages_of_drifting_pay_for_corners_on_many_circuits(stage):
 def test_a_driver_who_drove_alone_starts_out_blind_to_others(tmp_path):
     alone = _train("racing_qr_sac", tmp_path / "alone", "family=resources", "train.total_frames=16")
     choice = ["family=resources", "+env.cars=3", "env.num_envs=3", f"init_from={tmp_path / 'alone'}"]
-    with pytest.raises(RuntimeError, match=r"\(\d+, 141\) in the checkpoint, \(\d+, 174\) here"):
+    with pytest.raises(RuntimeError, match=r"\(\d+, 161\) in the checkpoint, \(\d+, 194\) here"):
         _train("racing_qr_sac", tmp_path / "refused", *choice)
     among = _train("racing_qr_sac", tmp_path / "among", *choice, "init_new_observations=33", *BRIEF)
-    seen, theta, others = torch.randn(5, 137), torch.randn(5, 4), torch.randn(5, 33)
+    seen, theta, others = torch.randn(5, 157), torch.randn(5, 4), torch.randn(5, 33)
     action = alone.collector.policy(TensorDict({"observation": seen, "style": theta}, [5]))["loc"]
     wider = TensorDict({"observation": torch.cat([seen, others], -1), "style": theta}, [5])
     torch.testing.assert_close(among.collector.policy(wider)["loc"], action)
@@ -185,7 +185,7 @@ def test_a_wide_network_that_drove_alone_still_can_while_nobody_is_near(tmp_path
     alone = _train("racing_qr_sac", tmp_path / "alone", *wide, "train.total_frames=16")
     choice = ["+env.cars=3", "env.num_envs=3", f"init_from={tmp_path / 'alone'}", "init_new_observations=33"]
     among = _train("racing_qr_sac", tmp_path / "among", *wide, *choice, *BRIEF)
-    seen, theta, action = torch.randn(5, 137), torch.randn(5, 4), torch.rand(5, 2)
+    seen, theta, action = torch.randn(5, 157), torch.randn(5, 4), torch.rand(5, 2)
     drive = TensorDict({"observation": seen, "style": theta, "action": action}, [5])
     nobody = drive.clone().set("observation", torch.cat([seen, torch.zeros(5, 33)], -1))
     torch.testing.assert_close(among.collector.policy(nobody)["loc"], alone.collector.policy(drive)["loc"])
@@ -201,10 +201,10 @@ def _value(loss, params, data):
 
 
 def test_networks_without_room_for_others_are_refused(tmp_path):
-    narrow = ["family=resources", *(f"network.{part}.widths=[150,150]" for part in ("actor", "critic"))]
+    narrow = ["family=resources", *(f"network.{part}.widths=[170,170]" for part in ("actor", "critic"))]
     _train("racing_qr_sac", tmp_path / "alone", *narrow, *BRIEF)
     choice = ["+env.cars=3", "env.num_envs=3", "init_new_observations=33", f"init_from={tmp_path / 'alone'}"]
-    with pytest.raises(CheckpointError, match=r"layers of \[150, 150\] units cannot get 33 inputs"):
+    with pytest.raises(CheckpointError, match=r"layers of \[170, 170\] units cannot get 33 inputs"):
         _train("racing_qr_sac", tmp_path / "among", *narrow, *choice)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 
 from coachable.coach.phrases.fitting import fitting
 from coachable.coach.phrases.grammar import StyleGrammar, Understanding
+from coachable.coach.session.influences import Influences
 from coachable.coach.session.live_episodes import LiveEpisodes
 from coachable.coach.session.readout import MeasuredWindow, StyleReport
 from coachable.coach.session.recording import Recording, check_seed, is_trained
@@ -78,8 +79,7 @@ class CoachSession:
         self._episodes = LiveEpisodes(domain, space, endless=endless, terminated=words.terminated)
         self.presets: dict[str, dict[str, Any]] = {"default": space.describe(space.default)}
         self.presets |= {name: dict(style) for name, style in words.presets.items()}
-        self._controls = {control.parameter.name: control for control in domain.controls}
-        self._control_values = {name: cast(float, c.parameter.default) for name, c in self._controls.items()}
+        self._influences = Influences(domain)
         self.grammar = StyleGrammar(parameters, words.vocabulary, words.examples)
         self._understood: Understanding | None = None
         self._recent = MeasuredWindow(domain.measures, round(window / domain.control_step))
@@ -112,7 +112,7 @@ class CoachSession:
     @property
     def controls(self) -> dict[str, float]:
         """Values of the live controls, by name, in their units."""
-        return dict(self._control_values)
+        return dict(self._influences.values)
 
     def set(self, **values: float | str) -> None:
         """Request another style from the next observation on; parameters that are not named keep their values.
@@ -142,10 +142,7 @@ class CoachSession:
         Raises:
             ValueError: For an unknown control or NaN.
         """
-        for name in values:
-            if name not in self._controls:
-                raise ValueError(f"no live control named {name!r}: {self.domain.name} has {list(self._controls)}")
-        fitted = {name: self._controls[name].fit(float(value)) for name, value in values.items()}
+        fitted = self._influences.fitted(values)
         self._timeline.take_over()
         self._apply({"controls": fitted})
 
@@ -155,9 +152,7 @@ class CoachSession:
         Raises:
             ValueError: If the domain has no push, or a strength is not finite.
         """
-        if self.domain.push is None:
-            raise ValueError(f"{self.domain.name} has no push")
-        fitted = list(self.domain.push.fit(float(forward), float(left)))
+        fitted = self._influences.fitted_push(forward, left)
         self._timeline.take_over()
         self._apply({"push": fitted})
 
@@ -188,7 +183,7 @@ class CoachSession:
             ValueError: In strict mode, for a number outside the trained range.
         """
         style = {name: value for name, value in understood.changes.items() if name in self.space}
-        controls = {name: float(value) for name, value in understood.changes.items() if name in self._controls}
+        controls = {name: float(value) for name, value in understood.changes.items() if name not in style}
         if style:
             self.set(**style)
         if controls:
@@ -243,7 +238,7 @@ class CoachSession:
         self._complied_at: int | None = None
         self._generator = torch.Generator().manual_seed(seed)
         self._episodes.seed(seed)
-        self._steer_env()
+        self._influences.steer(self.base_env)
         self._begin_episode()
 
     @property
@@ -348,9 +343,9 @@ class CoachSession:
             ValueError: If the recording belongs to another domain, style space or set of controls; the session is
                 then unchanged.
         """
-        recording.check(self.domain.name, self.space, self._controls, self.domain.push)
+        recording.check(self.domain.name, self.space, self._influences.controls, self._influences.push)
         self._theta, self._outside = self.space.make(strict=True, **recording.style), {}
-        self._control_values |= recording.controls
+        self._influences.values |= recording.controls
         self._episodes.endless = recording.endless
         self.reset(recording.seed)
         self._timeline.repeat(recording)
@@ -370,11 +365,11 @@ class CoachSession:
         if "style" in event:
             self._request(self.space.make(**(self.style | event["style"])), event["style"])
         if "controls" in event:
-            self._control_values |= event["controls"]
-            self._steer_env()
+            self._influences.values |= event["controls"]
+            self._influences.steer(self.base_env)
             self._timeline.note({"controls": dict(event["controls"])})
-        if "push" in event and self.domain.push is not None:
-            self.domain.push.apply(self.base_env, *event["push"])
+        if "push" in event:
+            self._influences.shove(self.base_env, event["push"])
             self._timeline.note({"push": list(event["push"])})
         if "reset" in event:
             self._timeline.note({"reset": True})
@@ -399,10 +394,6 @@ class CoachSession:
             self._request(drawn, self.space.describe(drawn))
         self._episodes.begin(self._theta)
         self._recent.clear()
-
-    def _steer_env(self) -> None:
-        for name, value in self._control_values.items():
-            self._controls[name].apply(self.base_env, value)
 
     def _seconds(self, step: int) -> float:
         return (step - self._steps_at_request) * self.domain.control_step

@@ -1,0 +1,59 @@
+"""What acts on the agent beside its style: live controls and pushes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import cast
+
+from torchrl.envs import EnvBase
+
+from coachable.domain import Domain
+
+
+class Influences:
+    """Live controls of a domain with their values, and its push.
+
+    Args:
+        domain: The domain.
+
+    Attributes:
+        controls: Live controls by name.
+        values: Their values by name, in their units.
+        push: The push, or None if the domain has none.
+    """
+
+    def __init__(self, domain: Domain) -> None:
+        self._domain, self.push = domain.name, domain.push
+        self.controls = {control.parameter.name: control for control in domain.controls}
+        self.values = {name: cast(float, c.parameter.default) for name, c in self.controls.items()}
+
+    def fitted(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Return values of controls, wrapped around or clamped to their ranges.
+
+        Raises:
+            ValueError: For an unknown control or NaN.
+        """
+        for name in values:
+            if name not in self.controls:
+                raise ValueError(f"no live control named {name!r}: {self._domain} has {list(self.controls)}")
+        return {name: self.controls[name].fit(float(value)) for name, value in values.items()}
+
+    def fitted_push(self, forward: float, left: float) -> list[float]:
+        """Return a push, scaled down to the largest strength.
+
+        Raises:
+            ValueError: If the domain has no push, or a strength is not finite.
+        """
+        if self.push is None:
+            raise ValueError(f"{self._domain} has no push")
+        return list(self.push.fit(float(forward), float(left)))
+
+    def steer(self, env: EnvBase) -> None:
+        """Write the values of the controls into the base environment."""
+        for name, value in self.values.items():
+            self.controls[name].apply(env, value)
+
+    def shove(self, env: EnvBase, strength: Sequence[float]) -> None:
+        """Push the agent in the base environment, if the domain has a push."""
+        if self.push is not None:
+            self.push.apply(env, *strength)
