@@ -125,9 +125,9 @@ class StratifiedSampler(Sampler):
         """Draw slots, grouped by table.
 
         Returns:
-            Slots `(batch_size,)`, and `{"table": (batch_size,)}`, with `priority_weight` if prioritised. The weight is
-            ``(n P(i))^-beta`` over the largest one of the batch. n is the number of records of the table, P(i) the
-            probability within it.
+            Slots `(batch_size,)`, and a dictionary with `table` of the same shape, and `priority_weight` if prioritised.
+            The weight is ``(n P(i))^-beta`` over the largest one of the batch. n is the number of records of the table,
+            P(i) the probability within it.
         """
         device = getattr(storage, "device", None)
         device = device if isinstance(device, torch.device) else torch.device("cpu")
