@@ -125,7 +125,7 @@ class StratifiedSampler(Sampler):
         """Draw slots, grouped by table.
 
         Returns:
-            Slots `(batch_size,)`, and a dictionary with `table` of the same shape, and `priority_weight` if prioritised.
+            Slots `(batch_size,)`, and a dictionary with `table` and, if prioritised, `priority_weight`, of that shape.
             The weight is ``(n P(i))^-beta`` over the largest one of the batch. n is the number of records of the table,
             P(i) the probability within it.
         """
