@@ -10,8 +10,10 @@ viser = pytest.importorskip("viser")
 sync_api = pytest.importorskip("playwright.sync_api")
 
 from coachable.coach.page.page import CoachPage  # noqa: E402
+from coachable.coach.page.scene_view import camera_of  # noqa: E402
 from coachable.coach.page.server import make_server  # noqa: E402
 from coachable.coach.session.session import CoachSession  # noqa: E402
+from coachable.domains.humanoid.stage import HumanoidStage  # noqa: E402
 from tests.coach.echo_domain import echo_session  # noqa: E402
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -224,4 +226,7 @@ def test_in_a_narrow_window_the_agent_is_above_the_panel(visit, page):
         pytest.skip("pictures are tested without a browser")
     visit(page, width=400)
     (client,) = page.server.get_clients().values()
-    wait_for(lambda: client.camera.look_at[2] == pytest.approx(-0.9))
+    position, target = camera_of(HumanoidStage.viewpoint, narrow=True)
+    assert target[2] < 0
+    wait_for(lambda: client.camera.look_at == pytest.approx(target, abs=1e-3))
+    assert client.camera.position == pytest.approx(position, abs=1e-3)
