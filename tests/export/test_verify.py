@@ -12,6 +12,7 @@ from coachable.contract.model import read_model
 from coachable.domain import Domain, load_domain
 from coachable.envs.humanoid.env import HumanoidEnv
 from coachable.envs.humanoid.observation import OBSERVATION_GROUPS
+from coachable.envs.racing.race.observation import own_columns
 from coachable.export.diagnosis import CAUSES
 from coachable.export.onnx import export, write_onnx
 from coachable.export.verify import verify
@@ -200,6 +201,52 @@ def test_mistakes_with_the_humanoid_are_named(env, cause, sentence, humanoid_fil
     verdict = verify(humanoid_file, replace(load_domain("humanoid"), make_env=env))
     assert causes(verdict) == {cause}
     assert any(sentence in problem for problem in verdict.problems), verdict.problems
+
+
+def racing_with(file, observe=lambda o: o, repeat=1):
+    """Return the domain of a driver's file with a mistake in the observation, or with longer control steps."""
+    domain = load_domain("racing_resources", {"env": read_model(file)[0].environment})
+
+    def make_env(**options):
+        env = domain.make_env(**options)
+        step, reset = env._step, env._reset
+
+        def seen(tensordict):
+            return tensordict.set("observation", observe(tensordict["observation"].clone()))
+
+        def longer_step(tensordict):
+            for _ in range(repeat - 1):
+                step(tensordict)
+            return seen(step(tensordict))
+
+        env._step, env._reset = longer_step, lambda *args, **kwargs: seen(reset(*args, **kwargs))
+        return env
+
+    return replace(domain, make_env=make_env)
+
+
+def test_mistakes_with_racing_are_named(tmp_path):
+    file = tmp_path / "racing.onnx"
+    export("racing_resources", file)
+    assert verify(file, racing_with(file)).problems == ()
+    loads = own_columns("tyre_load")
+
+    def rotated(observation):
+        observation[:, loads] = observation[:, loads].roll(1, 1)
+        return observation
+
+    def metres_per_second(observation):
+        observation[:, 0] *= 50.0
+        return observation
+
+    for mistake, cause, sentence in (
+        ({"observe": rotated}, ORDER, "tyre_load: front_left holds tyre_load: rear_right"),
+        ({"observe": metres_per_second}, SCALE, "motion: forward_speed: 50 times what was recorded"),
+        ({"repeat": 2}, RATE, "a step lasts 0.2 s instead of 0.1 s"),
+    ):
+        verdict = verify(file, racing_with(file, **mistake))
+        assert causes(verdict) == {cause}
+        assert any(sentence in problem for problem in verdict.problems), verdict.problems
 
 
 def test_wrong_declarations_are_named(humanoid_file, pendulum_file):
