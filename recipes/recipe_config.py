@@ -22,7 +22,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from recipe_checks import checked_values, choices, mistake_in
+from recipe_checks import checked_values, choices, mistake_in, typed_settings
 from recipe_saved import CONFIGS, check_saved_config
 from recipe_stages import composed_stages
 
@@ -266,15 +266,26 @@ def _chosen_stage(cfg: DictConfig, stages: list[dict[str, Any]]) -> DictConfig:
 
 
 def announce(config: dict[str, Any], train: Trainer) -> None:
-    """Print the chosen settings and about how long the training will take."""
+    """Print the chosen settings and about how long the training will take, with the stages that follow."""
     parameters = sum(p.numel() for p in train.learner.loss_module.actor_network_params.parameters())
     bf16 = train.learner.precision == "bf16"
     seconds = estimate_update_seconds(parameters, config["train"]["batch_size"], bf16, pick_device(config["device"]))
+
+    def hours(stage: dict[str, Any], frames: int) -> float:
+        settings = typed_settings(stage).train
+        return max(frames * (settings.utd_ratio or 0) * seconds, frames / (settings.throttle or float("inf"))) / 3600
+
     remaining = max(0, config["train"]["total_frames"] - train.frames)
-    updates = remaining * (config["train"]["utd_ratio"] or 0)
-    hours = max(updates * seconds, remaining / (config["train"]["throttle"] or float("inf"))) / 3600
+    time_left = hours(config, remaining)
+    names = [stage["stage"] for stage in config.get("stages") or []]
+    number = names.index(config["stage"]) + 1 if names else 0
+    later = sum(hours(stage, stage["train"]["total_frames"]) for stage in (config.get("stages") or [])[number:])
+    stage = f"stage {number} of {len(names)}, {config['stage']}: " if names else ""
     print(f"Found {detect().describe()}: preset {config['preset']}, {train.learner.precision} updates")
-    print(f"{remaining:,} env-steps to go, about {hours:.1f} h ({seconds * 1e3:.0f} ms per update)")
+    estimate = f"{stage}{remaining:,} env-steps to go, about {time_left:.1f} h ({seconds * 1e3:.0f} ms per update)"
+    if later:
+        estimate += f"; with the stages that follow about {time_left + later:.1f} h"
+    print(estimate[0].upper() + estimate[1:])
     print(f"Writing to {config['run_dir']}; Ctrl-C saves a checkpoint and stops")
 
 
