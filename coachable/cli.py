@@ -77,7 +77,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluate = command("evaluate", _measure, "measure every style of an agent: tables and a figure", _SOURCE_HELP)
     _add_out(evaluate, "evaluation", "folder")
     _add_number(evaluate, "--episodes", 20, "per style")
-    _add_number(evaluate, "--switch-episodes", 60, "with switching styles")
+    _add_number(evaluate, "--switch-episodes", 60, "with switching styles, 0 for none", lowest=0)
     _add_rollout(evaluate)
     text = "CSV file of a circuit to drive on beside the others, for racing agents"
     evaluate.add_argument("--track", type=Path, metavar="FILE", help=text)

@@ -70,7 +70,9 @@ def evaluate_styles(
     episodes, switch_episodes = settings.episodes, settings.switch_episodes
     grid = evaluate_grid(domain, agent.actor, agent.space, episodes=episodes, **settings.rollout)
     trials = evaluate_trials(domain, agent, settings)
-    switching = evaluate_switching(domain, agent.actor, agent.space, episodes=switch_episodes, **settings.rollout)
+    switching = None
+    if switch_episodes:
+        switching = evaluate_switching(domain, agent.actor, agent.space, episodes=switch_episodes, **settings.rollout)
     tables = {"grid": grid.rows(), "response": grid.response(agent.space)}
     tables |= {"medians": median_rows(domain, grid), "trials": trials}
     title = f"{domain.name}: {episodes} episodes of {grid.steps} steps per style, 95 % intervals"
@@ -127,7 +129,9 @@ def median_rows(domain: Domain, grid: StyleGrid) -> list[dict[str, Any]]:
     return rows
 
 
-def _summary(grid: StyleGrid, tables: dict[str, list[dict[str, Any]]], switching: SwitchReport) -> dict[str, Any]:
+def _summary(
+    grid: StyleGrid, tables: dict[str, list[dict[str, Any]]], switching: SwitchReport | None
+) -> dict[str, Any]:
     """Return the lowest, mean and highest cell of each metric, and the results of the trials and the switching test."""
     spans = {}
     for name, values in grid.episodes.items():
@@ -139,8 +143,10 @@ def _summary(grid: StyleGrid, tables: dict[str, list[dict[str, Any]]], switching
         "cells": len(grid.cells),
         "episodes_per_cell": grid.episodes["survived"].shape[1],
         "seed": grid.seed,
-        "switching": {**switching.metrics, "complied": switching.complied, "switches": switching.switches},
     }
+    if switching:
+        counts = {"complied": switching.complied, "switches": switching.switches}
+        summary["switching"] = {**switching.metrics, **counts}
     if tables["medians"]:
         summary["medians"] = {row["measure"]: row["median"] for row in tables["medians"]}
     if tables["trials"]:
@@ -153,7 +159,7 @@ def _report(
     agent: LoadedPolicy,
     grid: StyleGrid,
     tables: dict[str, list[dict[str, Any]]],
-    switching: SwitchReport,
+    switching: SwitchReport | None,
     switch_episodes: int,
 ) -> str:
     rows, response, medians, trials = (tables[name] for name in ("grid", "response", "medians", "trials"))
@@ -177,6 +183,8 @@ def _report(
         text += markdown_table(
             trials, {"trial": "", "episodes": "", "survived": "", "share_low": ".0%", "share_high": ".0%"}
         )
+    if switching is None:
+        return text
     times = switching.comply_seconds
     median = f"{times.median():.2f} s" if len(times) else "never"
     text += f"\n## Style switched at random every 100 steps ({switch_episodes} episodes)\n\n"

@@ -1,5 +1,6 @@
 """The grid, the switching test and their files, on an env whose outcome is known: its action is its measured style."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -179,6 +180,13 @@ def test_a_domain_without_trials_and_targets_reports_none(tmp_path):
     assert {file.name for file in tmp_path.iterdir()} == {
         *("grid.csv", "grid.png", "report.md", "response.csv", "summary.json"),
     }
+
+
+def test_without_switch_episodes_the_style_does_not_switch(tmp_path):
+    settings = EvaluationSettings(episodes=1, switch_episodes=0, progress=False)
+    report, _ = evaluate_styles(DOMAIN, LoadedPolicy(POLICY, SPACE, {}, {}), tmp_path, settings)
+    assert "Response to the request" in report and "switched" not in report
+    assert "switching" not in json.loads((tmp_path / "summary.json").read_text())
 
 
 def test_tables(tmp_path):
