@@ -41,6 +41,7 @@ nb_execution_timeout = 600
 nb_execution_in_temp = True
 nb_execution_raise_on_error = True
 nb_merge_streams = True
+nb_output_stderr = "remove"  # what other libraries log while they are imported
 
 # The API, from the docstrings. A single backtick marks a name: a link where it is documented, code otherwise.
 default_role = "py:obj"
