@@ -11,6 +11,7 @@ sys.path[:0] = [str(DOCS / "_extensions"), str(REPOSITORY)]
 # The kernels that run the tutorials import this copy of the library, and take one core each.
 os.environ["PYTHONPATH"] = os.pathsep.join([str(REPOSITORY), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL logs every buffer that it allocates
 
 from coachable import __version__  # noqa: E402
 
