@@ -11,6 +11,7 @@ sys.path[:0] = [str(DOCS / "_extensions"), str(REPOSITORY)]
 # The kernels that run the tutorials import this copy of the library, and take one core each.
 os.environ["PYTHONPATH"] = os.pathsep.join([str(REPOSITORY), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL logs every buffer that it allocates
 
 from coachable import __version__  # noqa: E402
 
@@ -41,6 +42,7 @@ nb_execution_timeout = 600
 nb_execution_in_temp = True
 nb_execution_raise_on_error = True
 nb_merge_streams = True
+nb_output_stderr = "remove"  # what other libraries log while they are imported
 
 # The API, from the docstrings. A single backtick marks a name: a link where it is documented, code otherwise.
 default_role = "py:obj"

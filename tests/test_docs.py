@@ -9,6 +9,7 @@ import tomllib
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -27,6 +28,8 @@ RECIPES = sorted(path.stem for path in (ROOT / "recipes").glob("*.py") if (CONFI
 
 _FENCE = re.compile(r"^```(\{?[\w-]*\}?)[^\n]*\n(.*?)^```", re.DOTALL | re.MULTILINE)
 _LINK = re.compile(r"!?\[(?:[^\[\]]|\[[^\]]*\])*\]\(([^)\s]+)\)")
+_ADDRESS = re.compile(r"\b[a-z][a-z0-9+.-]*://[^\s<>\"'`\])]+", re.IGNORECASE)
+_LOCAL = ("localhost", "127.0.0.1")
 _PROGRAMS = ("python", "python3", "coachable", "pytest")
 
 
@@ -52,6 +55,27 @@ def broken_links(page: Path) -> list[str]:
         if not found.exists() or (fragment and found.suffix == ".md" and fragment not in anchors(found)):
             broken.append(target)
     return broken
+
+
+def addresses(text: str) -> set[str]:
+    """The addresses on other machines that a text contains."""
+    found = {address.rstrip(".,;:") for address in _ADDRESS.findall(text)}
+    return {address for address in found if urlsplit(address).hostname not in _LOCAL}
+
+
+def is_valid(address: str) -> bool:
+    """Whether an address is one of https, with the full name of a host and nothing before or after it."""
+    return re.match(r"https://([a-z0-9-]+\.)+[a-z]{2,}(/|$)", address) is not None
+
+
+def spellings(found: set[str]) -> dict[str, set[str]]:
+    """Addresses by what they lead to, where there is more than one of them."""
+    same: dict[str, set[str]] = {}
+    for address in found:
+        url = urlsplit(address.lower())
+        key = url.netloc.removeprefix("www.") + url.path.removesuffix(".git").rstrip("/")
+        same.setdefault(f"{key}?{url.query}", set()).add(address.partition("#")[0])
+    return {key: written for key, written in same.items() if len(written) > 1}
 
 
 def commands(text: str) -> Iterator[list[str]]:
@@ -178,6 +202,20 @@ def test_broken_links_are_found(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("# One, two\n[a](#one-two) [b](#three) ![c](none.png) [d](https://example.org) [e](page.md)\n")
     assert broken_links(page) == ["#three", "none.png"]
+
+
+def test_addresses_are_valid_and_each_is_written_in_one_way():
+    found = set().union(*(addresses(page.read_text()) for page in LINKED))
+    assert found
+    assert [address for address in sorted(found) if not is_valid(address)] == []
+    assert spellings(found) == {}
+
+
+def test_wrong_addresses_are_found():
+    found = addresses("[a](http://a.org/b), https://a.org/b/. <https://me@c.org> `https://d` http://localhost:8000/e")
+    assert found == {"http://a.org/b", "https://a.org/b/", "https://me@c.org", "https://d"}
+    assert {address for address in found if not is_valid(address)} == found - {"https://a.org/b/"}
+    assert spellings(found) == {"a.org/b?": {"http://a.org/b", "https://a.org/b/"}}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
