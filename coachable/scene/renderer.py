@@ -1,9 +1,9 @@
-"""Pictures of scenes for films, drawn off-screen by MuJoCo, with labels, gauges and a legend."""
+"""Pictures of scenes for films, drawn off-screen by MuJoCo, with labels, gauges and a map."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -11,8 +11,9 @@ from PIL import Image, ImageDraw, ImageFont
 from torchrl.envs import EnvBase
 
 from coachable.offscreen import OffscreenMujoco
-from coachable.scene.frame import Backdrop, Frame, Map, Stage
-from coachable.scene.palette import INK, SILVER, WHITE, Colour
+from coachable.scene.between import between, continues
+from coachable.scene.frame import Backdrop, Frame, Gauge, Map, Stage
+from coachable.scene.palette import INK, SILVER, WHITE, Colour, mixed
 from coachable.scene.parts import BALL, BOX, CYLINDER, SHAPES
 
 _GEOMS = {
@@ -21,17 +22,20 @@ _GEOMS = {
     CYLINDER: mujoco.mjtGeom.mjGEOM_CYLINDER,
 }
 _SKY: Colour = (214, 224, 234)
+_HAZE = 2.0  # distances of the camera from which things fade
+_BAR = 0.26  # of the width, least length of a gauge's bar
 GLOW = 0.45  # opacity of the translucent primitives
 _MOST = 4000  # primitives
 _GROUND = "ground"
 _FIELD = 45.0  # [deg], of view
+_FINER = 2  # pixels drawn along each side of a pixel; software draws them faster than the samples of OpenGL
 
 
 class SceneRenderer:
     """Renderer of a stage, which is a `coachable.domain.Renderer`.
 
     Args:
-        stage: Description of the scene.
+        make_stage: Makes the description of the scene.
         width: Width of the image [px].
         height: Height of the image [px].
 
@@ -45,18 +49,44 @@ class SceneRenderer:
         self._font = ImageFont.load_default(size=self._line)
         self._place: Hashable = None
         self._offscreen: OffscreenMujoco | None = None
+        self._last: Frame | None = None
         self._build(Backdrop(()))  # raises here if there is no OpenGL
 
     def draw(self, env: EnvBase, row: int = 0) -> np.ndarray:
         """Return an image (height, width, 3) uint8 of the present state of one row."""
-        frame = self._stage.frame(env, row)
-        if frame.place != self._place:
+        return self.draw_way(env, row)[0]
+
+    def draw_way(
+        self,
+        env: EnvBase,
+        row: int = 0,
+        asked: Mapping[str, float | str] | None = None,
+        shares: Sequence[float] = (1.0,),
+    ) -> list[np.ndarray]:
+        """Draw states on the way from that of the last call to the present one; call it once per control step.
+
+        Args:
+            env: The environment.
+            row: Row of the environment.
+            asked: The style in force, if known.
+            shares: Shares of the way, from 0 to 1. States that do not continue each other have the present one instead.
+
+        Returns:
+            An image (height, width, 3) uint8 for each share.
+        """
+        frame, last = self._stage.frame(env, row, asked), self._last
+        self._last = frame
+        if shares and frame.place != self._place:
             self._build(self._stage.backdrop(env, row))
             self._place = frame.place
+        joined = last is not None and continues(last, frame)
+        return [self._draw(between(last, frame, share) if joined and share < 1.0 else frame) for share in shares]
+
+    def _draw(self, frame: Frame) -> np.ndarray:
         assert self._offscreen is not None
         self._aim(frame)
-        picture = self._offscreen.draw(self._data, lambda scene: _decorate(scene, frame))
-        return self._overlay(picture, frame)
+        fine = self._offscreen.draw(self._data, lambda scene: _decorate(scene, frame))
+        return self._overlay(Image.fromarray(fine).reduce(_FINER), frame)
 
     def close(self) -> None:
         """Release the OpenGL context."""
@@ -68,12 +98,17 @@ class SceneRenderer:
         """Compile a model of what does not move."""
         self.close()
         spec = mujoco.MjSpec()
-        spec.visual.global_.offwidth, spec.visual.global_.offheight = self._size
+        width, height = (_FINER * side for side in self._size)
+        spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
+        spec.visual.quality.offsamples = 0
         spec.visual.global_.fovy = _FIELD
         spec.visual.headlight.ambient[:], spec.visual.headlight.diffuse[:] = 0.42, 0.35
         spec.visual.headlight.specular[:] = 0.05
         spec.stat.extent = 1.0
-        spec.visual.map.znear, spec.visual.map.zfar = 0.2, self._stage.viewpoint.far
+        view, haze = self._stage.viewpoint, mixed(_SKY, SILVER, 0.5)  # what is far fades into the horizon
+        spec.visual.map.znear, spec.visual.map.zfar = 0.2, view.far
+        spec.visual.map.fogstart, spec.visual.map.fogend = _HAZE * view.distance, view.far
+        spec.visual.rgba.fog[:] = _rgba(haze)
         spec.add_texture(
             name="sky",
             type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
@@ -108,7 +143,7 @@ class SceneRenderer:
         self._travels = backdrop.travels
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
-        self._offscreen = OffscreenMujoco(self._model, *self._size, most=_MOST + self._model.ngeom)
+        self._offscreen = OffscreenMujoco(self._model, width, height, most=_MOST + self._model.ngeom, haze=True)
 
     def _aim(self, frame: Frame) -> None:
         assert self._offscreen is not None
@@ -122,28 +157,35 @@ class SceneRenderer:
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
 
-    def _overlay(self, picture: np.ndarray, frame: Frame) -> np.ndarray:
-        image = Image.fromarray(picture)
+    def _overlay(self, image: Image.Image, frame: Frame) -> np.ndarray:
         pen = ImageDraw.Draw(image, "RGBA")
         for label in frame.labels:
             self._write(pen, label.text, self._seen(np.asarray(label.position, dtype=float), frame))
         if frame.map is not None:
             self._draw_map(pen, frame.map)
-        line = self._line + 6
-        top = self._size[1] - 6 - line * len(frame.gauges)
-        for index, gauge in enumerate(frame.gauges):
+        self._draw_gauges(pen, frame.gauges)
+        return np.asarray(image)
+
+    def _draw_gauges(self, pen: ImageDraw.ImageDraw, gauges: Sequence[Gauge]) -> None:
+        """Write the gauges into the lower left corner: names, and texts on their bars, in columns as wide as needed."""
+        if not gauges:
+            return
+        line, gap = self._line + 6, 6
+        left = 2 * gap + max(pen.textlength(gauge.name, self._font) for gauge in gauges)
+        widest = max(pen.textlength(gauge.text, self._font) for gauge in gauges)
+        right = left + max(widest + 2 * gap, _BAR * self._size[0])
+        top = self._size[1] - gap - line * len(gauges)
+        pen.rectangle((0, top - 4, right + gap, self._size[1]), fill=(*INK, 170))
+        style = {"fill": WHITE, "font": self._font, "anchor": "lm"}
+        for index, gauge in enumerate(gauges):
             y = top + index * line
-            if index == 0:
-                pen.rectangle((0, y - 4, 0.44 * self._size[0], self._size[1]), fill=(*INK, 170))
             if gauge.share is not None:
-                left, right = 0.17 * self._size[0], 0.43 * self._size[0]
                 share = min(max(gauge.share, 0.0), 1.0)
                 pen.rectangle((left, y + 1, right, y + line - 4), fill=(255, 255, 255, 60))
                 pen.rectangle((left, y + 1, left + share * (right - left), y + line - 4), fill=(*gauge.colour, 255))
-            style = {"fill": WHITE, "font": self._font, "stroke_width": 1, "stroke_fill": (*INK, 255)}
-            pen.text((6, y), gauge.name, **style)
-            pen.text((0.18 * self._size[0], y), gauge.text, **style)
-        return np.asarray(image)
+            middle = y + line / 2 - 1
+            pen.text((gap, middle), gauge.name, **style)
+            pen.text((left + gap, middle), gauge.text, stroke_width=1, stroke_fill=(*INK, 255), **style)
 
     def _draw_map(self, pen: ImageDraw.ImageDraw, small: Map) -> None:
         side = 0.26 * self._size[1]

@@ -36,7 +36,7 @@ _PUSH_SCALE = 0.006  # [m/N], length of the arrow
 class HumanoidStage:
     """Scene of one walker of a `HumanoidEnv` or of an environment around it; see `coachable.scene.frame.Stage`."""
 
-    viewpoint = Viewpoint(distance=3.6, elevation=14.0, azimuth=-55.0, far=90.0)
+    viewpoint = Viewpoint(distance=3.6, elevation=14.0, azimuth=-55.0, far=_HALF)
     legend = (
         (SIDES["right"], "right leg, arm and footprints"),
         (SIDES["left"], "left leg, arm and footprints"),
