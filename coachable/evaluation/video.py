@@ -30,7 +30,8 @@ VIDEO_SUFFIXES = (".mp4", ".gif", ".webp", ".png")
 _IMAGE_FPS = 20  # of recorded sessions that are not mp4
 _FPS = (1.0, 60.0)  # least and most
 _WEBP_QUALITY = 50  # of 100
-_MEASURES_IN_CAPTION, _MEASURES_IN_PANEL = 3, 2  # as many as fit
+_MOST, _FEWEST = 3, 2  # measures in a caption, as many as fit, and in that of a narrow film
+_NARROW = 480  # [px]
 CAPTION = 44  # [px]
 _SMALLEST_FONT, _LARGEST_FONT = 8, 15  # [px]
 _MARKS = (((0, -4), (8, -4), (8, 4), (0, 4)), ((4, -4), (8, 4), (0, 4)))  # [px], a square and a triangle
@@ -97,7 +98,7 @@ def render(
 
     def film(styles: Sequence[dict[str, Any]]) -> Iterator[np.ndarray]:
         rate = None if sheet else fps
-        return _film(domain, agent.actor, agent.space, styles, period, size, seed, rate, panel=side_by_side)
+        return _film(domain, agent.actor, agent.space, styles, period, size, seed, rate)
 
     frames = film(requests)
     if side_by_side:
@@ -163,9 +164,8 @@ def _film(
     size: tuple[int, int],
     seed: int,
     fps: float | None,
-    panel: bool = False,
 ) -> Iterator[np.ndarray]:
-    """Yield the pictures of `period` steps of each request, with a short caption for a panel.
+    """Yield the pictures of `period` steps of each request, with a short caption where they are narrow.
 
     Without `fps` there is one picture of each request, of its last step, so that the agent has had time to comply.
     """
@@ -175,6 +175,7 @@ def _film(
     env = domain.styled_env(space, 1, seed=seed, num_threads=1, **domain.coached)
     renderer = domain.make_renderer(size[0], size[1] - CAPTION)
     rollout, failures, steps = Rollout(env, seed), 0, itertools.count()
+    short = size[0] < _NARROW
     rollout.begin(thetas[0][None])
     try:
         for request, theta in zip(requests, thetas, strict=True):
@@ -185,7 +186,7 @@ def _film(
                 recent = [*recent, domain.measures.step(transition)][-round(domain.window / domain.control_step) :]
                 last = [1.0] if step == period else []
                 shares = last if fps is None else _shares(next(steps), domain.control_step * fps)
-                measured = _measured_line(domain, space, style, recent, failures, panel) if shares else ""
+                measured = _measured_line(domain, space, style, recent, failures, short) if shares else ""
                 if isinstance(renderer, SceneRenderer):
                     pictures = renderer.draw_way(env, 0, style, shares)
                 else:
@@ -232,7 +233,7 @@ def _measured_line(
     style: Mapping[str, Any],
     recent: Sequence[Mapping[str, Tensor]],
     failures: int,
-    panel: bool = False,
+    short: bool = False,
 ) -> str:
     """Return what was measured since the request: what belongs to it, then published quantities that have a unit."""
     record = {name: torch.stack([row[name] for row in recent]) for name in recent[0]}
@@ -244,9 +245,9 @@ def _measured_line(
     ranked = [*(m for name in asked for m in owned[name] if not m.endswith("_error"))]
     ranked += [name for name in columns if name in domain.units] or ([] if ranked else columns)
     names = [name for name in dict.fromkeys(ranked) if name in known] or list(known)
-    names = names[: _MEASURES_IN_PANEL if panel else _MEASURES_IN_CAPTION]
+    names = names[: _FEWEST if short else _MOST]
     shown = ", ".join(f"{readable(name)} {_measured_value(domain, space, name, known[name])}" for name in names)
-    count = "" if not failures or panel else f"; {failures} {'failure' if failures == 1 else 'failures'}"
+    count = "" if not failures or short else f"; {failures} {'failure' if failures == 1 else 'failures'}"
     return f"measured: {shown or 'nothing yet'}{count}"
 
 

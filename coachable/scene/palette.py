@@ -23,6 +23,10 @@ STEEL: Colour = (118, 124, 132)
 SLATE: Colour = (74, 80, 88)
 INK: Colour = (34, 37, 43)
 
+AIR: Colour = (214, 224, 234)
+HAZE: Colour = (195, 202, 210)
+"""Sky above, and at the horizon, where what is far fades."""
+
 REQUESTED, MEASURED = (10, 122, 186), VERMILION
 """What was asked for and what was measured, in charts and scenes; the blue is lighter, for the dark page."""
 

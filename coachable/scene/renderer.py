@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from coachable.offscreen import OffscreenMujoco
 from coachable.scene.between import between, continues
 from coachable.scene.frame import Backdrop, Frame, Gauge, Map, Stage
-from coachable.scene.palette import INK, SILVER, WHITE, Colour, mixed
+from coachable.scene.palette import AIR, HAZE, INK, WHITE, mixed
 from coachable.scene.parts import BALL, BOX, CYLINDER, SHAPES
 
 _GEOMS = {
@@ -21,8 +21,6 @@ _GEOMS = {
     BALL: mujoco.mjtGeom.mjGEOM_ELLIPSOID,
     CYLINDER: mujoco.mjtGeom.mjGEOM_CYLINDER,
 }
-_SKY: Colour = (214, 224, 234)
-_HAZE = 2.0  # distances of the camera from which things fade
 _BAR = 0.26  # of the width, least length of a gauge's bar
 GLOW = 0.45  # opacity of the translucent primitives
 _MOST = 4000  # primitives
@@ -105,16 +103,15 @@ class SceneRenderer:
         spec.visual.headlight.ambient[:], spec.visual.headlight.diffuse[:] = 0.42, 0.35
         spec.visual.headlight.specular[:] = 0.05
         spec.stat.extent = 1.0
-        view, haze = self._stage.viewpoint, mixed(_SKY, SILVER, 0.5)  # what is far fades into the horizon
-        spec.visual.map.znear, spec.visual.map.zfar = 0.2, view.far
-        spec.visual.map.fogstart, spec.visual.map.fogend = _HAZE * view.distance, view.far
-        spec.visual.rgba.fog[:] = _rgba(haze)
+        spec.visual.map.znear, spec.visual.map.zfar = 0.2, self._stage.viewpoint.far
+        spec.visual.map.fogstart, spec.visual.map.fogend = self._stage.viewpoint.haze
+        spec.visual.rgba.fog[:] = _rgba(HAZE)
         spec.add_texture(
             name="sky",
             type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
             builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-            rgb1=np.divide(_SKY, 255.0),
-            rgb2=np.divide(SILVER, 255.0),
+            rgb1=np.divide(AIR, 255.0),
+            rgb2=np.divide(mixed(AIR, HAZE, 2.0), 255.0),  # the horizon is halfway
             width=64,
             height=384,
         )
@@ -170,7 +167,7 @@ class SceneRenderer:
         """Write the gauges into the lower left corner: names, and texts on their bars, in columns as wide as needed."""
         if not gauges:
             return
-        line, gap = self._line + 6, 6
+        line, gap = self._line + 5, 6
         left = 2 * gap + max(pen.textlength(gauge.name, self._font) for gauge in gauges)
         widest = max(pen.textlength(gauge.text, self._font) for gauge in gauges)
         right = left + max(widest + 2 * gap, _BAR * self._size[0])

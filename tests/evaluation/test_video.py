@@ -92,7 +92,7 @@ def test_the_caption_names_what_belongs_to_the_request_first():
     shown = partial(video._measured_line, replace(domain, measures=measures), space, style, recent)
     assert shown(0) == "measured: pose held 50%, step length 0.500 m, forward speed 1.23 m/s"
     assert shown(2).endswith("; 2 failures")
-    assert shown(2, panel=True) == "measured: pose held 50%, step length 0.500 m"
+    assert shown(2, short=True) == "measured: pose held 50%, step length 0.500 m"
     found.clear()
     assert shown(0) == "measured: nothing yet"
 

@@ -51,7 +51,7 @@ _RAYS = 15
 class CombatStage:
     """Scene of one fight of a `CombatEnv` or of an environment around it; see `coachable.scene.frame.Stage`."""
 
-    viewpoint = Viewpoint(distance=14.0, elevation=21.0, azimuth=192.0, turns=True, far=170.0, height=1.0)
+    viewpoint = Viewpoint(distance=13.0, elevation=20.0, azimuth=152.0, turns=True, far=170.0, height=1.0)
     legend = (
         *((colour, name) for name, colour in ELEMENT_COLOURS.items()),
         *zip(PART_COLOURS, ("shields (plates)", "weapons (barrels)", "canisters"), strict=True),

@@ -627,13 +627,20 @@ def test_slow_control_steps_are_drawn_in_between(server, monkeypatch):
     monkeypatch.setattr(server, "get_clients", lambda: {0: None})
     session = CoachSession.open("combat", seed=1)
     view = views.make_view(server, session)
+    view.mode.value = scene_view.FOLLOW
     focus = []
     for _ in range(2):
         session.step()
         view.update()
         focus.append(np.asarray(view.frame.focus)[:2])
     view.update(0.25)
-    assert -view._root.position[:2] == pytest.approx(focus[0] + 0.25 * (focus[1] - focus[0]), abs=1e-5)
+    between = focus[0] + 0.25 * (focus[1] - focus[0])
+    assert -view._root.position[:2] == pytest.approx(between, abs=1e-5)
+    assert view._moving.position[:2] == pytest.approx(between, abs=1e-5)
+    view.update()
+    placed = view._nodes["parts", "ball"].handle.batched_positions + view._moving.position
+    balls = view.frame.parts.of("ball").positions
+    assert placed[: len(balls)] == pytest.approx(balls, abs=1e-4), "relative to what the camera follows"
     session.close()
 
 
