@@ -21,12 +21,14 @@ _GEOMS = {
     BALL: mujoco.mjtGeom.mjGEOM_ELLIPSOID,
     CYLINDER: mujoco.mjtGeom.mjGEOM_CYLINDER,
 }
+_NARROW, _FEW = 480, 4  # [px], width below which only the first gauges are drawn, and how many
 _BAR = 0.26  # of the width, least length of a gauge's bar
 GLOW = 0.45  # opacity of the translucent primitives
 _MOST = 4000  # primitives
 _GROUND = "ground"
 _FIELD = 45.0  # [deg], of view
 _FINER = 2  # pixels drawn along each side of a pixel; software draws them faster than the samples of OpenGL
+_FINEST = 4096  # [px], largest side that is drawn so
 
 
 class SceneRenderer:
@@ -43,6 +45,7 @@ class SceneRenderer:
 
     def __init__(self, make_stage: Callable[[], Stage], width: int = 640, height: int = 480) -> None:
         self._stage, self._size = make_stage(), (width, height)
+        self._finer = _FINER if _FINER * max(width, height) <= _FINEST else 1
         self._line = max(10, width // 50)  # [px], height of the text
         self._font = ImageFont.load_default(size=self._line)
         self._place: Hashable = None
@@ -84,7 +87,7 @@ class SceneRenderer:
         assert self._offscreen is not None
         self._aim(frame)
         fine = self._offscreen.draw(self._data, lambda scene: _decorate(scene, frame))
-        return self._overlay(Image.fromarray(fine).reduce(_FINER), frame)
+        return self._overlay(Image.fromarray(fine).reduce(self._finer), frame)
 
     def close(self) -> None:
         """Release the OpenGL context."""
@@ -96,7 +99,7 @@ class SceneRenderer:
         """Compile a model of what does not move."""
         self.close()
         spec = mujoco.MjSpec()
-        width, height = (_FINER * side for side in self._size)
+        width, height = (self._finer * side for side in self._size)
         spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
         spec.visual.quality.offsamples = 0
         spec.visual.global_.fovy = _FIELD
@@ -160,7 +163,7 @@ class SceneRenderer:
             self._write(pen, label.text, self._seen(np.asarray(label.position, dtype=float), frame))
         if frame.map is not None:
             self._draw_map(pen, frame.map)
-        self._draw_gauges(pen, frame.gauges)
+        self._draw_gauges(pen, frame.gauges if self._size[0] >= _NARROW else frame.gauges[:_FEW])
         return np.asarray(image)
 
     def _draw_gauges(self, pen: ImageDraw.ImageDraw, gauges: Sequence[Gauge]) -> None:

@@ -42,7 +42,7 @@ _PLAIN = palette.SILVER  # ammunition without an element
 _BAR = (2.4, 0.26)  # [m], health bar
 _SHOWN = 0.05  # build-up of an element from which it is shown
 _BOUND_POSTS = 48
-_AHEAD = 4.0  # [m], largest distance of the focus from the player
+_AHEAD = 4.0  # [m], from the player to what the camera looks at
 _LAG = 0.3  # share by which the camera turns towards the nearest machine in a control step
 _ARC = math.radians(60.0)  # of a bite, to either side
 _RAYS = 15
@@ -80,18 +80,17 @@ class CombatStage:
             self._key, self._episode = machines, self._episode + 1
         self._steps = steps
         apart = s["enemy_position"][:, _nearest(s)] - s["position"]
-        self._turn(math.atan2(apart[1], apart[0]))
+        heading = self._turn(math.atan2(apart[1], apart[0]))
         parts, glows, labels = Parts(), Parts(), []
         self._add_player(parts, glows, s)
         for enemy in range(env.num_enemies):
             self._add_machine(parts, glows, labels, env, s, row, enemy)
         marks = _ground_marks(s, glows)
-        here = s["position"]
-        middle = here + apart * min(0.5, _AHEAD / max(float(np.hypot(*apart)), 1e-6))  # both are seen, if they are near
+        ahead = np.array([math.cos(heading), math.sin(heading)])
         return Frame(
             parts=parts,
-            focus=(*middle.tolist(), self.viewpoint.height),
-            heading=self._heading or 0.0,
+            focus=(*(s["position"] + _AHEAD * ahead).tolist(), self.viewpoint.height),
+            heading=heading,
             place=int(s["site"]),
             marks=marks,
             glows=glows,
@@ -107,10 +106,11 @@ class CombatStage:
         self._places: dict[int, np.ndarray] = {}
         self._rounds: tuple[int, float] | None = None  # section of the wheel, and rounds in it
 
-    def _turn(self, direction: float) -> None:
-        """Turn the camera towards a direction [rad], with a lag."""
+    def _turn(self, direction: float) -> float:
+        """Turn the camera towards a direction [rad] with a lag, and return where it looks then."""
         before = direction if self._heading is None else self._heading
         self._heading = before + _LAG * math.remainder(direction - before, 2 * math.pi)
+        return self._heading
 
     def _walk(self, who: int, place: np.ndarray) -> float:
         """Return the distance that somebody has walked since the fight began [m]."""
