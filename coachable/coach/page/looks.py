@@ -31,7 +31,7 @@ _STYLE = (
 }
 .gauges:empty { display: none; }
 .gauge { display: flex; gap: 8px; align-items: center; }
-.gauge b { flex: 0 0 9.5em; font-weight: 400; opacity: 0.85; white-space: nowrap; }
+.gauge b { flex: 0 0 10.2em; font-weight: 400; opacity: 0.85; white-space: nowrap; }
 .gauge span { position: relative; flex: 1; min-width: 9em; height: 1.45em; border-radius: 3px; overflow: hidden; }
 .gauge span:has(i) { background: rgba(255, 255, 255, 0.16); }
 .gauge i { position: absolute; inset: 0 auto 0 0; }
@@ -47,7 +47,7 @@ _STYLE = (
 @media (max-width: 576px) {
   .gauges { top: 6px; bottom: auto; left: 6px; font-size: 10px; line-height: 1.35; min-width: 0; padding: 3px 6px;
     background: INK8c; }
-  .gauge b { flex-basis: 8.5em; }
+  .gauge b { flex-basis: 10em; }
   .gauge span { min-width: 7em; }
   [style*="width: 20em"] { width: 100% !important; }
   .map { left: auto; right: 6px; top: 6px; width: 90px; height: 90px; }
