@@ -49,6 +49,7 @@ _STYLE = (
     background: INK8c; }
   .gauge b { flex-basis: 10em; }
   .gauge span { min-width: 7em; }
+  .gauge:nth-child(n + 5) { display: none; }
   [style*="width: 20em"] { width: 100% !important; }
   .map { left: auto; right: 6px; top: 6px; width: 90px; height: 90px; }
 }
