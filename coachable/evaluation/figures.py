@@ -24,7 +24,7 @@ from coachable.styles import Choice, StyleSpace
 
 _PANELS_PER_ROW = 4
 MARKERS = "osD^vP*X"  # distinguishable without colour as well
-_LOOK = {
+_LOOK: dict[Any, Any] = {
     "axes.prop_cycle": cycler(color=list(map(css, LINES))),
     "axes.spines.top": False,
     "axes.spines.right": False,

@@ -40,7 +40,9 @@ table { border-collapse: collapse; font-size: .84rem; font-variant-numeric: tabu
 th { text-align: left; font-weight: 600; color: var(--soft); vertical-align: bottom; }
 th, td { padding: .3rem .65rem; border-bottom: 1px solid var(--line); }
 th:first-child, td:first-child { position: sticky; left: 0; padding-left: 0; background: var(--panel); }
-td.number, th.number { text-align: right; white-space: nowrap; }
+td { min-width: 9rem; }
+td:first-child { min-width: 6.5rem; }
+td.number, th.number { min-width: 0; text-align: right; white-space: nowrap; }
 td[style] { background: color-mix(in srgb, var(--measured) calc(var(--share) * 32%), var(--panel)); }
 td small { color: var(--soft); }
 td[style] small { color: inherit; }

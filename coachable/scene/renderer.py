@@ -80,8 +80,9 @@ class SceneRenderer:
         if shares and frame.place != self._place:
             self._build(self._stage.backdrop(env, row))
             self._place = frame.place
-        joined = last is not None and continues(last, frame)
-        return [self._draw(between(last, frame, share) if joined and share < 1.0 else frame) for share in shares]
+        if last is None or not continues(last, frame):
+            last = frame
+        return [self._draw(between(last, frame, share) if share < 1.0 else frame) for share in shares]
 
     def _draw(self, frame: Frame) -> np.ndarray:
         assert self._offscreen is not None

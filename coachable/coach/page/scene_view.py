@@ -170,7 +170,7 @@ class SceneView:
         self._server.on_client_connect(on_connect)
 
 
-# viser takes the colours of batches as linear ones, unlike those of other meshes.
+# viser takes the colours of batches and of fog as linear ones, unlike those of meshes.
 _LINEAR = np.array(
     [round(255 * (v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4)) for v in np.arange(256) / 255], np.uint8
 )
@@ -282,7 +282,8 @@ def _light(server: viser.ViserServer) -> None:
 
 def _surround(server: viser.ViserServer, view: Viewpoint) -> None:
     """Show a sky above the horizon, into which what is far fades."""
-    server.scene.configure_fog(*view.haze, color=HAZE)
+    red, green, blue = _LINEAR[list(HAZE)].tolist()
+    server.scene.configure_fog(*view.haze, color=(red, green, blue))
     share = np.clip(np.linspace(0.0, 2.0, 64), 0.0, 1.0)[:, None, None]
     sky = np.array(AIR) + share * np.subtract(HAZE, AIR)
     server.scene.set_background_image(np.repeat(sky, 8, axis=1).round().astype(np.uint8), format="png")
