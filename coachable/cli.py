@@ -90,6 +90,8 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("--seconds", type=_seconds, default=4.0, dest="seconds_per_style", help=text)
     text = "of the picture of one style (default: 640x480)"
     render.add_argument("--size", type=_size, default=(640, 480), metavar="WIDTHxHEIGHT", help=text)
+    text = "pictures per second (%(default)s)"
+    render.add_argument("--fps", type=_fps, default=20.0, help=text)
     render.add_argument("--together", action="store_true", help="show all styles at once, side by side")
     render.add_argument("--seed", type=_at_least(0), default=0)
 
@@ -327,6 +329,16 @@ def _seconds(text: str) -> float:
         value = math.nan
     if not 0.0 < value <= 3600.0:
         raise argparse.ArgumentTypeError(f"{text!r}: expected a number of seconds above 0 and up to 3600")
+    return value
+
+
+def _fps(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 1.0 <= value <= 60.0:
+        raise argparse.ArgumentTypeError(f"{text!r}: expected a number of pictures per second from 1 to 60")
     return value
 
 

@@ -25,6 +25,7 @@ class OffscreenMujoco:
         width: Image width [px].
         height: Image height [px].
         most: Largest number of geoms of a picture.
+        haze: Whether what is far fades, as the model's settings say.
 
     Raises:
         RenderingError: If no OpenGL library is installed; the message names the package to install.
@@ -33,7 +34,7 @@ class OffscreenMujoco:
         camera: The model's first camera, or a free one that shows the whole model if it has none.
     """
 
-    def __init__(self, model: mujoco.MjModel, width: int, height: int, most: int = 1000) -> None:
+    def __init__(self, model: mujoco.MjModel, width: int, height: int, most: int = 1000, haze: bool = False) -> None:
         self._model = model
         self._gl = _make_gl_context(width, height)
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
@@ -41,6 +42,7 @@ class OffscreenMujoco:
         self._scene = mujoco.MjvScene(model, maxgeom=most)
         for slow in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
             self._scene.flags[slow] = False  # they take most of the time of software rendering
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_FOG] = haze
         self._option = mujoco.MjvOption()
         self._viewport = mujoco.MjrRect(0, 0, width, height)
         self.camera = mujoco.MjvCamera()

@@ -14,6 +14,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL logs every buffer that it allocates
 
 from coachable import __version__  # noqa: E402
+from coachable.scene.look import DARK, ICON, LIGHT, Look  # noqa: E402
+from coachable.scene.palette import css  # noqa: E402
 
 project = "coachable"
 author = "the coachable developers"
@@ -56,8 +58,19 @@ napoleon_use_ivar = True
 python_use_unqualified_type_names = True
 python_maximum_signature_line_length = 100
 
+
+def _colours(look: Look) -> dict[str, str]:
+    return {
+        "color-brand-primary": css(look.requested),
+        "color-brand-content": css(look.requested),
+        "color-foreground-primary": css(look.ink),
+    }
+
+
 html_theme = "furo"
+html_theme_options = {"light_css_variables": _colours(LIGHT), "dark_css_variables": _colours(DARK)}
 html_title = "coachable"
+html_favicon = os.path.relpath(ICON, DOCS)
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_copy_source = False

@@ -144,7 +144,7 @@ def _draw(rankings: Sequence[Ranking], path: Path, title: str) -> None:
     with drawing(path, 1, len(rankings), size=(11, 1.2 + 0.26 * shown), grid=False) as panels:
         for panel, ranking in zip(panels[0], rankings, strict=True):
             groups, means = ranking.groups[:shown], ranking.means[:shown]
-            colours = ["tab:orange" if group.is_style else "tab:blue" for group in groups]
+            colours = ["C1" if group.is_style else "C0" for group in groups]
             panel.barh(range(shown), means, xerr=ranking.deviations[:shown], color=colours, ecolor="0.4", capsize=2)
             panel.set_yticks(range(shown), [readable(group.name) for group in groups])
             panel.invert_yaxis()
@@ -153,6 +153,6 @@ def _draw(rankings: Sequence[Ranking], path: Path, title: str) -> None:
             panel.set_title(ranking.method, fontsize=10)
             panel.set_axisbelow(True)
             panel.grid(axis="x", alpha=0.3)
-        handles = [Rectangle((0, 0), 1, 1, color=colour) for colour in ("tab:orange", "tab:blue")]
+        handles = [Rectangle((0, 0), 1, 1, color=colour) for colour in ("C1", "C0")]
         panels[0, -1].legend(handles, ["style", "observation"], loc="lower right", fontsize=9)
         panels[0, 0].figure.suptitle(title, fontsize=10)

@@ -11,16 +11,27 @@ import matplotlib
 import numpy as np
 
 matplotlib.use("Agg")
+from cycler import cycler
 from matplotlib import pyplot as plt
 
 from coachable.domain import Domain
 from coachable.evaluation.runs import describe
 from coachable.evaluation.style_grid import StyleGrid, mean_of, measured_column, published
 from coachable.evaluation.wording import readable
+from coachable.scene.look import LIGHT, LINES
+from coachable.scene.palette import css
 from coachable.styles import Choice, StyleSpace
 
 _PANELS_PER_ROW = 4
 MARKERS = "osD^vP*X"  # distinguishable without colour as well
+_LOOK: dict[Any, Any] = {
+    "axes.prop_cycle": cycler(color=list(map(css, LINES))),
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    **dict.fromkeys(("text.color", "axes.labelcolor", "axes.titlecolor"), css(LIGHT.ink)),
+    **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), css(LIGHT.soft)),
+    "grid.color": css(LIGHT.line),
+}
 
 
 @contextlib.contextmanager
@@ -37,14 +48,14 @@ def drawing(
         grid: Whether the panels have grid lines.
         **options: Further arguments of `matplotlib.pyplot.subplots`.
     """
-    with plt.rc_context({"axes.grid": grid, "grid.alpha": 0.3 if grid else 1.0}):
+    with plt.rc_context(_LOOK | {"axes.grid": grid}):
         figure, panels = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained", **options)
-    try:
-        yield panels
-        # The version of matplotlib is left out, so that the same numbers give the same file.
-        figure.savefig(path, dpi=130, metadata={"Software": None} if path.suffix == ".png" else None)
-    finally:
-        plt.close(figure)
+        try:
+            yield panels
+            # The version of matplotlib is left out, so that the same numbers give the same file.
+            figure.savefig(path, dpi=130, metadata={"Software": None} if path.suffix == ".png" else None)
+        finally:
+            plt.close(figure)
 
 
 def shade(index: int, count: int) -> Any:

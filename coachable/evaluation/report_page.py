@@ -11,6 +11,7 @@ from typing import Any
 
 from coachable.evaluation.runs import Estimate
 from coachable.evaluation.wording import readable
+from coachable.scene.look import ICON, TITLE, icon_link, stylesheet
 
 __all__ = ["Page", "paragraph", "picture", "shown", "table"]
 
@@ -18,23 +19,46 @@ _NOTHING = "n/a"
 _DENSITY = 1.5  # pixels of a picture per pixel of the page
 
 _STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #1c2430; background: #fff; max-width: 1040px; margin: 2rem auto;
-  padding: 0 1.2rem; }
-h1 { font-size: 1.7rem; margin-bottom: .2rem; }
-h2 { font-size: 1.2rem; margin: 2.4rem 0 .4rem; border-bottom: 1px solid #d5dbe3; padding-bottom: .2rem; }
-p { max-width: 78ch; margin: .5rem 0; }
+* { box-sizing: border-box; }
+body { margin: 0; background: var(--ground); color: var(--ink); }
+main { max-width: 1120px; margin: 0 auto; padding: 1.5rem; }
+header { display: flex; gap: .9rem; align-items: flex-start; }
+header svg { flex: none; width: 46px; height: 46px; }
+h1 { margin: .3rem 0; font-size: 1.5rem; line-height: 1.25; letter-spacing: -.01em; }
+h2 { margin: 0 0 .6rem; font-size: 1.15rem; }
+p { max-width: 78ch; margin: .5rem 0; color: var(--soft); font-size: .925rem; }
+section { margin: 1.25rem 0; padding: 1.1rem 1.25rem; background: var(--panel); border: 1px solid var(--line);
+  border-radius: 12px; }
+nav { display: flex; flex-wrap: wrap; gap: .4rem; margin: 1rem 0; }
+nav a { padding: .3rem .8rem; border: 1px solid var(--line); border-radius: 999px; background: var(--panel);
+  font-size: .9rem; text-decoration: none; }
+a { color: var(--requested); }
+a:hover { border-color: var(--requested); }
+a:focus-visible, .scroll:focus-visible { outline: 3px solid var(--measured); outline-offset: 2px; }
 .scroll { overflow-x: auto; margin: .8rem 0; }
-table { border-collapse: collapse; font-size: 13.5px; font-variant-numeric: tabular-nums; }
-th { text-align: left; font-weight: 600; background: #eef1f5; vertical-align: bottom; }
-th, td { padding: .28rem .65rem; border-bottom: 1px solid #e3e8ee; }
-td.number, th.number { text-align: right; white-space: nowrap; }
-td small { color: #5b6675; }
-figure { margin: 1rem 0; }
-img { max-width: 100%; height: auto; }
-nav a { margin-right: 1rem; }
-a { color: #1d5fa8; }
-code { background: #f2f4f7; padding: .1rem .3rem; border-radius: 3px; }
-footer { color: #5b6675; font-size: 13px; margin-top: 3rem; }
+table { border-collapse: collapse; font-size: .84rem; font-variant-numeric: tabular-nums; }
+th { text-align: left; font-weight: 600; color: var(--soft); vertical-align: bottom; }
+th, td { padding: .3rem .65rem; border-bottom: 1px solid var(--line); }
+th:first-child, td:first-child { position: sticky; left: 0; padding-left: 0; background: var(--panel); }
+td { min-width: 9rem; }
+td:first-child { min-width: 6.5rem; }
+td.number, th.number { min-width: 0; text-align: right; white-space: nowrap; }
+td[style] { background: color-mix(in srgb, var(--measured) calc(var(--share) * 32%), var(--panel)); }
+td small { color: var(--soft); }
+td[style] small { color: inherit; }
+figure { margin: .8rem 0; }
+figure img { display: block; max-width: 100%; height: auto; }
+footer { margin: 2rem 0 0; color: var(--soft); font-size: .8rem; overflow-wrap: anywhere; }
+@media (max-width: 700px) {
+  main { padding: .9rem .6rem; }
+  section { padding: .8rem .7rem; }
+  h1 { font-size: 1.2rem; }
+  td:first-child { max-width: 9.5rem; }
+  figure img { max-width: none; }
+}
+/* Figures are drawn on white: the dark page turns their lightness around and keeps their hues. */
+@media (prefers-color-scheme: dark) { figure img { filter: invert(1) hue-rotate(180deg); mix-blend-mode: screen; } }
+@media print { section { break-inside: avoid; } }
 """
 
 
@@ -59,14 +83,17 @@ class Page:
         name = html.escape(self.title)
         links = " ".join(f'<a href="#s{i}">{html.escape(t)}</a>' for i, (t, _) in enumerate(self._sections))
         body = "\n".join(
-            f'<h2 id="s{i}">{html.escape(title)}</h2>\n{content}' for i, (title, content) in enumerate(self._sections)
+            f'<section>\n<h2 id="s{i}">{html.escape(title)}</h2>\n{content}\n</section>'
+            for i, (title, content) in enumerate(self._sections)
         )
+        icon = ICON.read_text(encoding="utf-8").replace("<svg", '<svg aria-hidden="true"', 1)
         return (
             '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-            '<meta name="viewport" content="width=device-width">\n'
-            f'<link rel="icon" href="data:,">\n<title>{name}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n'
-            f"<h1>{name}</h1>\n{paragraph(self.lead)}\n<nav>{links}</nav>\n{body}\n"
-            f"<footer>{html.escape(footer)}</footer>\n</body>\n</html>\n"
+            '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+            f'<link rel="icon" href="{icon_link()}">\n<title>{TITLE}: {name}</title>\n'
+            f"<style>\n{stylesheet()}{_STYLE}</style>\n</head>\n<body>\n<main>\n"
+            f"<header>{icon}<div><h1>{name}</h1>\n{paragraph(self.lead)}</div></header>\n"
+            f"<nav>{links}</nav>\n{body}\n<footer>{html.escape(footer)}</footer>\n</main>\n</body>\n</html>\n"
         )
 
 
@@ -81,8 +108,8 @@ def picture(path: Path, description: str) -> str:
     width = int.from_bytes(content[16:20], "big")  # from the header (PNG specification, IHDR)
     data = base64.b64encode(content).decode()
     return (
-        f'<figure><img width="{round(width / _DENSITY)}" alt="{html.escape(description)}" '
-        f'src="data:image/png;base64,{data}"></figure>'
+        f'<figure class="scroll" tabindex="0"><img width="{round(width / _DENSITY)}" '
+        f'alt="{html.escape(description)}" src="data:image/png;base64,{data}"></figure>'
     )
 
 
@@ -92,7 +119,7 @@ def table(rows: Sequence[Mapping[str, Any]], formats: Mapping[str, str], colour:
     Args:
         rows: Values by column name; an `Estimate` is shown with its interval.
         formats: Format specification of numbers by column or metric; by default ".3g".
-        colour: Whether to shade the estimates of a column from the lowest (white) to the highest value.
+        colour: Whether to shade the estimates of a column, the highest value most.
     """
     columns = list(rows[0])
     numeric = {c for c in columns if any(isinstance(row[c], Estimate | float | int) for row in rows)}
@@ -107,7 +134,7 @@ def table(rows: Sequence[Mapping[str, Any]], formats: Mapping[str, str], colour:
             shade = _shade(value, ranges[column]) if colour and isinstance(value, Estimate) else ""
             cells.append(f"<td{_class(column in numeric)}{shade}>{_cell(value, form)}</td>")
         lines.append(f"<tr>{''.join(cells)}</tr>")
-    return f'<div class="scroll"><table>\n<tr>{head}</tr>\n' + "\n".join(lines) + "\n</table></div>"
+    return f'<div class="scroll" tabindex="0"><table>\n<tr>{head}</tr>\n' + "\n".join(lines) + "\n</table></div>"
 
 
 def shown(value: Any, form: str) -> str:
@@ -141,4 +168,4 @@ def _shade(value: Estimate, bounds: tuple[float, float]) -> str:
     low, high = bounds
     if math.isnan(value.value) or high <= low:
         return ""
-    return f' style="background: rgba(29, 95, 168, {0.30 * ((value.value - low) / (high - low)):.3f})"'
+    return f' style="--share: {(value.value - low) / (high - low):.2f}"'

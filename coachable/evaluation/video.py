@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import math
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +19,26 @@ from tqdm import tqdm
 from coachable.domain import Domain
 from coachable.evaluation.outputs import complete_file
 from coachable.evaluation.rollouts import Rollout
-from coachable.evaluation.wording import readable, readable_number
+from coachable.evaluation.wording import measures_by_parameter, readable, readable_number
 from coachable.extras import how_to_install
+from coachable.scene.look import DARK
+from coachable.scene.renderer import SceneRenderer
 from coachable.styles import Choice, StyleRangeWarning, StyleSpace, Weight
 from coachable.training.weights import domain_of, load_policy
 
 VIDEO_SUFFIXES = (".mp4", ".gif", ".webp", ".png")
-_IMAGE_FPS = 20  # of films that are not mp4
+_IMAGE_FPS = 20  # of recorded sessions that are not mp4
+_FPS = (1.0, 60.0)  # least and most
 _WEBP_QUALITY = 50  # of 100
-_MEASURES_IN_CAPTION, _MEASURES_IN_PANEL = 4, 2  # as many as fit
+_MOST, _FEWEST = 3, 2  # measures in a caption, as many as fit, and in that of a narrow film
+_NARROW = 480  # [px]
 CAPTION = 44  # [px]
-_SMALLEST_FONT = 8  # [px]
+_SMALLEST_FONT, _LARGEST_FONT = 8, 15  # [px]
+_MARKS = (((0, -4), (8, -4), (8, 4), (0, 4)), ((4, -4), (8, 4), (0, 4)))  # [px], a square and a triangle
 _SMALLEST = (64, CAPTION + 16)  # [px]
 _LARGEST = 4096  # [px]
 _LONGEST = 3600.0  # [s]
+_ROUNDING = 1e-6  # of a picture
 
 
 def render(
@@ -40,6 +48,7 @@ def render(
     styles: Sequence[dict[str, Any]] | None = None,
     seconds_per_style: float = 4.0,
     size: tuple[int, int] = (640, 480),
+    fps: float = 20.0,
     seed: int = 0,
     together: bool = False,
     progress: bool = True,
@@ -54,6 +63,7 @@ def render(
         seconds_per_style: Time between switches, or length of a film of all styles together [s], above 0 and at most
             3600.
         size: Width and height of the picture of one style [px], at least 64 x 60 and at most 4096 x 4096; even for mp4.
+        fps: Pictures per second, from 1 to 60. A domain with a scene is drawn between its control steps as well.
         seed: Seed of the initial state and of sampled actions.
         together: Whether to show all styles at once, side by side in rows of three, instead of one after the other.
         progress: Whether to show a progress bar.
@@ -72,6 +82,8 @@ def render(
     if any(not low <= side <= _LARGEST for side, low in zip(size, _SMALLEST, strict=True)):
         smallest = "x".join(map(str, _SMALLEST))
         raise ValueError(f"the size is {size[0]}x{size[1]}: expected {smallest} to {_LARGEST}x{_LARGEST}")
+    if not _FPS[0] <= fps <= _FPS[1]:
+        raise ValueError(f"{fps} pictures per second: expected {_FPS[0]:g} to {_FPS[1]:g}")
     if out.suffix == ".mp4":
         if size[0] % 2 or size[1] % 2:
             raise ValueError(f"the size is {size[0]}x{size[1]}: mp4 needs an even width and height")
@@ -80,25 +92,25 @@ def render(
     domain = domain_of(agent)
     requests = default_tour(domain, agent.space) if styles is None else list(styles)
     period = max(1, round(seconds_per_style / domain.control_step))
-    sheet = out.suffix == ".png"
-    fps = round(1 / domain.control_step)
-    # A sheet shows the last step of each style, so that the agent has had time to comply.
-    every = period if sheet else 1 if out.suffix == ".mp4" else min(_stride(fps), period)
+    sheet, side_by_side = out.suffix == ".png", together and out.suffix != ".png"
+    steps = period if side_by_side else len(requests) * period
+    fps = max(fps, 1.0 / (steps * domain.control_step))  # at least one picture
 
     def film(styles: Sequence[dict[str, Any]]) -> Iterator[np.ndarray]:
-        panel = together and not sheet
-        return _film(domain, agent.actor, agent.space, styles, period, size, seed, every=every, panel=panel)
+        rate = None if sheet else fps
+        return _film(domain, agent.actor, agent.space, styles, period, size, seed, rate)
 
-    frames, total = film(requests), len(requests) * (period // every)
-    if together and not sheet:
+    frames = film(requests)
+    if side_by_side:
         panels = [film([request]) for request in requests]
-        frames, total = (tiled(row) for row in zip(*panels, strict=True)), period // every
+        frames = (tiled(row) for row in zip(*panels, strict=True))
+    total = len(requests) if sheet else math.floor(steps * domain.control_step * fps + _ROUNDING)
     bar = tqdm(frames, total=total, desc="drawing", unit="frame", disable=None if progress else True, leave=False)
     with complete_file(out) as unfinished:
         if sheet:
             Image.fromarray(tiled(list(bar))).save(unfinished)
         else:
-            write_video(bar, unfinished, max(1, fps // every))
+            write_video(bar, unfinished, fps, every=1)
     return out
 
 
@@ -115,34 +127,32 @@ def default_tour(domain: Domain, space: StyleSpace) -> list[dict[str, Any]]:
     ]
 
 
-def write_video(frames: Iterable[np.ndarray], out: Path, fps: int) -> None:
+def write_video(frames: Iterable[np.ndarray], out: Path, fps: float, every: int | None = None) -> None:
     """Write frames (height, width, 3) uint8 as mp4 (H.264), gif or animated WebP.
 
     Args:
         frames: The frames.
         out: File to write, `.mp4`, `.gif` or `.webp`.
-        fps: Frames per second; gif and WebP leave some out to have about 20.
+        fps: Frames per second.
+        every: Of gif and WebP, every which frame is written; by default as many as make about 20 per second.
     """
     if out.suffix != ".mp4":
-        stride = _stride(fps)
+        stride = every or max(1, int(fps) // _IMAGE_FPS)
         images = [Image.fromarray(frame) for frame in itertools.islice(frames, 0, None, stride)]
-        options: dict[str, Any] = {"append_images": images[1:], "duration": 1000 * stride // fps, "loop": 0}
+        options: dict[str, Any] = {"append_images": images[1:], "duration": round(1000 * stride / fps), "loop": 0}
         options |= {"quality": _WEBP_QUALITY} if out.suffix == ".webp" else {}
         images[0].save(out, save_all=True, **options)
         return
     av = _import_av()
     with av.open(str(out), "w") as container:
-        stream = container.add_stream("libx264", rate=fps, options={"preset": "veryfast", "crf": "23"})
+        rate = Fraction(fps).limit_denominator(1000)
+        stream = container.add_stream("libx264", rate=rate, options={"preset": "veryfast", "crf": "23"})
         stream.pix_fmt = "yuv420p"
         for index, frame in enumerate(frames):
             if index == 0:
                 stream.height, stream.width = frame.shape[:2]
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
         container.mux(stream.encode())
-
-
-def _stride(fps: int) -> int:
-    return max(1, fps // _IMAGE_FPS)
 
 
 def _film(
@@ -153,33 +163,47 @@ def _film(
     period: int,
     size: tuple[int, int],
     seed: int,
-    every: int,
-    panel: bool = False,
+    fps: float | None,
 ) -> Iterator[np.ndarray]:
-    """Yield every `every`-th frame of the `period` steps of each request, with a short caption for a panel."""
+    """Yield the pictures of `period` steps of each request, with a short caption where they are narrow.
+
+    Without `fps` there is one picture of each request, of its last step, so that the agent has had time to comply.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", StyleRangeWarning)  # the caption mentions clamped values
         thetas = [space.make(**request) for request in requests]
     env = domain.styled_env(space, 1, seed=seed, num_threads=1, **domain.coached)
     renderer = domain.make_renderer(size[0], size[1] - CAPTION)
-    rollout, failures = Rollout(env, seed), 0
+    rollout, failures, steps = Rollout(env, seed), 0, itertools.count()
+    short = size[0] < _NARROW
     rollout.begin(thetas[0][None])
     try:
         for request, theta in zip(requests, thetas, strict=True):
-            asked = asked_line(space, request, theta)
+            asked, style = asked_line(space, request, theta), space.describe(theta)
             recent: list[dict[str, Tensor]] = []
             for step in range(1, period + 1):
                 transition = rollout.step(policy, theta[None])
-                recent.append(domain.measures.step(transition))
-                if step % every == 0:
-                    measured = _measured_line(domain, recent, failures, space.names if panel else ())
-                    yield caption(renderer.draw(env), (asked, measured))
+                recent = [*recent, domain.measures.step(transition)][-round(domain.window / domain.control_step) :]
+                last = [1.0] if step == period else []
+                shares = last if fps is None else _shares(next(steps), domain.control_step * fps)
+                measured = _measured_line(domain, space, style, recent, failures, short) if shares else ""
+                if isinstance(renderer, SceneRenderer):
+                    pictures = renderer.draw_way(env, 0, style, shares)
+                else:
+                    pictures = [renderer.draw(env)] * len(shares) if shares else []
+                yield from (caption(picture, (asked, measured)) for picture in pictures)
                 if transition["next", "done"].any():
                     failures += int(transition["next", "terminated"].sum())
                     rollout.begin(theta[None])
     finally:
         renderer.close()
         env.close()
+
+
+def _shares(step: int, pictures: float) -> list[float]:
+    """Return where in a step pictures are due, as shares of it in (0, 1], if there are `pictures` of them per step."""
+    first, last = (math.floor(number * pictures + _ROUNDING) for number in (step, step + 1))
+    return [min(1.0, number / pictures - step) for number in range(first + 1, last + 1)]
 
 
 def asked_line(space: StyleSpace, request: Mapping[str, Any], theta: Tensor) -> str:
@@ -199,39 +223,60 @@ def asked_line(space: StyleSpace, request: Mapping[str, Any], theta: Tensor) -> 
         clamped = abs(wanted - value) > 1e-6 * max(abs(wanted), abs(value))
         if value or clamped or not isinstance(space[name], Weight):
             note = f" (clamped from {readable_number(wanted)})" if clamped else ""
-            parts.append(f"{name} {readable_number(value)}{note}")
-    return readable(f"asked: {', '.join(parts) or 'every weight 0'}")
+            parts.append(f"{name} {readable_number(value, getattr(space[name], 'unit', ''))}{note}")
+    return readable(f"requested: {', '.join(parts) or 'every weight 0'}")
 
 
-def _measured_line(domain: Domain, recent: list[dict[str, Tensor]], failures: int, first: Sequence[str] = ()) -> str:
-    """Return what was measured in the last two seconds; a short line if the names to begin with are given."""
-    window = recent[-round(2.0 / domain.control_step) :]
-    record = {name: torch.stack([row[name] for row in window]) for name in window[0]}
-    measured = domain.measures.summarise(record, torch.ones(len(window), 1, dtype=torch.bool))
-    wanted = [name.removeprefix("measured_") for name in domain.columns]
-    published = {name: value for name, value in measured.items() if name in wanted} or measured
-    names = [name for name, value in published.items() if not bool(value.isnan().any())]
-    names = sorted(names, key=lambda name: name not in first)[: _MEASURES_IN_PANEL if first else _MEASURES_IN_CAPTION]
-    shown = ", ".join(f"{name} {published[name].item():.2f}" for name in names)
-    return f"last 2 s: {shown}{f'; failures {failures}' if failures or not first else ''}".replace("_", " ")
+def _measured_line(
+    domain: Domain,
+    space: StyleSpace,
+    style: Mapping[str, Any],
+    recent: Sequence[Mapping[str, Tensor]],
+    failures: int,
+    short: bool = False,
+) -> str:
+    """Return what was measured since the request: what belongs to it, then published quantities that have a unit."""
+    record = {name: torch.stack([row[name] for row in recent]) for name in recent[0]}
+    measured = domain.measures.summarise(record, torch.ones(len(recent), 1, dtype=torch.bool))
+    known = {name: value.item() for name, value in measured.items() if not bool(value.isnan().any())}
+    owned = measures_by_parameter(space, known)
+    asked = [name for name in space.names if style[name] or not isinstance(space[name], Weight)]
+    columns = [name.removeprefix("measured_") for name in domain.columns]
+    ranked = [*(m for name in asked for m in owned[name] if not m.endswith("_error"))]
+    ranked += [name for name in columns if name in domain.units] or ([] if ranked else columns)
+    names = [name for name in dict.fromkeys(ranked) if name in known] or list(known)
+    names = names[: _FEWEST if short else _MOST]
+    shown = ", ".join(f"{readable(name)} {_measured_value(domain, space, name, known[name])}" for name in names)
+    count = "" if not failures or short else f"; {failures} {'failure' if failures == 1 else 'failures'}"
+    return f"measured: {shown or 'nothing yet'}{count}"
+
+
+def _measured_value(domain: Domain, space: StyleSpace, name: str, value: float) -> str:
+    """Return a measured value as the domain publishes it, or else with three digits, with its unit."""
+    form = domain.columns.get(name, domain.columns.get(f"measured_{name}", ""))
+    if form.endswith("%"):
+        return format(value, form)
+    unit = domain.units.get(name, getattr(space[name], "unit", "") if name in space else "")
+    return f"{format(value, form)} {unit}".rstrip() if form else readable_number(value, unit)
 
 
 def caption(frame: np.ndarray, lines: tuple[str, str]) -> np.ndarray:
-    """Add two lines of text below a frame.
+    """Add a line for the request and one for what was measured below a frame, each with the mark of its kind.
 
     Args:
         frame: Frame (height, width, 3) uint8.
-        lines: The lines; the first one is larger. Long lines are written smaller, so that they fit.
+        lines: The lines. Long lines are written smaller, so that they fit.
 
     Returns:
         Frame (height + `CAPTION`, width, 3) uint8.
     """
-    image = Image.new("RGB", (frame.shape[1], CAPTION), (20, 20, 30))
+    image = Image.new("RGB", (frame.shape[1], CAPTION), DARK.panel)
     draw = ImageDraw.Draw(image)
-    for line, top, largest, colour in zip(lines, (2, 24), (16, 12), ((255, 220, 120), (220, 220, 220)), strict=True):
-        fonts = (ImageFont.load_default(size) for size in range(largest, _SMALLEST_FONT - 1, -1))
-        font = next((f for f in fonts if draw.textlength(line, f) <= frame.shape[1] - 12), None)
-        draw.text((8, top), line, font=font or ImageFont.load_default(_SMALLEST_FONT), fill=colour)
+    for line, middle, colour, mark in zip(lines, (13, 32), (DARK.requested, DARK.measured), _MARKS, strict=True):
+        fonts = (ImageFont.load_default(size) for size in range(_LARGEST_FONT, _SMALLEST_FONT - 1, -1))
+        font = next((f for f in fonts if draw.textlength(line, f) <= frame.shape[1] - 28), None)
+        draw.polygon([(8 + x, middle + y) for x, y in mark], fill=colour)
+        draw.text((22, middle), line, anchor="lm", font=font or ImageFont.load_default(_SMALLEST_FONT), fill=colour)
     return np.concatenate([frame, np.asarray(image)])
 
 

@@ -1,6 +1,9 @@
-"""Names and numbers as text for people."""
+"""Names and numbers as text for people, and which measures tell about which parameter."""
 
+from collections.abc import Iterable
 from typing import Any
+
+from coachable.styles import StyleSpace
 
 
 def readable(name: Any) -> str:
@@ -12,3 +15,26 @@ def readable_number(value: float, unit: str = "") -> str:
     """Return a number with three significant digits, or as a whole number from 1000 on, and its unit."""
     number = f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
     return f"{number} {unit}".rstrip()
+
+
+def measures_by_parameter(space: StyleSpace, names: Iterable[str]) -> dict[str, list[str]]:
+    """Group measures by the parameter that they belong to; those of no parameter are listed under "".
+
+    A measure belongs to the parameter whose name is part of its own, word by word: `pose_held` to `pose`,
+    `damage_melee` to `melee`. Of several such parameters, the one with the longest name is chosen.
+
+    Args:
+        space: The style space.
+        names: Names of the measures.
+
+    Example:
+        >>> from coachable.styles import Setpoint
+        >>> measures_by_parameter(StyleSpace([Setpoint("gap", 0, 2)]), ["gap", "gap_error", "speed"])
+        {'gap': ['gap', 'gap_error'], '': ['speed']}
+    """
+    groups: dict[str, list[str]] = {name: [] for name in space.names} | {"": []}
+    by_length = sorted(space.names, key=len, reverse=True)
+    for measure in names:
+        owner = next((name for name in by_length if f"_{name}_" in f"_{measure}_"), "")
+        groups[owner].append(measure)
+    return groups

@@ -133,6 +133,11 @@ class Viewpoint:
     far: float = 200.0
     height: float = 0.9
 
+    @property
+    def haze(self) -> tuple[float, float]:
+        """Distances from the camera at which things begin to fade, and at which they cannot be seen any more [m]."""
+        return 2.0 * self.distance, self.far
+
 
 class Stage(Protocol):
     """Description of a domain's scene.

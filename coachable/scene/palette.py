@@ -1,4 +1,4 @@
-"""Colours of scenes, pages and films.
+"""Colours of scenes; those of pages, films and figures are in `coachable.scene.look`.
 
 The hues are those of Okabe and Ito, which people with any of the common kinds of colour blindness can tell apart
 (https://jfly.uni-koeln.de/color/). Each of them is readable on the light and on the dark page.
@@ -23,8 +23,12 @@ STEEL: Colour = (118, 124, 132)
 SLATE: Colour = (74, 80, 88)
 INK: Colour = (34, 37, 43)
 
-REQUESTED, MEASURED = VERMILION, (10, 122, 186)
-"""What was asked for and what was measured, in charts, scenes and films; the blue is lighter, for the dark page."""
+AIR: Colour = (214, 224, 234)
+HAZE: Colour = (195, 202, 210)
+"""Sky above, and at the horizon, where what is far fades."""
+
+REQUESTED, MEASURED = (10, 122, 186), VERMILION
+"""What was asked for and what was measured, in charts and scenes; the blue is lighter, for the dark page."""
 
 
 def css(colour: Colour) -> str:

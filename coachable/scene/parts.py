@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -133,6 +134,25 @@ class Surface:
     vertices: np.ndarray
     faces: np.ndarray
     colour: Colour
+
+
+def plain(name: str, low: Numbers, high: Numbers, height: float, cell: float, colour: Colour) -> Surface:
+    """Return a level rectangle of small triangles, because haze is worked out at their corners.
+
+    Args:
+        name: Name of the surface.
+        low: Corner with the smallest x and y (2,) [m].
+        high: Opposite corner (2,) [m].
+        height: Its height [m].
+        cell: Largest length of the triangles along x and y [m].
+        colour: Its colour.
+    """
+    sides = [np.linspace(a, b, 1 + max(1, math.ceil((b - a) / cell))) for a, b in zip(low, high, strict=True)]
+    x, y = np.meshgrid(*sides, indexing="ij")
+    index = np.arange(x.size).reshape(x.shape)
+    a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
+    faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+    return Surface(name, np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], 1), faces, colour)
 
 
 def above(place: Numbers, height: float) -> np.ndarray:

@@ -1,9 +1,9 @@
-"""Pictures of scenes for films, drawn off-screen by MuJoCo, with labels, gauges and a legend."""
+"""Pictures of scenes for films, drawn off-screen by MuJoCo, with labels, gauges and a map."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping, Sequence
 
 import mujoco
 import numpy as np
@@ -11,8 +11,9 @@ from PIL import Image, ImageDraw, ImageFont
 from torchrl.envs import EnvBase
 
 from coachable.offscreen import OffscreenMujoco
-from coachable.scene.frame import Backdrop, Frame, Map, Stage
-from coachable.scene.palette import INK, SILVER, WHITE, Colour
+from coachable.scene.between import between, continues
+from coachable.scene.frame import Backdrop, Frame, Gauge, Map, Stage
+from coachable.scene.palette import AIR, HAZE, INK, WHITE, mixed
 from coachable.scene.parts import BALL, BOX, CYLINDER, SHAPES
 
 _GEOMS = {
@@ -20,18 +21,21 @@ _GEOMS = {
     BALL: mujoco.mjtGeom.mjGEOM_ELLIPSOID,
     CYLINDER: mujoco.mjtGeom.mjGEOM_CYLINDER,
 }
-_SKY: Colour = (214, 224, 234)
+_NARROW, _FEW = 480, 4  # [px], width below which only the first gauges are drawn, and how many
+_BAR = 0.26  # of the width, least length of a gauge's bar
 GLOW = 0.45  # opacity of the translucent primitives
 _MOST = 4000  # primitives
 _GROUND = "ground"
 _FIELD = 45.0  # [deg], of view
+_FINER = 2  # pixels drawn along each side of a pixel; software draws them faster than the samples of OpenGL
+_FINEST = 4096  # [px], largest side that is drawn so
 
 
 class SceneRenderer:
     """Renderer of a stage, which is a `coachable.domain.Renderer`.
 
     Args:
-        stage: Description of the scene.
+        make_stage: Makes the description of the scene.
         width: Width of the image [px].
         height: Height of the image [px].
 
@@ -41,22 +45,50 @@ class SceneRenderer:
 
     def __init__(self, make_stage: Callable[[], Stage], width: int = 640, height: int = 480) -> None:
         self._stage, self._size = make_stage(), (width, height)
+        self._finer = _FINER if _FINER * max(width, height) <= _FINEST else 1
         self._line = max(10, width // 50)  # [px], height of the text
         self._font = ImageFont.load_default(size=self._line)
         self._place: Hashable = None
         self._offscreen: OffscreenMujoco | None = None
+        self._last: Frame | None = None
         self._build(Backdrop(()))  # raises here if there is no OpenGL
 
     def draw(self, env: EnvBase, row: int = 0) -> np.ndarray:
         """Return an image (height, width, 3) uint8 of the present state of one row."""
-        frame = self._stage.frame(env, row)
-        if frame.place != self._place:
+        return self.draw_way(env, row)[0]
+
+    def draw_way(
+        self,
+        env: EnvBase,
+        row: int = 0,
+        asked: Mapping[str, float | str] | None = None,
+        shares: Sequence[float] = (1.0,),
+    ) -> list[np.ndarray]:
+        """Draw states on the way from that of the last call to the present one; call it once per control step.
+
+        Args:
+            env: The environment.
+            row: Row of the environment.
+            asked: The style in force, if known.
+            shares: Shares of the way, from 0 to 1. States that do not continue each other have the present one instead.
+
+        Returns:
+            An image (height, width, 3) uint8 for each share.
+        """
+        frame, last = self._stage.frame(env, row, asked), self._last
+        self._last = frame
+        if shares and frame.place != self._place:
             self._build(self._stage.backdrop(env, row))
             self._place = frame.place
+        if last is None or not continues(last, frame):
+            last = frame
+        return [self._draw(between(last, frame, share) if share < 1.0 else frame) for share in shares]
+
+    def _draw(self, frame: Frame) -> np.ndarray:
         assert self._offscreen is not None
         self._aim(frame)
-        picture = self._offscreen.draw(self._data, lambda scene: _decorate(scene, frame))
-        return self._overlay(picture, frame)
+        fine = self._offscreen.draw(self._data, lambda scene: _decorate(scene, frame))
+        return self._overlay(Image.fromarray(fine).reduce(self._finer), frame)
 
     def close(self) -> None:
         """Release the OpenGL context."""
@@ -68,18 +100,22 @@ class SceneRenderer:
         """Compile a model of what does not move."""
         self.close()
         spec = mujoco.MjSpec()
-        spec.visual.global_.offwidth, spec.visual.global_.offheight = self._size
+        width, height = (self._finer * side for side in self._size)
+        spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
+        spec.visual.quality.offsamples = 0
         spec.visual.global_.fovy = _FIELD
         spec.visual.headlight.ambient[:], spec.visual.headlight.diffuse[:] = 0.42, 0.35
         spec.visual.headlight.specular[:] = 0.05
         spec.stat.extent = 1.0
         spec.visual.map.znear, spec.visual.map.zfar = 0.2, self._stage.viewpoint.far
+        spec.visual.map.fogstart, spec.visual.map.fogend = self._stage.viewpoint.haze
+        spec.visual.rgba.fog[:] = _rgba(HAZE)
         spec.add_texture(
             name="sky",
             type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
             builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-            rgb1=np.divide(_SKY, 255.0),
-            rgb2=np.divide(SILVER, 255.0),
+            rgb1=np.divide(AIR, 255.0),
+            rgb2=np.divide(mixed(AIR, HAZE, 2.0), 255.0),  # the horizon is halfway
             width=64,
             height=384,
         )
@@ -108,7 +144,7 @@ class SceneRenderer:
         self._travels = backdrop.travels
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
-        self._offscreen = OffscreenMujoco(self._model, *self._size, most=_MOST + self._model.ngeom)
+        self._offscreen = OffscreenMujoco(self._model, width, height, most=_MOST + self._model.ngeom, haze=True)
 
     def _aim(self, frame: Frame) -> None:
         assert self._offscreen is not None
@@ -122,28 +158,35 @@ class SceneRenderer:
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
 
-    def _overlay(self, picture: np.ndarray, frame: Frame) -> np.ndarray:
-        image = Image.fromarray(picture)
+    def _overlay(self, image: Image.Image, frame: Frame) -> np.ndarray:
         pen = ImageDraw.Draw(image, "RGBA")
         for label in frame.labels:
             self._write(pen, label.text, self._seen(np.asarray(label.position, dtype=float), frame))
         if frame.map is not None:
             self._draw_map(pen, frame.map)
-        line = self._line + 6
-        top = self._size[1] - 6 - line * len(frame.gauges)
-        for index, gauge in enumerate(frame.gauges):
+        self._draw_gauges(pen, frame.gauges if self._size[0] >= _NARROW else frame.gauges[:_FEW])
+        return np.asarray(image)
+
+    def _draw_gauges(self, pen: ImageDraw.ImageDraw, gauges: Sequence[Gauge]) -> None:
+        """Write the gauges into the lower left corner: names, and texts on their bars, in columns as wide as needed."""
+        if not gauges:
+            return
+        line, gap = self._line + 5, 6
+        left = 2 * gap + max(pen.textlength(gauge.name, self._font) for gauge in gauges)
+        widest = max(pen.textlength(gauge.text, self._font) for gauge in gauges)
+        right = left + max(widest + 2 * gap, _BAR * self._size[0])
+        top = self._size[1] - gap - line * len(gauges)
+        pen.rectangle((0, top - 4, right + gap, self._size[1]), fill=(*INK, 170))
+        style = {"fill": WHITE, "font": self._font, "anchor": "lm"}
+        for index, gauge in enumerate(gauges):
             y = top + index * line
-            if index == 0:
-                pen.rectangle((0, y - 4, 0.44 * self._size[0], self._size[1]), fill=(*INK, 170))
             if gauge.share is not None:
-                left, right = 0.17 * self._size[0], 0.43 * self._size[0]
                 share = min(max(gauge.share, 0.0), 1.0)
                 pen.rectangle((left, y + 1, right, y + line - 4), fill=(255, 255, 255, 60))
                 pen.rectangle((left, y + 1, left + share * (right - left), y + line - 4), fill=(*gauge.colour, 255))
-            style = {"fill": WHITE, "font": self._font, "stroke_width": 1, "stroke_fill": (*INK, 255)}
-            pen.text((6, y), gauge.name, **style)
-            pen.text((0.18 * self._size[0], y), gauge.text, **style)
-        return np.asarray(image)
+            middle = y + line / 2 - 1
+            pen.text((gap, middle), gauge.name, **style)
+            pen.text((left + gap, middle), gauge.text, stroke_width=1, stroke_fill=(*INK, 255), **style)
 
     def _draw_map(self, pen: ImageDraw.ImageDraw, small: Map) -> None:
         side = 0.26 * self._size[1]

@@ -83,15 +83,32 @@ def test_long_lines_of_the_caption_are_written_smaller():
     assert (shown[10:, 200:] != background).any()
 
 
-def test_a_panel_names_the_requested_quantities_first():
-    domain = load_domain("humanoid")
-    names = ("forward_speed", "pose_held", "step_length", "power")
-    measures = SimpleNamespace(summarise=lambda record, alive: dict.fromkeys(names, torch.tensor([0.5])))
-    recent = [{"power": torch.zeros(1)}]
-    shown = partial(video._measured_line, replace(domain, measures=measures), recent)
-    assert shown(0, ("pose", "step_length")) == "last 2 s: step length 0.50, forward speed 0.50"
-    assert shown(2, ("pose", "step_length")).endswith("; failures 2")
-    assert shown(0) == "last 2 s: forward speed 0.50, pose held 0.50, step length 0.50, power 0.50; failures 0"
+def test_the_caption_names_what_belongs_to_the_request_first():
+    domain, space = load_domain("humanoid"), humanoid_style_space()
+    values = {"forward_speed": 1.234, "pose_held": 0.5, "step_length": 0.5, "power": 700.4, "step_length_error": 0.1}
+    found = {name: torch.tensor([value]) for name, value in values.items()} | {"drift": torch.tensor([torch.nan])}
+    measures = SimpleNamespace(summarise=lambda record, alive: found)
+    recent, style = [{"power": torch.zeros(1)}], {"pose": "arms_up", "step_length": 0.4}
+    shown = partial(video._measured_line, replace(domain, measures=measures), space, style, recent)
+    assert shown(0) == "measured: pose held 50%, step length 0.500 m, forward speed 1.23 m/s"
+    assert shown(2).endswith("; 2 failures")
+    assert shown(2, short=True) == "measured: pose held 50%, step length 0.500 m"
+    found.clear()
+    assert shown(0) == "measured: nothing yet"
+
+
+@pytest.mark.parametrize(
+    ("pictures", "shares"),
+    [
+        (0.5, [[], [1.0], [], [1.0]]),
+        (1.0, [[1.0]] * 4),
+        (2.0, [[0.5, 1.0]] * 4),
+        (1.5, [[2 / 3], [1 / 3, 1.0], [2 / 3], [1 / 3, 1.0]]),
+    ],
+)
+def test_pictures_are_due_at_equal_intervals(pictures, shares):
+    for step, expected in enumerate(shares):
+        assert video._shares(step, pictures) == pytest.approx(expected)
 
 
 def test_the_tour_shows_every_pose_with_three_lengths():
@@ -113,6 +130,7 @@ def test_another_suffix_is_refused_before_anything_is_drawn(tmp_path):
         ({"size": (100_000, 480)}, "the size is 100000x480: expected"),
         ({"size": (641, 480)}, "mp4 needs an even width and height"),
         ({"seconds_per_style": float("nan")}, "seconds per style are nan: expected more than 0"),
+        ({"fps": 0.5}, "0.5 pictures per second: expected 1 to 60"),
         ({"seconds_per_style": 0.0}, "seconds per style are 0.0: expected more than 0"),
     ],
 )
@@ -129,25 +147,25 @@ def test_the_caption_shows_what_the_agent_is_asked():
             warnings.simplefilter("ignore", StyleRangeWarning)
             return asked_line(space, request, space.make(**request))
 
-    assert line(pose="t_pose", step_length=0.5) == "asked: pose t pose, step length 0.5"
-    assert line(step_length=9.0) == "asked: pose arms in front, step length 0.65 (clamped from 9)"
-    assert line(pose="arms_up", step_length=0.0) == "asked: pose arms up, step length 0.3 (clamped from 0)"
-    assert line() == "asked: pose arms in front, step length 0.475"
+    assert line(pose="t_pose", step_length=0.5) == "requested: pose t pose, step length 0.5 m"
+    assert line(step_length=9.0) == "requested: pose arms in front, step length 0.65 m (clamped from 9)"
+    assert line(pose="arms_up", step_length=0.0) == "requested: pose arms up, step length 0.3 m (clamped from 0)"
+    assert line() == "requested: pose arms in front, step length 0.475 m"
 
 
 def test_the_caption_leaves_out_weights_of_zero():
     space = StyleSpace([Weight("fire", 0.0, 1.0), Weight("tire", -60.0, 12000.0)])
-    assert asked_line(space, {"fire": 0.0}, space.make(fire=0.0)) == "asked: every weight 0"
-    assert asked_line(space, {"tire": 6000.0}, space.make(tire=6000.0)) == "asked: tire 6000"
+    assert asked_line(space, {"fire": 0.0}, space.make(fire=0.0)) == "requested: every weight 0"
+    assert asked_line(space, {"tire": 6000.0}, space.make(tire=6000.0)) == "requested: tire 6000"
 
 
 def test_the_film_of_a_request_outside_the_range_says_so(monkeypatch):
     captions = []
     monkeypatch.setattr(video, "caption", lambda frame, lines: captions.append(lines))
     agent, domain = load_policy("humanoid"), replace(load_domain("humanoid"), make_renderer=BlankRenderer)
-    film = video._film(domain, agent.actor, agent.space, [{"step_length": 9.0}], 1, (64, 64), 0, every=1)
+    film = video._film(domain, agent.actor, agent.space, [{"step_length": 9.0}], 1, (64, 64), 0, None)
     assert len(list(film)) == 1
-    assert captions[0][0] == "asked: pose arms in front, step length 0.65 (clamped from 9)"
+    assert captions[0][0] == "requested: pose arms in front, step length 0.65 m (clamped from 9)"
 
 
 class GreyRenderer:

@@ -14,6 +14,7 @@ from coachable.scene.parts import (
     about_y,
     about_z,
     multiplied,
+    plain,
     rotated,
     towards,
     unit_mesh,
@@ -98,6 +99,14 @@ def test_every_shape_has_all_its_primitives():
         empty = parts.of(shape)
         parts.batch(shape, Batch(empty.positions, empty.wxyzs, empty.sizes, empty.colours))
     assert len(parts) == 0
+
+
+def test_a_plain_is_made_of_small_triangles_that_face_up():
+    surface = plain("ground", (-1.0, 0.0), (3.0, 5.0), 0.5, 2.0, (1, 2, 3))
+    corners = surface.vertices[surface.faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (across[:, 2] > 0).all() and across[:, 2].sum() / 2 == pytest.approx(4.0 * 5.0)
+    assert (corners[..., 2] == 0.5).all() and len(corners) == 2 * 2 * 3
 
 
 # Machado, Oliveira and Fernandes 2009, severity 1, for linear RGB.

@@ -23,14 +23,14 @@ class Still:
 
     def __init__(self, **further):
         self.further = further
-        self.backdrops = 0
+        self.backdrops, self.place = 0, 0.0
 
     def backdrop(self, env, row=0):
         self.backdrops += 1
         return Backdrop((Surface("ground", SQUARE, np.array([[0, 1, 2], [0, 2, 3]]), GREEN),))
 
     def frame(self, env, row=0, asked=None):
-        parts = Parts().ball((0.0, 0.0, 0.0), (2.0, 2.0, 2.0), RED)
+        parts = Parts().ball((self.place, 0.0, 0.0), (2.0, 2.0, 2.0), RED)
         return Frame(parts, (0.0, 0.0, 0.0), 0.0, place="here", **self.further)
 
 
@@ -64,6 +64,20 @@ def test_a_label_stands_above_its_place():
 
 def test_a_label_behind_the_camera_is_left_out():
     assert np.array_equal(picture(Still(labels=[Label("MMM", (0.0, -30.0, 0.0))])), picture(Still()))
+
+
+def test_states_between_two_steps_are_drawn():
+    stage = Still()
+    renderer = SceneRenderer(lambda: stage, 200, 160)
+    (before,) = renderer.draw_way(None)
+    stage.place = 2.0
+    assert renderer.draw_way(None, shares=()) == []
+    stage.place = 0.0
+    middle, after = renderer.draw_way(None, shares=(0.5, 1.0))
+    renderer.close()
+    columns = [np.nonzero(hue(picture.astype(int)) == 0)[1].mean() for picture in (before, middle, after)]
+    assert columns[0] == columns[2] and columns[1] > columns[0] + 10
+    assert stage.backdrops == 1
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])

@@ -137,4 +137,4 @@ def _lines(session: CoachSession) -> tuple[str, str]:
     report = session.report()
     asked = ", ".join(f"{n} {v:.2f}" if isinstance(v, float) else f"{v}" for n, v in report.requested.items())
     shown = ", ".join(f"{name} {value:.2f}" for name, value in report.measured.items())
-    return f"asked: {asked}".replace("_", " "), f"measured: {shown}".replace("_", " ")
+    return f"requested: {asked}".replace("_", " "), f"measured: {shown}".replace("_", " ")

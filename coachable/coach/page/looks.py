@@ -8,16 +8,8 @@ from functools import lru_cache
 
 from websockets.http11 import Response
 
-from coachable.scene.palette import BLUE, ORANGE, css
-
-TITLE = "coachable"
-ICON = (
-    "data:image/svg+xml,%3Csvg xmlns='http://www.w3.org/2000/svg' viewBox='0 0 32 32'%3E"
-    f"%3Crect width='32' height='32' rx='7' fill='{css(BLUE).replace('#', '%23')}'/%3E"
-    "%3Cpath d='M6 11h20M6 21h20' stroke='white' stroke-width='3' stroke-linecap='round'/%3E"
-    f"%3Ccircle cx='20' cy='11' r='4.5' fill='{css(ORANGE).replace('#', '%23')}'/%3E"
-    "%3Ccircle cx='11' cy='21' r='4.5' fill='white'/%3E%3C/svg%3E"
-)
+from coachable.scene.look import FONT, TITLE, icon_link
+from coachable.scene.palette import INK, WHITE, css
 
 # viser shows the page in dark colours if the address says so. The browser's own setting decides here.
 _SCRIPT = """
@@ -31,21 +23,22 @@ _SCRIPT = """
 })();
 """
 
-_STYLE = """
+_STYLE = (
+    """
 .gauges {
   position: fixed; left: 12px; bottom: 12px; z-index: 5; pointer-events: none; min-width: 15em; padding: 6px 10px;
-  border-radius: 8px; background: rgba(34, 37, 43, 0.78); color: #f0f0ec; font: 13px/1.6 system-ui, sans-serif;
+  border-radius: 8px; background: INKc7; color: WHITE; font: 13px/1.6 FONT;
 }
 .gauges:empty { display: none; }
 .gauge { display: flex; gap: 8px; align-items: center; }
-.gauge b { flex: 0 0 9.5em; font-weight: 400; opacity: 0.85; white-space: nowrap; }
+.gauge b { flex: 0 0 10.2em; font-weight: 400; opacity: 0.85; white-space: nowrap; }
 .gauge span { position: relative; flex: 1; min-width: 9em; height: 1.45em; border-radius: 3px; overflow: hidden; }
 .gauge span:has(i) { background: rgba(255, 255, 255, 0.16); }
 .gauge i { position: absolute; inset: 0 auto 0 0; }
 .gauge em { position: relative; font-style: normal; padding: 0 6px; text-shadow: 0 0 3px #000, 0 0 2px #000; }
 .map {
   position: fixed; left: 12px; top: 12px; z-index: 5; width: 150px; height: 150px; pointer-events: none;
-  border-radius: 8px; background: rgba(34, 37, 43, 0.55);
+  border-radius: 8px; background: INK8c;
 }
 .legend { margin: 0 1em 0.6em; font-size: 0.85em; }
 .legend summary { cursor: pointer; opacity: 0.8; }
@@ -53,13 +46,17 @@ _STYLE = """
 .legend i { flex: none; width: 14px; height: 14px; border-radius: 3px; border: 1px solid rgba(128, 128, 128, 0.7); }
 @media (max-width: 576px) {
   .gauges { top: 6px; bottom: auto; left: 6px; font-size: 10px; line-height: 1.35; min-width: 0; padding: 3px 6px;
-    background: rgba(34, 37, 43, 0.55); }
-  .gauge b { flex-basis: 8.5em; }
+    background: INK8c; }
+  .gauge b { flex-basis: 10em; }
   .gauge span { min-width: 7em; }
+  .gauge:nth-child(n + 5) { display: none; }
   [style*="width: 20em"] { width: 100% !important; }
   .map { left: auto; right: 6px; top: 6px; width: 90px; height: 90px; }
 }
-"""
+""".replace("INK", css(INK))
+    .replace("WHITE", css(WHITE))
+    .replace("FONT", FONT)
+)
 
 
 def dressed(response: Response) -> Response:
@@ -77,7 +74,7 @@ def _dressed(body: bytes, packed: bool) -> bytes:
     text = gzip.decompress(body) if packed else body
     title = f"<title>{TITLE}</title><style>{_STYLE}</style><script>{_SCRIPT}</script>".encode()
     text = text.replace(b"<title>Viser</title>", title, 1)
-    icon = f'href="{ICON}"'.encode()
+    icon = f'href="{icon_link()}"'.encode()
     text = re.sub(rb'href="data:image/svg\+xml,[^"]*"', lambda _: icon, text, count=1)
     text = text.replace(b"Viser client", b"Coach an agent while it acts", 1)
     return gzip.compress(text) if packed else text

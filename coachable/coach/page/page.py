@@ -18,11 +18,11 @@ from coachable.coach.page.widgets import Chart, MeasuredText, ParameterWidget, w
 from coachable.coach.phrases.grammar import Understanding
 from coachable.coach.session.loop import LiveLoop
 from coachable.coach.session.plan import read_plan
-from coachable.coach.session.readout import StyleReport, measures_by_parameter
+from coachable.coach.session.readout import StyleReport
 from coachable.coach.session.recording import Recording
 from coachable.coach.session.session import CoachSession
 from coachable.domain import Push
-from coachable.evaluation.wording import readable, readable_number
+from coachable.evaluation.wording import measures_by_parameter, readable, readable_number
 from coachable.styles import Parameter
 
 if TYPE_CHECKING:

@@ -6,6 +6,7 @@ import contextlib
 import html
 import math
 from collections.abc import Hashable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from coachable.coach.session.session import CoachSession
 from coachable.scene.between import between, continues
 from coachable.scene.frame import Frame, Map, Stage, Viewpoint
-from coachable.scene.palette import css
+from coachable.scene.palette import AIR, HAZE, css
 from coachable.scene.parts import SHAPES, Batch, Parts, about_z, rotated, unit_mesh
 from coachable.scene.renderer import GLOW
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 PHONE = 576  # [px]; in narrower windows viser's panel covers the lower right
 FOLLOW, TURN, STAY = "follow", "follow and turn", "stay"
 _EVEN, _DIRECTED = 1.5, 1.4  # brightness of the lights
-_ROOT = "/scene"
+_ROOT, _MOVING = "/scene", "/scene/moving"
 _FARTHER = 2.2  # factor on the camera's distance in narrow windows
 _LABELS = 12
 _SPARE = 1.5  # room for more marks than there are, before viser gets a larger node
@@ -54,15 +55,18 @@ class SceneView:
         self._seen: Hashable = None
         self._place: Hashable = None
         self._still: list[Any] = []
+        # What moves is placed relative to the focus, so that it stays in the picture in browsers that draw slowly.
         self._nodes = {
-            (group, shape): _Node(server, f"{_ROOT}/{group}_{shape}", shape, glows=group == "glows")
-            for group in ("parts", "marks", "glows")
+            (group, shape): _Node(server, f"{parent}/{group}_{shape}", shape, glows=group == "glows")
+            for group, parent in (("parts", _MOVING), ("marks", _ROOT), ("glows", _MOVING))
             for shape in SHAPES
         }
         self.overlay = ""
         server.scene.set_up_direction("+z")
         _light(server)
+        _surround(server, stage.viewpoint)
         self._root = server.scene.add_frame(_ROOT, show_axes=False)
+        self._moving = server.scene.add_frame(_MOVING, show_axes=False)
         self._ground = server.scene.add_frame(f"{_ROOT}/ground", show_axes=False)
         self._labels = [
             server.scene.add_label(f"{_ROOT}/label_{index}", "", visible=False, anchor="bottom-center")
@@ -99,8 +103,10 @@ class SceneView:
         """See `View.close`."""
 
     def _show(self, frame: Frame) -> None:
+        focus = np.array([*frame.focus[:2], 0.0])
         for (group, _), node in self._nodes.items():
-            node.show(getattr(frame, group))
+            node.show(getattr(frame, group), np.zeros(3) if group == "marks" else focus)
+        self._moving.position = focus
         self._move(frame)
         for index, handle in enumerate(self._labels):
             label = frame.labels[index] if index < len(frame.labels) else None
@@ -164,7 +170,7 @@ class SceneView:
         self._server.on_client_connect(on_connect)
 
 
-# viser takes the colours of batches as linear ones, unlike those of other meshes.
+# viser takes the colours of batches and of fog as linear ones, unlike those of meshes.
 _LINEAR = np.array(
     [round(255 * (v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4)) for v in np.arange(256) / 255], np.uint8
 )
@@ -181,9 +187,11 @@ class _Node:
         self.handle: Any = None
         self._room = 0
 
-    def show(self, parts: Parts) -> None:
-        """Show the primitives of this node's shape."""
+    def show(self, parts: Parts, origin: np.ndarray | None = None) -> None:
+        """Show the primitives of this node's shape, with places relative to an origin (3,) [m]."""
         batch = parts.of(self._shape)
+        if origin is not None:
+            batch = replace(batch, positions=batch.positions - origin)
         if len(batch) > self._room:
             self._make(batch)
         elif self._room:
@@ -270,6 +278,15 @@ def _light(server: viser.ViserServer) -> None:
     server.scene.configure_environment_map(None)
     server.scene.add_light_hemisphere("/sky", sky_color=(255, 255, 255), ground_color=(150, 150, 155), intensity=_EVEN)
     server.scene.add_light_directional("/sun", intensity=_DIRECTED, position=(-4.0, -3.0, 9.0))
+
+
+def _surround(server: viser.ViserServer, view: Viewpoint) -> None:
+    """Show a sky above the horizon, into which what is far fades."""
+    red, green, blue = _LINEAR[list(HAZE)].tolist()
+    server.scene.configure_fog(*view.haze, color=(red, green, blue))
+    share = np.clip(np.linspace(0.0, 2.0, 64), 0.0, 1.0)[:, None, None]
+    sky = np.array(AIR) + share * np.subtract(HAZE, AIR)
+    server.scene.set_background_image(np.repeat(sky, 8, axis=1).round().astype(np.uint8), format="png")
 
 
 def _legend(stage: Stage) -> str:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coachable.coach.session.readout import StyleReport, measures_by_parameter
-from coachable.evaluation.wording import readable, readable_number
+from coachable.coach.session.readout import StyleReport
+from coachable.evaluation.wording import measures_by_parameter, readable, readable_number
 from coachable.scene import palette
 from coachable.scene.palette import css
 from coachable.styles import Choice, Parameter, StyleSpace, Weight

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -12,7 +12,6 @@ from torch import Tensor
 
 from coachable.domain import StyleMeasures
 from coachable.keys import TASK_REWARD
-from coachable.styles import StyleSpace
 
 
 @dataclass(frozen=True)
@@ -51,29 +50,6 @@ class StyleReport:
     episode_time: float
     ended: str | None
     endings: Mapping[str, int]
-
-
-def measures_by_parameter(space: StyleSpace, names: Iterable[str]) -> dict[str, list[str]]:
-    """Group measures by the parameter that they belong to; those of no parameter are listed under "".
-
-    A measure belongs to the parameter whose name is part of its own, word by word: `pose_held` to `pose`,
-    `damage_melee` to `melee`. Of several such parameters, the one with the longest name is chosen.
-
-    Args:
-        space: The style space.
-        names: Names of the measures.
-
-    Example:
-        >>> from coachable.styles import Setpoint
-        >>> measures_by_parameter(StyleSpace([Setpoint("gap", 0, 2)]), ["gap", "gap_error", "speed"])
-        {'gap': ['gap', 'gap_error'], '': ['speed']}
-    """
-    groups: dict[str, list[str]] = {name: [] for name in space.names} | {"": []}
-    by_length = sorted(space.names, key=len, reverse=True)
-    for measure in names:
-        owner = next((name for name in by_length if f"_{name}_" in f"_{measure}_"), "")
-        groups[owner].append(measure)
-    return groups
 
 
 class MeasuredWindow:

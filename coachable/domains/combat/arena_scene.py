@@ -14,12 +14,12 @@ from coachable.scene.palette import Colour
 from coachable.scene.parts import Parts, Surface, about_y, about_z
 
 _GROUND: dict[str, tuple[Colour, Colour]] = {  # of the ground and of its grid
-    "Ice-lake": ((176, 196, 208), (200, 216, 226)),
-    "Shining-wastes": ((186, 168, 132), (204, 188, 154)),
-    "Arena": ((164, 160, 156), (186, 182, 178)),
+    "Ice-lake": ((160, 184, 199), (198, 217, 228)),
+    "Shining-wastes": ((178, 158, 120), (204, 187, 152)),
+    "Arena": ((152, 148, 144), (184, 180, 175)),
 }
 _RADIUS = 90.0  # [m], of the ground
-_GRID = 5.0  # [m]
+_GRID, _LINE = 5.0, 0.1  # [m], between lines on the ground and their width
 _ROCKS = (42.0, 85.0, 70)  # [m], [m], number
 _WALL_HEIGHT = 3.0  # [m]
 
@@ -36,8 +36,8 @@ def arena(site: int) -> Backdrop:
     parts = Parts()
     reach = 40.0
     for place in np.arange(-reach, reach + _GRID, _GRID):
-        parts.box((place, 0.0, 0.0), (0.06, 2 * reach, 0.02), line)
-        parts.box((0.0, place, 0.0), (2 * reach, 0.06, 0.02), line)
+        parts.box((place, 0.0, 0.0), (_LINE, 2 * reach, 0.02), line)
+        parts.box((0.0, place, 0.0), (2 * reach, _LINE, 0.02), line)
     radius = load_table("sites").number(name, "wall_radius")
     if math.isfinite(radius):
         _wall(parts, radius)

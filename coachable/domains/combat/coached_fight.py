@@ -207,11 +207,11 @@ def draw_timeline(rows: Sequence[Mapping[str, Any]], path: Path, *, bin_seconds:
             base += height
         damage = np.array([sum(row[source] for source in SOURCES) for row in rows])
         counted = np.array([row["counted"] for row in rows])
-        for hits, level, colour in ((counted > 0, 1, "tab:green"), ((damage > 0) & (counted <= 0), 0, "tab:red")):
+        for hits, level, colour in ((counted > 0, 1, "C2"), ((damage > 0) & (counted <= 0), 0, "C1")):
             ticks.eventplot(times[hits], lineoffsets=level, linelengths=0.8, colors=colour)
         for fight in dict.fromkeys(row["fight"] for row in rows):
             own = [row for row in rows if row["fight"] == fight]
-            for name, style in (("player", "k-"), ("machine", "r--")):
+            for name, style in (("player", "k-"), ("machine", "C1--")):
                 health = [row[f"{name}_health"] for row in own]
                 bottom.plot([row["seconds"] for row in own], health, style, label=None if fight else name)
             start, ended = own[0]["seconds"] - step, readable(own[-1]["ended"])

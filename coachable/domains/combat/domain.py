@@ -17,6 +17,7 @@ from coachable.envs.combat.constants import CONTROL_STEP, EPISODE_STEPS
 from coachable.envs.combat.env import CombatEnv
 from coachable.envs.combat.features import observation_groups
 from coachable.envs.combat.gamepad import ACTION_GROUPS
+from coachable.envs.combat.tables import STYLES
 from coachable.scene.renderer import SceneRenderer
 
 
@@ -63,7 +64,7 @@ DOMAIN = Domain(
     control_step=CONTROL_STEP,
     episode_steps=EPISODE_STEPS,
     columns={"won": ".0%", "damage": ".0f", "style_score": ".2f"},
-    units={"damage": "HP"},
+    units={"damage": "HP"} | {name: "HP" for name in STYLES if not name.startswith("part_")},
     observation_groups=observation_groups("full"),
     action_groups=ACTION_GROUPS,
     words=WORDS,

@@ -42,7 +42,8 @@ _PLAIN = palette.SILVER  # ammunition without an element
 _BAR = (2.4, 0.26)  # [m], health bar
 _SHOWN = 0.05  # build-up of an element from which it is shown
 _BOUND_POSTS = 48
-_AHEAD = 7.0  # [m], largest distance of the focus from the player
+_AHEAD = 4.0  # [m], from the player to what the camera looks at
+_LAG = 0.3  # share by which the camera turns towards the nearest machine in a control step
 _ARC = math.radians(60.0)  # of a bite, to either side
 _RAYS = 15
 
@@ -50,7 +51,7 @@ _RAYS = 15
 class CombatStage:
     """Scene of one fight of a `CombatEnv` or of an environment around it; see `coachable.scene.frame.Stage`."""
 
-    viewpoint = Viewpoint(distance=27.0, elevation=34.0, azimuth=-70.0, far=320.0, height=1.0)
+    viewpoint = Viewpoint(distance=13.0, elevation=20.0, azimuth=152.0, turns=True, far=170.0, height=1.0)
     legend = (
         *((colour, name) for name, colour in ELEMENT_COLOURS.items()),
         *zip(PART_COLOURS, ("shields (plates)", "weapons (barrels)", "canisters"), strict=True),
@@ -78,18 +79,18 @@ class CombatStage:
             self._begin()
             self._key, self._episode = machines, self._episode + 1
         self._steps = steps
+        apart = s["enemy_position"][:, _nearest(s)] - s["position"]
+        heading = self._turn(math.atan2(apart[1], apart[0]))
         parts, glows, labels = Parts(), Parts(), []
         self._add_player(parts, glows, s)
         for enemy in range(env.num_enemies):
             self._add_machine(parts, glows, labels, env, s, row, enemy)
         marks = _ground_marks(s, glows)
-        here, nearest = s["position"], s["enemy_position"][:, _nearest(s)]
-        apart = nearest - here
-        middle = here + apart * min(0.5, _AHEAD / max(float(np.hypot(*apart)), 1e-6))  # both are seen, if they are near
+        ahead = np.array([math.cos(heading), math.sin(heading)])
         return Frame(
             parts=parts,
-            focus=(*middle.tolist(), self.viewpoint.height),
-            heading=float(s["yaw"]),
+            focus=(*(s["position"] + _AHEAD * ahead).tolist(), self.viewpoint.height),
+            heading=heading,
             place=int(s["site"]),
             marks=marks,
             glows=glows,
@@ -100,9 +101,16 @@ class CombatStage:
 
     def _begin(self) -> None:
         self._steps = 0.0
+        self._heading: float | None = None
         self._walked: dict[int, float] = {}  # by enemy, -1 for the player
         self._places: dict[int, np.ndarray] = {}
         self._rounds: tuple[int, float] | None = None  # section of the wheel, and rounds in it
+
+    def _turn(self, direction: float) -> float:
+        """Turn the camera towards a direction [rad] with a lag, and return where it looks then."""
+        before = direction if self._heading is None else self._heading
+        self._heading = before + _LAG * math.remainder(direction - before, 2 * math.pi)
+        return self._heading
 
     def _walk(self, who: int, place: np.ndarray) -> float:
         """Return the distance that somebody has walked since the fight began [m]."""
@@ -156,7 +164,7 @@ class CombatStage:
                 shown = part if s["count"][slot, enemy] > 0 else _vanished(part)
                 parts.figure(shown, above(ground, radius), turn)
         top = above(ground, 2.6 * radius + 0.8)
-        _health_bar(parts, top, hp / full, self.viewpoint.azimuth)
+        _health_bar(parts, top, hp / full, math.radians(self.viewpoint.azimuth) + (self._heading or 0.0))
         active = [e for i, e in enumerate(ELEMENTS) if s["state_timer"][i, enemy] > 0]
         for index, element in enumerate(active):
             ring = 2 * radius + 1.0 + 0.7 * index
@@ -202,8 +210,8 @@ def _vanished(parts: Parts) -> Parts:
 
 
 def _health_bar(parts: Parts, place: np.ndarray, share: float, azimuth: float) -> None:
-    """Add a bar that is upright and turned to where the camera is at first [deg]."""
-    share, across = min(max(share, 0.0), 1.0), math.radians(azimuth) + math.pi / 2
+    """Add a bar that is upright and turned to the camera, which is in a direction [rad]."""
+    share, across = min(max(share, 0.0), 1.0), azimuth + math.pi / 2
     along = np.array([math.cos(across), math.sin(across), 0.0])
     length, height = _BAR
     colour = palette.GREEN if share > 0.5 else palette.ORANGE if share > 0.25 else palette.VERMILION
@@ -269,7 +277,7 @@ def _gauges(env: CombatEnv, s: Mapping[str, np.ndarray], row: int) -> Sequence[G
     gauges.append(Gauge("build-up", text, built[strongest] if shown else 0.0, ELEMENT_COLOURS[strongest]))
     counts = s["count"][:, enemy]
     kinds = env.traits.part_type[:, :, enemy, row].cpu().numpy()
-    remaining = ", ".join(f"{float(kinds[i] @ counts):.0f} {name}s" for i, name in enumerate(PART_TYPES))
+    remaining = ", ".join(f"{name}s {float(kinds[i] @ counts):.0f}" for i, name in enumerate(PART_TYPES))
     gauges.append(Gauge("parts left", remaining))
     gauges.append(Gauge("site", f"{SITES[int(s['site'])]}, {float(s['steps']) * c.CONTROL_STEP:.0f} s"))
     return gauges

@@ -17,7 +17,7 @@ from coachable.envs.humanoid.observation import rotate_to_course
 from coachable.scene import palette
 from coachable.scene.frame import Backdrop, Frame, Gauge, Label, Viewpoint
 from coachable.scene.palette import Colour
-from coachable.scene.parts import BALL, CYLINDER, Batch, Parts, Surface, about_z, above, towards
+from coachable.scene.parts import BALL, CYLINDER, Batch, Parts, about_z, above, plain, towards
 
 _HALF = 30.0  # [m], of the ground around the walker
 _MARK = 0.5  # [m], between lines on the ground
@@ -36,7 +36,7 @@ _PUSH_SCALE = 0.006  # [m/N], length of the arrow
 class HumanoidStage:
     """Scene of one walker of a `HumanoidEnv` or of an environment around it; see `coachable.scene.frame.Stage`."""
 
-    viewpoint = Viewpoint(distance=3.6, elevation=14.0, azimuth=-55.0, far=90.0)
+    viewpoint = Viewpoint(distance=3.6, elevation=14.0, azimuth=-55.0, far=_HALF)
     legend = (
         (SIDES["right"], "right leg, arm and footprints"),
         (SIDES["left"], "left leg, arm and footprints"),
@@ -56,8 +56,7 @@ class HumanoidStage:
 
     def backdrop(self, env: EnvBase, row: int = 0) -> Backdrop:
         """See `Stage.backdrop`."""
-        square = _HALF * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
-        ground = Surface("floor", square, np.array([[0, 1, 2], [0, 2, 3]]), _GROUND)
+        ground = plain("floor", (-_HALF, -_HALF), (_HALF, _HALF), 0.0, 3.0, _GROUND)
         lines = Parts()
         for index in range(round(-_HALF / _MARK), round(_HALF / _MARK) + 1):
             whole = index * _MARK % 1.0 == 0.0

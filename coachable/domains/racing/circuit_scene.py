@@ -8,7 +8,7 @@ from coachable.envs.racing.circuit.track import Track
 from coachable.scene import palette
 from coachable.scene.frame import Backdrop
 from coachable.scene.palette import Colour
-from coachable.scene.parts import Parts, Surface, about_z
+from coachable.scene.parts import Parts, Surface, about_z, plain
 
 GRASS, RUN_OFF, TARMAC = (126, 150, 104), (158, 156, 148), (88, 91, 97)
 KERB: tuple[Colour, Colour] = (palette.VERMILION, palette.WHITE)
@@ -17,6 +17,7 @@ _LINE = (0.10, 0.35)  # [m], from the edge inwards
 _KERB_WIDTH, _KERB_CURVATURE = 1.3, 1.0 / 300.0  # [m], [1/m]: kerbs are where the track bends more
 _WALL_HEIGHT = 0.9  # [m]
 _AROUND = 400.0  # [m], grass beyond the circuit
+_CELL = 60.0  # [m], of the grass
 _LEVELS = {"grass": -0.15, "run_off": -0.03, "tarmac": 0.0, "lines": 0.02, "kerbs": 0.05}  # [m]
 _TREES = 45.0  # [m], along the track
 _TREE_GAP = (6.0, 30.0)  # [m], beyond the wall
@@ -32,10 +33,8 @@ def circuit(track: Track) -> Backdrop:
     table = track.table.numpy()
     left, right, margin, curvature = table[:, 5], table[:, 6], table[:, 7], table[:, 4]
     low, high = table[:, :2].min(0) - _AROUND, table[:, :2].max(0) + _AROUND
-    corners = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
-    grass = np.insert(corners, 2, _LEVELS["grass"], axis=1)
     surfaces = [
-        Surface("grass", grass, np.array([[0, 1, 2], [0, 2, 3]]), GRASS),
+        plain("grass", low, high, _LEVELS["grass"], _CELL, GRASS),
         _joined("run_off", RUN_OFF, _band(table, left, left + margin), _band(table, -right - margin, -right)),
         _joined("tarmac", TARMAC, _band(table, -right, left)),
         _joined(

@@ -65,7 +65,7 @@ def racing_domain(
         )
 
     angles = ("sideslip", "sideslip_corners", "sideslip_straights") if family == "drift" else ()
-    units = {"pace": "m/s", "speed": "m/s", "fuel_per_km": "l"}
+    units = {"pace": "m/s", "speed": "m/s", "fuel_per_km": "l", "wear_per_km": "tyres"}
     units |= dict.fromkeys(("slip_angle_front", "slip_angle_rear", *angles), "deg")
     domain = Domain(
         name=f"racing_{family}",

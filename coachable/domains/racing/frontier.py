@@ -264,7 +264,7 @@ def draw(curves: Sequence[Rows], path: Path) -> None:
                 [row["seconds_lost"] for row in rows],
                 [100 * row["range_gain"] for row in rows],
                 styles[first["resource"], first["fuel_exponent"]],
-                color={"gt3": "#1f77b4", "x2019": "#d62728"}[first["car"]],
+                color={"gt3": "C0", "x2019": "C1"}[first["car"]],
                 marker="o",
                 markersize=3,
                 label=f"{first['car']}, {label}",

@@ -13,6 +13,7 @@ from coachable.export.graph import graph_of, import_onnx
 from coachable.export.onnx import TOLERANCE, export
 from coachable.export.web.part import WebPart
 from coachable.export.web.third_party import packages, provide
+from coachable.scene.look import ICON, stylesheet
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
 __all__ = ["SCHEMA_VERSION", "export_page", "manifest_of"]
@@ -61,6 +62,8 @@ def export_page(source: str | Path, out: Path, assets: Path | None = None) -> in
         (out / _MODELS[name]).write_text(text, encoding="utf-8")
     with as_file(files("coachable.export.web") / "static") as own:
         shutil.copytree(own, out, dirs_exist_ok=True)
+    (out / "look.css").write_text(stylesheet(), encoding="utf-8")
+    shutil.copyfile(ICON, out / ICON.name)
     for name, file in vendored.items():
         target = out / _VENDORED / name
         target.parent.mkdir(parents=True, exist_ok=True)

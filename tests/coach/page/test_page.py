@@ -19,7 +19,7 @@ import msgspec  # noqa: E402, viser brings it
 import websockets.sync.client as websockets  # noqa: E402, viser brings it
 
 from coachable.coach.page import film as film_module  # noqa: E402
-from coachable.coach.page import looks, scene_view, views  # noqa: E402
+from coachable.coach.page import scene_view, views  # noqa: E402
 from coachable.coach.page.page import CoachPage, verdict  # noqa: E402
 from coachable.coach.page.server import make_server  # noqa: E402
 from coachable.coach.session.readout import StyleReport  # noqa: E402
@@ -27,6 +27,7 @@ from coachable.coach.session.session import CoachSession  # noqa: E402
 from coachable.domains.combat.stage import CombatStage  # noqa: E402
 from coachable.domains.humanoid.stage import HumanoidStage  # noqa: E402
 from coachable.domains.racing.stage import RacingStage  # noqa: E402
+from coachable.scene.look import icon_link  # noqa: E402
 from coachable.scene.parts import Parts  # noqa: E402
 from coachable.styles import StyleRangeWarning  # noqa: E402
 from tests.coach.echo_domain import echo_session  # noqa: E402
@@ -556,7 +557,7 @@ def test_the_page_has_its_own_title_and_icon(server):
     plain = urllib.request.urlopen(f"http://127.0.0.1:{server.get_port()}/").read().decode()
     for text in (packed, plain):
         head = text[: text.index("</title>")]
-        assert head.endswith("<title>coachable") and looks.ICON in head and "Viser" not in head
+        assert head.endswith("<title>coachable") and icon_link() in head and "Viser" not in head
         assert "prefers-color-scheme: dark" in text and ".gauges {" in text
 
 
@@ -626,13 +627,20 @@ def test_slow_control_steps_are_drawn_in_between(server, monkeypatch):
     monkeypatch.setattr(server, "get_clients", lambda: {0: None})
     session = CoachSession.open("combat", seed=1)
     view = views.make_view(server, session)
+    view.mode.value = scene_view.FOLLOW
     focus = []
     for _ in range(2):
         session.step()
         view.update()
         focus.append(np.asarray(view.frame.focus)[:2])
     view.update(0.25)
-    assert -view._root.position[:2] == pytest.approx(focus[0] + 0.25 * (focus[1] - focus[0]), abs=1e-5)
+    between = focus[0] + 0.25 * (focus[1] - focus[0])
+    assert -view._root.position[:2] == pytest.approx(between, abs=1e-5)
+    assert view._moving.position[:2] == pytest.approx(between, abs=1e-5)
+    view.update()
+    placed = view._nodes["parts", "ball"].handle.batched_positions + view._moving.position
+    balls = view.frame.parts.of("ball").positions
+    assert placed[: len(balls)] == pytest.approx(balls, abs=1e-4), "relative to what the camera follows"
     session.close()
 
 

@@ -84,7 +84,7 @@ def test_a_removed_part_is_gone(env):
         left = len(shown(after.parts, colour)) - (2 if colour == LAMPS[IDLE] else 0)
         assert left == count - 1
         assert all(len(after.parts.of(shape)) == len(before.parts.of(shape)) for shape in SHAPES)
-    assert stage.frame(env).gauges[5].text.startswith(f"{int((kinds[0] > 0).sum()) * 1 - 1}")
+    assert stage.frame(env).gauges[5].text.startswith(f"shields {int((kinds[0] > 0).sum()) - 1}")
 
 
 def test_the_health_bar_shrinks_and_changes_colour(env):
