@@ -81,8 +81,8 @@ def export_recordings(
     domain = domain_of(agent)
     if domain.make_stage is None:
         raise ValueError(
-            f"the domain {domain.name} has neither a simulation for the browser nor a scene: expected one that declares "
-            "make_web or make_stage"
+            f"the domain {domain.name} has neither a simulation for the browser nor a scene: expected one that "
+            "declares make_web or make_stage"
         )
     cells = domain.recorded_cells()
     if not 0 < len(cells) <= MOST:

@@ -154,8 +154,7 @@ def _lasting(groups: Sequence[Parts]) -> dict[str, np.ndarray]:
                 [np.round(batch.positions, _DIGITS), np.round(batch.wxyzs, 4), np.round(batch.sizes, _DIGITS)], axis=1
             )
             seen |= {
-                (number, *row, *colour)
-                for row, colour in zip(table.tolist(), batch.colours.tolist(), strict=True)
+                (number, *row, *colour) for row, colour in zip(table.tolist(), batch.colours.tolist(), strict=True)
             }
         for key in [key for key in alive if key not in seen]:
             rows.append((alive.pop(key), index - 1, key))

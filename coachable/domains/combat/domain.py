@@ -75,6 +75,6 @@ DOMAIN = Domain(
     recorded=Recorded(
         seconds=45.0,
         title="A fighter who uses what you ask for",
-        summary="Ask for a weapon, an element or a part, and see how much of the damage it does.",
+        summary="Ask for a way to fight, and see how much of the damage it does.",
     ),
 )

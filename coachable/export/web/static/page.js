@@ -57,8 +57,14 @@ export class Page {
   }
 }
 
-/** Load files with a bar that shows how far it is. */
-export async function download(names, sizes) {
+/**
+ * Begin to load files, with a bar that shows how far it is.
+ *
+ * @param {string[]} names  The files.
+ * @param {{file: string, bytes: number}[]} sizes  The manifest's downloads.
+ * @returns {Map<string, Promise<Uint8Array>>} Content by name.
+ */
+export function download(names, sizes) {
   const total = sizes.filter(({ file }) => names.includes(file)).reduce((sum, { bytes }) => sum + bytes, 0);
   let loaded = 0;
   const read = async (name) => {
@@ -71,9 +77,10 @@ export async function download(names, sizes) {
       chunks.push(value);
       loaded += value.length;
       at("loading-bar").value = loaded / total;
-      at("loading-text").textContent = `Loading: ${megabytes(loaded)} of ${megabytes(total)}`;
+      at("loading-text").textContent =
+        loaded < total ? `Loading: ${megabytes(loaded)} of ${megabytes(total)}` : "Starting …";
     }
-    return [name, new Uint8Array(await new Blob(chunks).arrayBuffer())];
+    return new Uint8Array(await new Blob(chunks).arrayBuffer());
   };
-  return new Map(await Promise.all(names.map(read)));
+  return new Map(names.map((name) => [name, read(name)]));
 }

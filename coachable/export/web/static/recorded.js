@@ -29,12 +29,12 @@ class RecordedPage extends Page {
     }));
     this.loaded = new Map();
     const { number, moment } = fromFragment(manifest, location.hash);
-    const [files, drawing] = await Promise.all([
-      download([...manifest.backdrops, manifest.recordings[number].file], manifest.downloads),
-      import("./recorded_scene.js"),
-    ]);
-    this.backdrops = await Promise.all(manifest.backdrops.map((file) => decode(files.get(file))));
-    this.loaded.set(number, decode(files.get(manifest.recordings[number].file)));
+    const files = download([...manifest.backdrops, manifest.recordings[number].file], manifest.downloads);
+    const decoded = [...files.values()].map((bytes) => bytes.then(decode));
+    const drawing = await import("./recorded_scene.js");
+    const recording = decoded.pop();
+    this.loaded.set(number, recording);
+    this.backdrops = await Promise.all(decoded);
     try {
       this.scene = new drawing.RecordedScene(at("scene"), at("labels"), manifest.viewpoint);
     } catch (error) {

@@ -16,6 +16,10 @@ export class RecordedPanel {
    */
   constructor(form, others, manifest, ask) {
     this.manifest = manifest;
+    for (const measure of manifest.measures) {
+      const found = manifest.recordings.map(({ measured }) => measured[measure.name]);
+      measure.answer = measure.share && found.every((value) => value === 0 || value === 1);
+    }
     this.show = []; // functions that show a recording
     const parameters = varied(manifest);
     const fixed = manifest.parameters.filter(({ values }) => values.length === 1);
@@ -119,7 +123,7 @@ export class RecordedPanel {
       const shapes = along(this.manifest, style, name).flatMap(([value, number]) => {
         const found = this.manifest.recordings[number].measured[measure.name];
         const x = 12 + parameter.values.indexOf(value) * column;
-        const half = Math.min(0.36 * column, 28, x + 4);
+        const half = Math.min(0.36 * column, 18);
         const here = value === style[name] ? "here" : "";
         const drawn = [];
         if (found !== null) {
@@ -152,6 +156,7 @@ function textOf({ kind, unit }, value) {
 
 function textOfMeasure(measure, value) {
   if (value === null) return "no value";
+  if (measure.answer) return value ? "yes" : "no";
   return measure.share ? shortOf(measure, value) : withUnit(shortOf(measure, value), measure.unit);
 }
 

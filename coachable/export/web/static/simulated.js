@@ -19,18 +19,26 @@ class SimulatedPage extends Page {
 
   async load() {
     const { manifest } = this;
-    const wanted = [...Object.values(manifest.models), ...Object.values(manifest.graphs), `${MUJOCO}.wasm`, `${ONNX}/ort-wasm-simd-threaded.wasm`];
-    const [files, mujoco, ort, drawing] = await Promise.all([
-      download(wanted, manifest.downloads),
-      import(`./${MUJOCO}.js`),
-      import(`./${ONNX}/ort.wasm.min.mjs`),
+    const own = [...Object.values(manifest.models), ...Object.values(manifest.graphs)];
+    const engines = [`${MUJOCO}.wasm`, `${ONNX}/ort-wasm-simd-threaded.wasm`];
+    const files = download([...own, ...engines], manifest.downloads);
+    // Each engine starts as soon as its own files are here.
+    const physics = Promise.all([import(`./${MUJOCO}.js`), files.get(engines[0])]).then(([mujoco, wasmBinary]) =>
+      mujoco.default({ wasmBinary }),
+    );
+    const graphs = Promise.all([import(`./${ONNX}/ort.wasm.min.mjs`), files.get(engines[1])]).then(([ort, wasmBinary]) => {
+      ort.env.wasm.numThreads = 1; // more need headers that a static host does not send
+      ort.env.wasm.wasmBinary = wasmBinary;
+      return ort;
+    });
+    const [mujoco, ort, drawing, ...contents] = await Promise.all([
+      physics,
+      graphs,
       import("./scene.js"),
+      ...own.map((name) => files.get(name)),
     ]);
-    at("loading-text").textContent = "Starting …";
-    ort.env.wasm.numThreads = 1; // more need headers that a static host does not send
-    ort.env.wasm.wasmBinary = files.get(wanted.at(-1));
-    const physics = await mujoco.default({ wasmBinary: files.get(wanted.at(-2)) });
-    this.simulator = await createSimulator({ mujoco: physics, ort, manifest, files });
+    const parts = new Map(own.map((name, i) => [name, contents[i]]));
+    this.simulator = await createSimulator({ mujoco, ort, manifest, files: parts });
     try {
       this.scene = new drawing.Scene(at("scene"), this.simulator.kinematics, manifest.followed);
     } catch (error) {
