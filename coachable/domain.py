@@ -133,6 +133,7 @@ class Recorded:
         seconds: Length of a recording, which an episode's end may cut short [s].
         alike: Function from a number of episodes to options of `make_env` with which that many episodes begin alike, so
             that styles can be compared; by default they begin differently.
+        columns: Measures that the page shows, with the format of their values; None for the domain's `columns`.
         beside: Style parameter beside which the page shows a measure, by the measure's name; a measured parameter is
             shown beside itself.
         title: Title of the page; "" for one from the domain's name.
@@ -142,6 +143,7 @@ class Recorded:
     grid: Mapping[str, Sequence[Any]] | Sequence[Mapping[str, Any]] | None = None
     seconds: float = 30.0
     alike: Callable[[int], Mapping[str, Any]] | None = None
+    columns: Mapping[str, str] | None = None
     beside: Mapping[str, str] = field(default_factory=dict)
     title: str = ""
     summary: str = "Ask for a style, and see what the agent does and what is measured."

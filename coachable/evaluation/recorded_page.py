@@ -73,7 +73,7 @@ def export_recordings(
         Size of all files of the page [byte].
 
     Raises:
-        ValueError: If the agent's domain has no scene, or more than `MOST` styles.
+        ValueError: If the agent's domain has no scene, more than `MOST` styles, or names an unknown measure.
         CheckpointError: If the source does not hold a usable policy.
         OSError: If the files of other projects cannot be fetched, or writing fails.
     """
@@ -94,12 +94,18 @@ def export_recordings(
     recordings = record(
         domain, agent.actor, torch.stack(thetas), requests, space=agent.space, steps=steps, seed=seed, progress=progress
     )
+    columns = domain.recorded.columns or published(domain, recordings[0].measured)
+    shown = [_measure(domain, agent.space, *column) for column in columns.items()]
+    if unknown := {measure["name"] for measure in shown} - recordings[0].measured.keys():
+        raise ValueError(
+            f"the domain {domain.name} shows {', '.join(sorted(unknown))}: expected some of "
+            f"{', '.join(sorted(recordings[0].measured))}"
+        )
     backdrops: dict[bytes, str] = {}
     with complete_folder(out) as folder:
         copy_page(folder, vendored)
         (folder / _FOLDER).mkdir()
         manifest = _manifest(agent, domain, requests)
-        shown = [_measure(domain, agent.space, *column) for column in published(domain, recordings[0].measured).items()]
         played = []
         for number, (recording, request) in enumerate(zip(recordings, requests, strict=True)):
             for content in recording.backdrops.values():
@@ -228,7 +234,7 @@ def _measure(domain: Domain, space: StyleSpace, column: str, form: str) -> dict[
     return {
         "name": name,
         "parameter": beside,
-        "text": readable(name),
+        "text": "mean over the recording" if name == beside else readable(name),
         "unit": unit,
         "share": form.endswith("%"),
         "digits": digits,

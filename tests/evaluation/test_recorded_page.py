@@ -96,6 +96,13 @@ def test_a_style_outside_of_the_trained_range_is_refused(changed, tmp_path):
     assert not (tmp_path / "site").exists()
 
 
+def test_an_unknown_measure_is_refused(changed, tmp_path):
+    changed(recorded=Recorded(grid=[{"fuel": 0.0}], seconds=0.1, columns={"pace": ".1f", "grace": ".1f"}))
+    with pytest.raises(ValueError, match=r"shows grace: expected some of .*pace"):
+        export_recordings(NAME, tmp_path / "site", progress=False)
+    assert not (tmp_path / "site").exists()
+
+
 def test_a_file_in_place_of_the_folder_is_refused(changed, tmp_path):
     changed(recorded=Recorded(grid=[{"fuel": 0.0}], seconds=0.1))
     (tmp_path / "site").write_text("something else")

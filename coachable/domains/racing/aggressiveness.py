@@ -13,6 +13,15 @@ DOMAIN = racing_domain(
     columns={"contact": ".2%", "place": ".2f"},
     evaluation=evaluate_aggressiveness,
     recorded=Recorded(
+        columns={
+            "longitudinal": ".1f",
+            "lateral": ".1f",
+            "complied": ".1%",
+            "contact": ".1%",
+            "place": ".1f",
+            "pace": ".1f",
+            "off": ".1%",
+        },
         title="A driver who keeps the distance that you ask for",
         summary="Ask for room ahead, behind and beside, and see how close the car comes to the others.",
     ),
