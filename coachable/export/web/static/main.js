@@ -15,9 +15,10 @@ async function start() {
 function tellLoads(manifest) {
   const total = manifest.downloads.reduce((sum, { bytes }) => sum + bytes, 0);
   const versions = manifest.packages.map(({ name, version, license }) => `${name} ${version} (${license})`).join(", ");
+  const agent = `agent (coachable ${manifest.coachable_version}, domain ${manifest.domain})`;
+  const content = manifest.kind === "recordings" ? `recordings of the ${agent}` : `the ${agent}, its physics`;
   at("loads").textContent =
-    `${megabytes(total)} from this site and nothing from any other: the agent (coachable ${manifest.coachable_version}, ` +
-    `domain ${manifest.domain}), its physics, and ${versions}. Nothing is sent anywhere.`;
+    `${megabytes(total)} from this site and nothing from any other: ${content}, and ${versions}. Nothing is sent anywhere.`;
   for (const { file, bytes } of manifest.downloads) {
     const row = at("files").insertRow();
     row.insertCell().textContent = file;

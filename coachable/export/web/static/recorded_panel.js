@@ -18,7 +18,7 @@ export class RecordedPanel {
     this.manifest = manifest;
     for (const measure of manifest.measures) {
       const found = manifest.recordings.map(({ measured }) => measured[measure.name]);
-      measure.answer = measure.share && found.every((value) => value === 0 || value === 1);
+      measure.answer = measure.share && measure.digits === 0 && found.every((value) => value === 0 || value === 1);
     }
     this.show = []; // functions that show a recording
     const parameters = varied(manifest);
