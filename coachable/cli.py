@@ -243,9 +243,13 @@ def _report(options: argparse.Namespace) -> int:
 
 def _export(options: argparse.Namespace) -> int:
     if options.web is not None:
+        from coachable.evaluation.recorded_page import export_recordings
         from coachable.export.web.page import export_page
+        from coachable.training.weights import domain_of, load_policy
 
-        size = export_page(options.source, options.web, options.assets)
+        acts = domain_of(load_policy(options.source)).make_web is not None
+        write = export_page if acts else export_recordings
+        size = write(options.source, options.web, options.assets)
         print(
             f"wrote {options.web} ({size / 1e6:.1f} MB); see it with: python3 -m http.server --directory {options.web}"
         )

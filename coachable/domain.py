@@ -125,6 +125,31 @@ class Push:
 
 
 @dataclass(frozen=True)
+class Recorded:
+    """What the exported page of a domain plays whose simulation does not run in a browser.
+
+    Attributes:
+        grid: Styles of the recordings, as in `Domain.grid`; None for the domain's grid.
+        seconds: Length of a recording, which an episode's end may cut short [s].
+        alike: Function from a number of episodes to options of `make_env` with which that many episodes begin alike, so
+            that styles can be compared; by default they begin differently.
+        columns: Measures that the page shows, with the format of their values; None for the domain's `columns`.
+        beside: Style parameter beside which the page shows a measure, by the measure's name; a measured parameter is
+            shown beside itself.
+        title: Title of the page; "" for one from the domain's name.
+        summary: One sentence for the visitor.
+    """
+
+    grid: Mapping[str, Sequence[Any]] | Sequence[Mapping[str, Any]] | None = None
+    seconds: float = 30.0
+    alike: Callable[[int], Mapping[str, Any]] | None = None
+    columns: Mapping[str, str] | None = None
+    beside: Mapping[str, str] = field(default_factory=dict)
+    title: str = ""
+    summary: str = "Ask for a style, and see what the agent does and what is measured."
+
+
+@dataclass(frozen=True)
 class Words:
     """Words for a domain, in addition to the names and help texts of its styles.
 
@@ -180,6 +205,9 @@ class Domain:
         make_renderer: `(width, height) -> Renderer`; by default `EnvPictures`, the environment's own pictures.
         make_stage: `() -> coachable.scene.frame.Stage`, the scene that the page shows in 3-D; None shows the renderer's
             pictures.
+        make_web: `(space) -> coachable.export.web.part.WebPart`, for a page on which the agent acts in the browser;
+            None if the simulation cannot run there, so that the page plays recordings.
+        recorded: What such a page plays.
         grid: Values of each style parameter, of which the evaluation grid has all combinations, or a list of styles by
             parameter name. By default a few values over each parameter's evaluation range.
         control_step: Duration of one env step [s]; by default from the environment's attributes, or 1.
@@ -229,6 +257,7 @@ class Domain:
     evaluation: Callable[..., str] | None = None
     make_stage: Callable[[], Stage] | None = None
     make_web: Callable[[StyleSpace], Any] | None = None
+    recorded: Recorded = field(default_factory=Recorded)
 
     def styled_env(
         self,
@@ -270,9 +299,17 @@ class Domain:
 
     def cells(self) -> list[dict[str, Any]]:
         """Return the styles of the evaluation grid, by parameter name."""
-        if isinstance(self.grid, Mapping):
-            return [dict(zip(self.grid, values, strict=True)) for values in product(*self.grid.values())]
-        return [dict(cell) for cell in self.grid]
+        return _cells(self.grid)
+
+    def recorded_cells(self) -> list[dict[str, Any]]:
+        """Return the styles that the exported page plays, by parameter name."""
+        return _cells(self.grid if self.recorded.grid is None else self.recorded.grid)
+
+
+def _cells(grid: Mapping[str, Sequence[Any]] | Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    if isinstance(grid, Mapping):
+        return [dict(zip(grid, values, strict=True)) for values in product(*grid.values())]
+    return [dict(cell) for cell in grid]
 
 
 def _takes(function: Any, argument: str) -> bool:

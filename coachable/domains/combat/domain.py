@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from coachable.domain import Domain
+from coachable.domain import Domain, Recorded
 from coachable.domains.combat.fights import evaluate_fights
 from coachable.domains.combat.metrics import CombatMeasures
 from coachable.domains.combat.stage import CombatStage
@@ -17,7 +17,7 @@ from coachable.envs.combat.constants import CONTROL_STEP, EPISODE_STEPS
 from coachable.envs.combat.env import CombatEnv
 from coachable.envs.combat.features import observation_groups
 from coachable.envs.combat.gamepad import ACTION_GROUPS
-from coachable.envs.combat.tables import STYLES
+from coachable.envs.combat.tables import SITES, STYLES
 from coachable.scene.renderer import SceneRenderer
 
 
@@ -40,8 +40,10 @@ def _as_trained(settings: Mapping[str, Any]) -> Domain:
     options = {name: value for name, value in settings.items() if name not in ("_target_", "num_envs", "components")}
     styles: Sequence[str] | None = settings.get("styles")
     make_space = partial(combat_style_space, styles, settings.get("reward_scale", "sim"))
+    machines: Sequence[str] = settings.get("machines") or ("Scrounger",)
     return replace(
         DOMAIN,
+        recorded=replace(DOMAIN.recorded, alike=lambda _: {"machines": machines[-1:], "sites": SITES[-1:]}),
         make_env=partial(make_combat_env, **options),
         make_space=make_space,
         measures=CombatMeasures(styles),
@@ -70,4 +72,9 @@ DOMAIN = Domain(
     words=WORDS,
     as_trained=_as_trained,
     evaluation=evaluate_fights,
+    recorded=Recorded(
+        seconds=45.0,
+        title="A fighter who uses what you ask for",
+        summary="Ask for a way to fight, and see how much of the damage it does.",
+    ),
 )

@@ -1,5 +1,6 @@
 """Declaration of the domain racing_aggressiveness."""
 
+from coachable.domain import Recorded
 from coachable.domains.racing.domain import racing_domain
 from coachable.domains.racing.families import CARS
 from coachable.domains.racing.races import evaluate_aggressiveness
@@ -11,5 +12,18 @@ DOMAIN = racing_domain(
     grid={"longitudinal": (0.5, 1.0, 1.5), "lateral": (0.0, 0.25, 0.5, 0.75, 1.0)},
     columns={"contact": ".2%", "place": ".2f"},
     evaluation=evaluate_aggressiveness,
+    recorded=Recorded(
+        columns={
+            "longitudinal": ".1f",
+            "lateral": ".1f",
+            "complied": ".1%",
+            "contact": ".1%",
+            "place": ".1f",
+            "pace": ".1f",
+            "off": ".1%",
+        },
+        title="A driver who keeps the distance that you ask for",
+        summary="Ask for room ahead, behind and beside, and see how close the car comes to the others.",
+    ),
     scenarios=rolling_start(CARS),
 )

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from coachable.domain import Domain
+from coachable.domain import Domain, Recorded
 from coachable.domains.racing.families import home_track, racing_family
 from coachable.domains.racing.metrics import RacingMeasures
 from coachable.domains.racing.stage import RacingStage
@@ -30,6 +30,7 @@ def racing_domain(
     grid: Mapping[str, Sequence[Any]] | Sequence[Mapping[str, Any]],
     columns: Mapping[str, str],
     evaluation: Callable[..., str],
+    recorded: Recorded,
     **options: Any,
 ) -> Domain:
     """Return the domain of a family of styles.
@@ -40,6 +41,7 @@ def racing_domain(
         grid: Evaluation grid, as in `Domain`.
         columns: Published columns beside survival, pace, time off course and changes of the steering command.
         evaluation: Function that `coachable evaluate` calls.
+        recorded: What the exported page plays.
         **options: Options of the environment that differ from training when an agent is shown and measured.
     """
     make_env, make_space, make_reward = racing_family(family)
@@ -86,8 +88,13 @@ def racing_domain(
         words=WORDS[family],
         as_trained=as_trained,
         evaluation=evaluation,
+        recorded=replace(recorded, alike=_alike),
     )
     return _with_circuits(domain)
+
+
+def _alike(races: int) -> dict[str, int]:
+    return {"copies": races, "controlled": 1}
 
 
 def _with_circuits(domain: Domain, **changes: Any) -> Domain:

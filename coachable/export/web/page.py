@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Mapping, Sequence
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,11 @@ from coachable import __version__
 from coachable.export.graph import graph_of, import_onnx
 from coachable.export.onnx import TOLERANCE, export
 from coachable.export.web.part import WebPart
-from coachable.export.web.third_party import packages, provide
+from coachable.export.web.third_party import Package, packages, provide
 from coachable.scene.look import ICON, stylesheet
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
-__all__ = ["SCHEMA_VERSION", "export_page", "manifest_of"]
+__all__ = ["SCHEMA_VERSION", "about", "copy_page", "export_page", "finish_page", "manifest_of"]
 
 SCHEMA_VERSION = 1
 """Version of `manifest.json`."""
@@ -56,10 +57,21 @@ def export_page(source: str | Path, out: Path, assets: Path | None = None) -> in
     features = graph_of(part.features, part.example, _OUTPUTS)
     onnx.checker.check_model(features)
     out.mkdir(parents=True, exist_ok=True)
+    copy_page(out, vendored)
     export(source, out / _GRAPHS["policy"])
     (out / _GRAPHS["features"]).write_bytes(features.SerializeToString())
     for name, text in (("dynamics", part.dynamics), ("kinematics", part.kinematics)):
         (out / _MODELS[name]).write_text(text, encoding="utf-8")
+    return finish_page(out, manifest_of(agent, part), [*_MODELS.values(), *_GRAPHS.values()], vendored)
+
+
+def copy_page(out: Path, vendored: Mapping[str, Path]) -> None:
+    """Write the page's own files, and the files of other projects with their licences.
+
+    Args:
+        out: The page's folder.
+        vendored: Files of other projects, from `coachable.export.web.third_party.provide`.
+    """
     with as_file(files("coachable.export.web") / "static") as own:
         shutil.copytree(own, out, dirs_exist_ok=True)
     (out / "look.css").write_text(stylesheet(), encoding="utf-8")
@@ -68,12 +80,39 @@ def export_page(source: str | Path, out: Path, assets: Path | None = None) -> in
         target = out / _VENDORED / name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(file, target)
-    (out / _VENDORED / "LICENSES.txt").write_text(_licenses(), encoding="utf-8")
-    manifest = manifest_of(agent, part)
-    manifest["downloads"] = [_download(out, name) for name in (*_MODELS.values(), *_GRAPHS.values())]
-    manifest["downloads"] += [_download(out, f"{_VENDORED}/{name}") for name in vendored]
+    used = _used(vendored)
+    (out / _VENDORED / "LICENSES.txt").write_text(_licenses(used), encoding="utf-8")
+
+
+def finish_page(out: Path, manifest: dict[str, Any], data: Sequence[str], vendored: Mapping[str, Path]) -> int:
+    """Write `manifest.json` with the sizes of everything that the page loads.
+
+    Args:
+        out: The page's folder, with all other files.
+        manifest: What the page has to know.
+        data: Names of the files of this agent.
+        vendored: Files of other projects, as in `copy_page`.
+
+    Returns:
+        Size of all files of the page [byte].
+    """
+    names = [*data, *(f"{_VENDORED}/{name}" for name in vendored)]
+    manifest["downloads"] = [{"file": name, "bytes": (out / name).stat().st_size} for name in names]
+    manifest["packages"] = [
+        {"name": p.name, "version": p.version, "license": p.license, "home": p.home} for p in _used(vendored)
+    ]
     (out / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")
     return sum(file.stat().st_size for file in out.rglob("*") if file.is_file())
+
+
+def about(agent: LoadedPolicy) -> dict[str, Any]:
+    """Return what every page has to know of an agent."""
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "coachable_version": __version__,
+        "domain": agent.metadata["domain"],
+        "frames": agent.metadata["frames"],
+    }
 
 
 def manifest_of(agent: LoadedPolicy, part: WebPart) -> dict[str, Any]:
@@ -97,10 +136,8 @@ def manifest_of(agent: LoadedPolicy, part: WebPart) -> dict[str, Any]:
         for control in domain.controls
     ]
     return {
-        "schema_version": SCHEMA_VERSION,
-        "coachable_version": __version__,
-        "domain": domain.name,
-        "frames": agent.metadata["frames"],
+        **about(agent),
+        "kind": "simulation",
         "title": part.title,
         "summary": part.summary,
         "style_space": json.loads(space.to_json()),
@@ -116,7 +153,6 @@ def manifest_of(agent: LoadedPolicy, part: WebPart) -> dict[str, Any]:
         "terminated": part.terminated,
         "starts": [dict(start) for start in part.starts],
         "largest_difference": TOLERANCE,
-        "packages": [{"name": p.name, "version": p.version, "license": p.license, "home": p.home} for p in packages()],
     }
 
 
@@ -127,14 +163,15 @@ def _part_of(agent: LoadedPolicy) -> WebPart:
     return domain.make_web(agent.space)
 
 
-def _download(out: Path, name: str) -> dict[str, Any]:
-    return {"file": name, "bytes": (out / name).stat().st_size}
+def _used(vendored: Mapping[str, Path]) -> list[Package]:
+    return [p for p in packages() if any(name.startswith(f"{p.name}/") for name in vendored)]
 
 
-def _licenses() -> str:
+def _licenses(used: Sequence[Package]) -> str:
     """Return the notices that the licences of the vendored files ask for."""
-    blocks = [f"{p.name} {p.version}\n{p.copyright}\nLicence: {p.license}\n{p.home}\n" for p in packages()]
+    blocks = [f"{p.name} {p.version}\n{p.copyright}\nLicence: {p.license}\n{p.home}\n" for p in used]
     mit = (files("coachable.export.web") / "MIT.txt").read_text(encoding="utf-8")
     apache = "The Apache License 2.0 is at https://www.apache.org/licenses/LICENSE-2.0\n"
     model = "The humanoid's model is from dm_control, Copyright The dm_control Authors, Apache-2.0.\n"
-    return "\n".join([*blocks, model, apache, "MIT License\n", mit])
+    others = [model, apache] if any(p.license == "Apache-2.0" for p in used) else []
+    return "\n".join([*blocks, *others, "MIT License\n", mit])

@@ -44,18 +44,19 @@ class Package:
     files: dict[str, str]
 
 
-def packages() -> list[Package]:
-    """Return the packages of `third_party.json`."""
+def packages(*names: str) -> list[Package]:
+    """Return the packages of `third_party.json` with these names, or all of them."""
     lock = json.loads((files("coachable.export.web") / "third_party.json").read_text(encoding="utf-8"))
-    return [Package(**package) for package in lock["packages"]]
+    return [Package(**package) for package in lock["packages"] if not names or package["name"] in names]
 
 
-def provide(assets: Path | None = None) -> dict[str, Path]:
+def provide(assets: Path | None = None, *names: str) -> dict[str, Path]:
     """Return the files by `PACKAGE/PATH`, after comparing them with their hashes.
 
     Args:
         assets: Folder that contains them at these paths, such as `node_modules`. By default a cache of the user, which
             is filled with `npm pack` where files are missing.
+        *names: Names of the needed packages; all by default.
 
     Raises:
         ValueError: If a file of `assets` is missing or is not the pinned one.
@@ -63,13 +64,13 @@ def provide(assets: Path | None = None) -> dict[str, Path]:
     """
     folder = _cache() if assets is None else assets
     found = {}
-    for package in packages():
+    for package in packages(*names):
         missing = [path for path in package.files if not _matches(folder, package, path)]
         if missing and assets is not None:
             raise ValueError(
                 f"{assets / package.name / missing[0]} is missing or is not the file of {package.name} "
                 f"{package.version}: expected a folder like node_modules after npm install "
-                f"{' '.join(f'{other.name}@{other.version}' for other in packages())}"
+                f"{' '.join(f'{other.name}@{other.version}' for other in packages(*names))}"
             )
         if missing:
             _fetch(package, folder)

@@ -1,11 +1,14 @@
-"""The humanoid's page, written once for all tests of this folder."""
+"""Pages, written once for all tests of this folder."""
 
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+
+from coachable.training.weights import domain_of, load_policy
 
 HERE = Path(__file__).parent
 
@@ -23,6 +26,26 @@ def site(tmp_path_factory):
         pytest.skip(str(error))
     folder = tmp_path_factory.mktemp("page") / "site"
     export_page("humanoid", folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def recorded_site(tmp_path_factory):
+    """A page with three short recordings."""
+    from coachable.evaluation import recorded_page
+    from coachable.export.web.third_party import provide
+
+    try:
+        provide(None, "three")
+    except OSError as error:
+        pytest.skip(str(error))
+    domain = domain_of(load_policy("racing_resources"))
+    grid = {"overtake": (1.0,), "defend": (1.0,), "tire": (0.0,), "fuel": (0.0, 52.0, 105.0)}
+    short = replace(domain, recorded=replace(domain.recorded, grid=grid, seconds=1.0))
+    folder = tmp_path_factory.mktemp("recorded") / "site"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recorded_page, "domain_of", lambda _: short)
+        recorded_page.export_recordings("racing_resources", folder, progress=False)
     return folder
 
 

@@ -1,5 +1,6 @@
 """The page in headless Chromium: it starts, follows its sliders, and asks no other site for anything."""
 
+import contextlib
 import functools
 import http.server
 import json
@@ -69,6 +70,14 @@ def wait_for(condition, seconds):
 
 @pytest.fixture
 def address(site):
+    with served(site) as address:
+        yield address
+
+
+@contextlib.contextmanager
+def served(site):
+    """Address of a folder on this computer."""
+
     class Quiet(http.server.SimpleHTTPRequestHandler):
         def log_message(self, *_):
             pass
@@ -139,3 +148,36 @@ def test_nothing_is_wider_than_the_window_and_everything_has_a_name(browser, add
     assert browser.evaluate(small) == 0
     assert browser.evaluate("document.getElementById('pause').textContent") == "Walk on"  # it waits to be started
     assert seconds(browser) == 0
+
+
+def test_recordings_follow_their_sliders_and_ask_no_other_site(browser, recorded_site):
+    manifest = json.loads((recorded_site / "manifest.json").read_text())
+    metrics = {"width": 360, "height": 740, "deviceScaleFactor": 1, "mobile": True}
+    browser.call("Emulation.setDeviceMetricsOverride", **metrics)
+    with served(recorded_site) as address:
+        browser.call("Page.navigate", url=f"{address}#fuel=105")
+        wait_for(lambda: browser.evaluate("document.getElementById('loading')?.hidden === true"), 120)
+        notice = browser.evaluate("document.getElementById('notice').textContent")
+        assert notice.startswith("Recording: this page plays 3 recorded episodes of the agent")
+        assert browser.evaluate("document.getElementById('request-fuel').value") == "2"
+        for index, recording in enumerate(manifest["recordings"]):
+            browser.evaluate(
+                f"(() => {{ const slider = document.getElementById('request-fuel'); slider.value = {index};"
+                " slider.dispatchEvent(new Event('input')); })()"
+            )
+            shown = "Number(document.getElementById('measured-fuel_per_km').dataset.value)"
+            assert browser.evaluate(shown) == recording["measured"]["fuel_per_km"]
+            asked = f"Requested: Fuel {recording['style']['fuel']:g}."
+            announced = f"document.getElementById('announcement').textContent.startsWith('{asked}')"
+            wait_for(lambda announced=announced: browser.evaluate(announced), 60)
+        assert "fuel=105" in browser.evaluate("location.hash")
+        browser.evaluate(
+            "(() => { document.getElementById('pause').click(); const slider = document.getElementById('moment');"
+            " slider.value = 0.5; slider.dispatchEvent(new Event('input')); })()"
+        )
+        wait_for(lambda: seconds(browser) == 0.5, 60)
+        assert browser.evaluate("document.documentElement.scrollWidth") <= 360
+        sent = [e["params"]["request"]["url"] for e in browser.events if e.get("method") == "Network.requestWillBeSent"]
+        assert len(sent) > 10
+        assert [url for url in sent if not url.startswith((address, "data:", "blob:", "about:"))] == []
+    assert not [e for e in browser.events if e.get("method") == "Runtime.exceptionThrown"]

@@ -1,5 +1,7 @@
 """The folder of the page: what is in it, where files of other projects come from, and the page's arithmetic."""
 
+import base64
+import gzip
 import json
 import shutil
 import subprocess
@@ -11,6 +13,9 @@ import pytest
 from coachable.cli import main
 from coachable.domain import load_domain
 from coachable.export.web import third_party
+from coachable.scene.frame import Frame, Gauge
+from coachable.scene.parts import Parts
+from coachable.scene.recorded import encode_frames
 
 STATIC = Path(str(files("coachable.export.web"))) / "static"
 
@@ -25,13 +30,6 @@ def test_the_page_is_small_and_names_no_folder_of_this_machine(site):
     manifest = json.loads((site / "manifest.json").read_text())
     for download in manifest["downloads"]:
         assert (site / download["file"]).stat().st_size == download["bytes"]
-
-
-def test_a_domain_without_a_page_says_so(capsys, tmp_path):
-    pytest.importorskip("onnxscript")
-    assert main(["export", "combat", "--web", str(tmp_path / "site")]) == 2
-    assert "the domain combat has no page for the browser" in capsys.readouterr().err
-    assert not (tmp_path / "site").exists()
 
 
 def test_a_walker_with_a_styled_speed_measures_it():
@@ -102,13 +100,58 @@ assert.equal(readout.mean("length"), null);
 """
 
 
+RECORDINGS = """
+import assert from "node:assert/strict";
+const { decode, nearest, along, varied, fromFragment, fragmentOf } = await import(RECORDING);
+const styles = [[0, 0], [0, 50], [0, 100], [9, 0], [9, 100]].map(([tire, fuel]) => ({ pace: 1, tire, fuel }));
+const manifest = {
+  parameters: [
+    { name: "pace", kind: "number", values: [1] },
+    { name: "tire", kind: "number", values: [0, 9] },
+    { name: "fuel", kind: "number", values: [0, 50, 100] },
+  ],
+  recordings: styles.map((style) => ({ style })),
+};
+assert.deepEqual(varied(manifest).map(({ name }) => name), ["tire", "fuel"]);
+assert.equal(nearest(manifest, { tire: 0, fuel: 60 }), 1);
+assert.equal(nearest(manifest, { tire: 9, fuel: 50 }, "tire") >= 3, true); // there is none with both
+assert.equal(nearest(manifest, { tire: 9, fuel: 50 }, "fuel"), 1);
+assert.deepEqual(along(manifest, styles[4], "fuel"), [[0, 3], [100, 4]]);
+assert.deepEqual(along(manifest, styles[4], "tire"), [[0, 2], [9, 4]]);
+assert.equal(fragmentOf(manifest, 4), "#tire=9&fuel=100");
+assert.deepEqual(fromFragment(manifest, fragmentOf(manifest, 4, 2.5)), { number: 4, moment: 2.5 });
+assert.deepEqual(fromFragment(manifest, "#tire=<b>&fuel=1e9&t=-3"), { number: 2, moment: 0 });
+assert.deepEqual(fromFragment(manifest, "#tire=NaN&fuel=&t=x"), { number: 0, moment: 0 });
+for (const packed of [true, false]) {
+  const recording = await decode(new Uint8Array(Buffer.from(packed ? PACKED : PLAIN, "base64")));
+  assert.equal(recording.frames, 2);
+  assert.deepEqual([...recording.arrays.get("focus")], [1, 2, 3, 4, 5, 6]);
+  assert.deepEqual(recording.gauges[1], [["speed", "3 m/s", 0.25, "#0072b2"]]);
+}
+"""
+
+
+def test_recordings_are_decoded_and_found():
+    frames = [Frame(Parts(), focus, 0.0, gauges=[Gauge("speed", "3 m/s", 0.25)]) for focus in ((1, 2, 3), (4, 5, 6))]
+    packed = encode_frames(frames, {"": 0})
+    texts = {"PACKED": packed, "PLAIN": gzip.decompress(packed)}
+    script = RECORDINGS
+    for name, content in texts.items():
+        script = script.replace(name, json.dumps(base64.b64encode(content).decode()))
+    run_in_node(script, "recording")
+
+
 def test_requests_links_and_readouts():
+    run_in_node(SCRIPT, "request", "readout")
+
+
+def run_in_node(script, *modules):
+    """Run a script in which the upper-case names of modules stand for their addresses."""
     node = shutil.which("node")
     if node is None:
         pytest.skip("node is not installed")
-    script = SCRIPT
-    for name in ("request", "readout"):
-        script = script.replace(name.upper(), json.dumps((STATIC / f"{name}.js").as_uri()))
+    for name in modules:
+        script = script.replace(f"({name.upper()})", f"({json.dumps((STATIC / f'{name}.js').as_uri())})")
     done = subprocess.run(
         [node, "--input-type=module", "--no-warnings"], input=script, capture_output=True, text=True, timeout=60
     )

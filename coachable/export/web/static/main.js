@@ -1,225 +1,24 @@
-// Start of the page: load everything, then let the agent act in real time.
+// Start of the page: an agent that acts in the browser, or recordings of one.
 
-import { Panel } from "./panel.js";
-import { Readout } from "./readout.js";
-import { controlsOf, defaultsOf, entriesOf, fragmentOf, fromFragment, thetaOf } from "./request.js";
-import { createSimulator } from "./simulator.js";
+import { at, megabytes } from "./dom.js";
 
-const THIRD_PARTY = "third_party";
-const MUJOCO = `${THIRD_PARTY}/@mujoco/mujoco/mujoco`;
-const ONNX = `${THIRD_PARTY}/onnxruntime-web/dist`;
-const BEHIND = 0.25; // [s] that a frame catches up at most; beyond this the agent acts slower than real time
-const AFTER_FALL = 1200; // [ms] before the next episode
-const ANNOUNCE = 4; // [s] after a request, what was measured is read out
-
-const at = (id) => document.getElementById(id);
-
-class Page {
-  async load() {
-    const manifest = await (await fetch("manifest.json")).json();
-    this.manifest = manifest;
-    document.title = manifest.title;
-    at("title").textContent = manifest.title;
-    at("summary").textContent = manifest.summary;
-    tellLoads(manifest);
-    const wanted = [...Object.values(manifest.models), ...Object.values(manifest.graphs), `${MUJOCO}.wasm`, `${ONNX}/ort-wasm-simd-threaded.wasm`];
-    const [files, mujoco, ort, drawing] = await Promise.all([
-      download(wanted, manifest.downloads),
-      import(`./${MUJOCO}.js`),
-      import(`./${ONNX}/ort.wasm.min.mjs`),
-      import("./scene.js"),
-    ]);
-    at("loading-text").textContent = "Starting …";
-    ort.env.wasm.numThreads = 1; // more need headers that a static host does not send
-    ort.env.wasm.wasmBinary = files.get(wanted.at(-1));
-    const physics = await mujoco.default({ wasmBinary: files.get(wanted.at(-2)) });
-    this.simulator = await createSimulator({ mujoco: physics, ort, manifest, files });
-    try {
-      this.scene = new drawing.Scene(at("scene"), this.simulator.kinematics, manifest.followed);
-    } catch (error) {
-      console.error(error);
-      this.tell("This browser cannot draw in 3-D: the numbers go on.");
-    }
-  }
-
-  start() {
-    const { manifest } = this;
-    this.entries = entriesOf(manifest);
-    this.readout = new Readout(manifest.measures);
-    this.panel = new Panel(at("requests"), at("others"), this.entries, manifest.measures, (name, value) =>
-      this.ask({ ...this.request, [name]: value }),
-    );
-    this.request = fromFragment(this.entries, location.hash, defaultsOf(this.entries));
-    this.episode = 0;
-    this.ask(this.request);
-    this.again();
-    addEventListener("hashchange", () => this.ask(fromFragment(this.entries, location.hash, this.request)));
-    this.#buttons();
-    this.pause(matchMedia("(prefers-reduced-motion: reduce)").matches);
-    at("loading").hidden = true;
-    this.before = performance.now();
-    requestAnimationFrame(() => this.frame());
-  }
-
-  /** Take over what is asked for, from the next control step on. */
-  ask(request) {
-    this.request = request;
-    this.simulator.style = Float32Array.from(thetaOf(this.entries, request));
-    this.simulator.controls = Float64Array.from(controlsOf(this.entries, request));
-    this.readout.clear();
-    this.panel.request(request);
-    this.panel.measured(this.readout);
-    this.announceAt = this.time + ANNOUNCE;
-    history.replaceState(null, "", fragmentOf(this.entries, request));
-  }
-
-  /** Begin an episode in another of the initial states. */
-  again() {
-    this.simulator.reset(this.episode++);
-    this.readout.clear();
-    this.panel.measured(this.readout);
-    this.pending = 0;
-    this.fell = null;
-    this.tell("");
-    this.announceAt = ANNOUNCE;
-    this.scene?.restart();
-    this.scene?.draw();
-  }
-
-  push() {
-    if (this.paused) this.pause(false);
-    this.simulator.push(2 * Math.PI * Math.random());
-    this.tell(`pushed with ${this.manifest.push.force} N`, 1000);
-  }
-
-  pause(paused) {
-    this.paused = paused;
-    at("pause").textContent = paused ? "Walk on" : "Pause";
-  }
-
-  /** Time since the episode began [s]. */
-  get time() {
-    return this.simulator.steps * this.manifest.physics.control_step;
-  }
-
-  tell(text, milliseconds = 0) {
-    at("banner").textContent = text;
-    at("banner").hidden = !text;
-    clearTimeout(this.quiet);
-    if (milliseconds) this.quiet = setTimeout(() => this.tell(""), milliseconds);
-  }
-
-  async frame() {
-    const now = performance.now(); // the time that the browser hands over lies in the past where drawing is slow
-    const elapsed = (now - this.before) / 1000;
-    this.before = now;
-    const { control_step: step } = this.manifest.physics;
-    if (!this.paused && this.fell === null) {
-      this.pending += Math.min(elapsed, BEHIND);
-      let steps = 0;
-      for (; this.pending >= step && this.fell === null; steps++) {
-        await this.advance();
-        this.pending -= step;
-      }
-      this.#pace(elapsed, steps * step);
-      if (steps) this.panel.measured(this.readout);
-      this.scene?.draw(Math.min(this.pending / step, 1));
-      at("clock").textContent = `${this.time.toFixed(1)} s`;
-    } else {
-      if (this.fell !== null && now - this.fell > AFTER_FALL) this.again();
-      this.scene?.draw();
-    }
-    requestAnimationFrame(() => this.frame());
-  }
-
-  /** One control step. */
-  async advance() {
-    const { measured, mark, terminated } = await this.simulator.step();
-    this.readout.add(this.time, measured);
-    this.scene?.take();
-    if (mark.every(Number.isFinite)) {
-      const index = this.manifest.measures.findIndex(({ at_marks }) => at_marks);
-      this.scene?.mark(mark, index < 0 ? "" : measured[index].toFixed(2));
-    }
-    if (this.time >= this.announceAt) {
-      this.announceAt = Infinity;
-      at("announcement").textContent = this.panel.sentences(this.readout);
-    }
-    if (terminated) {
-      this.fell = performance.now();
-      const words = `The agent ${this.manifest.terminated} after ${this.time.toFixed(1)} s`;
-      this.tell(words);
-      at("announcement").textContent = words;
-    }
-  }
-
-  /** Say so if the computer is slower than real time. */
-  #pace(elapsed, simulated) {
-    this.rate = 0.95 * (this.rate ?? 1) + 0.05 * (simulated / Math.max(elapsed, 0.001));
-    if (this.rate < 0.7) this.scene?.spare();
-    at("pace").textContent = this.rate < 0.9 ? `${this.rate.toFixed(1)} × real time` : "";
-  }
-
-  #buttons() {
-    const actions = {
-      pause: () => this.pause(!this.paused),
-      push: () => this.push(),
-      again: () => this.again(),
-      share: () => this.#share(),
-    };
-    for (const [id, action] of Object.entries(actions)) {
-      at(id).disabled = false;
-      at(id).addEventListener("click", action);
-    }
-    addEventListener("keydown", (event) => {
-      if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
-      const typing = event.target.closest("button, summary, a, input[type=radio]");
-      const id = { " ": typing ? undefined : "pause", p: "push", r: "again" }[event.key.toLowerCase()];
-      if (id) {
-        event.preventDefault();
-        actions[id]();
-      }
-    });
-  }
-
-  async #share() {
-    try {
-      await navigator.clipboard.writeText(location.href);
-      at("share").textContent = "Copied";
-    } catch {
-      at("share").textContent = "It is in the address bar";
-    }
-    setTimeout(() => (at("share").textContent = "Copy link"), 2000);
-  }
-}
-
-/** Load files with a bar that shows how far it is. */
-async function download(names, sizes) {
-  const total = sizes.filter(({ file }) => names.includes(file)).reduce((sum, { bytes }) => sum + bytes, 0);
-  let loaded = 0;
-  const read = async (name) => {
-    const answer = await fetch(name);
-    if (!answer.ok) throw new Error(`${name}: ${answer.status} ${answer.statusText}`);
-    const chunks = [];
-    for (const reader = answer.body.getReader(); ; ) {
-      const { done, value } = await reader.read();
-      if (done) break;
-      chunks.push(value);
-      loaded += value.length;
-      at("loading-bar").value = loaded / total;
-      at("loading-text").textContent = `Loading the agent and its physics: ${megabytes(loaded)} of ${megabytes(total)}`;
-    }
-    return [name, new Uint8Array(await new Blob(chunks).arrayBuffer())];
-  };
-  return new Map(await Promise.all(names.map(read)));
+async function start() {
+  const manifest = await (await fetch("manifest.json")).json();
+  document.title = manifest.title;
+  at("title").textContent = manifest.title;
+  at("summary").textContent = manifest.summary;
+  tellLoads(manifest);
+  const kind = await import(manifest.kind === "recordings" ? "./recorded.js" : "./simulated.js");
+  await kind.start(manifest);
 }
 
 function tellLoads(manifest) {
   const total = manifest.downloads.reduce((sum, { bytes }) => sum + bytes, 0);
   const versions = manifest.packages.map(({ name, version, license }) => `${name} ${version} (${license})`).join(", ");
+  const agent = `agent (coachable ${manifest.coachable_version}, domain ${manifest.domain})`;
+  const content = manifest.kind === "recordings" ? `recordings of the ${agent}` : `the ${agent}, its physics`;
   at("loads").textContent =
-    `${megabytes(total)} from this site and nothing from any other: the agent (coachable ${manifest.coachable_version}, ` +
-    `domain ${manifest.domain}), its physics, and ${versions}. Nothing is sent anywhere.`;
+    `${megabytes(total)} from this site and nothing from any other: ${content}, and ${versions}. Nothing is sent anywhere.`;
   for (const { file, bytes } of manifest.downloads) {
     const row = at("files").insertRow();
     row.insertCell().textContent = file;
@@ -227,14 +26,8 @@ function tellLoads(manifest) {
   }
 }
 
-function megabytes(bytes) {
-  return `${(bytes / 1e6).toFixed(1)} MB`;
-}
-
-const page = new Page();
 try {
-  await page.load();
-  page.start();
+  await start();
 } catch (error) {
   console.error(error);
   at("loading-bar").hidden = true;

@@ -1,8 +1,7 @@
 // The coach's panel: requests as controls made from the declaration, and beside each what is measured.
 
+import { listening, make, shape } from "./dom.js";
 import { isOutside, textOf, withUnit, words } from "./request.js";
-
-const SVG = "http://www.w3.org/2000/svg";
 
 export class Panel {
   /**
@@ -130,9 +129,7 @@ export class Panel {
       parts.push(make("div", { class: "meter", "aria-hidden": "true" }, shown.meter));
     }
     if (measure.at_marks) {
-      shown.steps = document.createElementNS(SVG, "svg");
-      shown.steps.setAttribute("class", "steps");
-      shown.steps.setAttribute("aria-hidden", "true");
+      shown.steps = shape("svg", { class: "steps", "aria-hidden": "true" });
       parts.push(shown.steps);
     }
     return parts;
@@ -153,22 +150,16 @@ function drawSteps(svg, values, asked, top) {
   const [width, height, foot] = [svg.clientWidth || 300, 84, 16];
   const scale = (height - foot - 4) / top;
   const column = width / 8;
-  const draw = (tag, attributes, text = "") => {
-    const shape = document.createElementNS(SVG, tag);
-    for (const [name, value] of Object.entries(attributes)) shape.setAttribute(name, value);
-    shape.textContent = text;
-    return shape;
-  };
   const bars = values.flatMap((value, i) => {
     const size = Math.max(value, 0) * scale;
     const x = i * column;
     return [
-      draw("rect", { x: x + 5, y: height - foot - size, width: column - 10, height: size, rx: 3, opacity: 0.45 + 0.55 * ((i + 1) / values.length) }),
-      draw("text", { x: x + column / 2, y: height - 3 }, value.toFixed(2)),
+      shape("rect", { x: x + 5, y: height - foot - size, width: column - 10, height: size, rx: 3, opacity: 0.45 + 0.55 * ((i + 1) / values.length) }),
+      shape("text", { x: x + column / 2, y: height - 3 }, value.toFixed(2)),
     ];
   });
   const y = height - foot - asked * scale;
-  svg.replaceChildren(...bars, draw("line", { x1: 0, x2: width, y1: y, y2: y }));
+  svg.replaceChildren(...bars, shape("line", { x1: 0, x2: width, y1: y, y2: y }));
 }
 
 /** Where a value lies below a slider, whose thumb does not go quite to the ends. */
@@ -179,16 +170,4 @@ function placeOf({ from, to }, value) {
 
 function textOfMeasure({ share, unit }, value) {
   return share ? `${Math.round(100 * value)} % of the time` : withUnit(value.toFixed(2), unit);
-}
-
-function make(tag, attributes, ...children) {
-  const element = document.createElement(tag);
-  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
-  element.append(...children);
-  return element;
-}
-
-function listening(element, event, react) {
-  element.addEventListener(event, react);
-  return element;
 }

@@ -2,6 +2,8 @@
 
 import * as THREE from "./third_party/three/build/three.module.min.js";
 
+import { aim, fitting, orbit } from "./view.js";
+
 const COLOURS = {
   light: { sky: "#e9edf1", ground: "#dfe5eb", fine: "#cdd5de", bold: "#b3bfcb", body: "#d9a066", label: "#3a4754", sun: 2.2, fill: 1.5 },
   dark: { sky: "#12171d", ground: "#1b222a", fine: "#27313b", bold: "#3a4855", body: "#d79a5f", label: "#c3cdd8", sun: 2.0, fill: 0.7 },
@@ -49,7 +51,8 @@ export class Scene {
     this.dark = matchMedia("(prefers-color-scheme: dark)");
     this.dark.addEventListener("change", () => this.#paint());
     this.#paint();
-    this.#listen();
+    this.fit = fitting(this.renderer, this.camera, canvas, () => this.sparing);
+    orbit(canvas, this.view, DISTANCE);
     this.restart();
   }
 
@@ -112,12 +115,8 @@ export class Scene {
     this.ground.position.set(Math.round(this.target.x), Math.round(this.target.y), 0);
     this.sun.position.copy(this.target).add(offset);
     this.sun.target.position.copy(this.target);
-    const { azimuth, elevation, distance } = this.view;
-    const flat = distance * Math.cos(elevation);
-    this.camera.position.set(flat * Math.cos(azimuth), flat * Math.sin(azimuth), distance * Math.sin(elevation));
-    this.camera.position.add(this.target);
-    this.camera.lookAt(this.target);
-    this.#fit();
+    aim(this.camera, this.target, this.view);
+    this.fit();
     this.renderer.render(this.scene, this.camera);
   }
 
@@ -125,18 +124,7 @@ export class Scene {
   spare() {
     if (this.sparing) return;
     this.sparing = true;
-    this.width = null; // measured anew by the next picture
     this.sun.castShadow = false;
-  }
-
-  #fit() {
-    const { clientWidth: width, clientHeight: height } = this.canvas;
-    if (this.width === width && this.height === height) return;
-    [this.width, this.height] = [width, height];
-    this.renderer.setPixelRatio(this.sparing ? 0.5 : Math.min(devicePixelRatio, 2));
-    this.renderer.setSize(width, height, false);
-    this.camera.aspect = width / Math.max(height, 1);
-    this.camera.updateProjectionMatrix();
   }
 
   #paint() {
@@ -150,39 +138,6 @@ export class Scene {
     this.ground.material.map?.dispose();
     this.ground.material.map = gridOf(this.colours);
     this.ground.material.needsUpdate = true;
-  }
-
-  /** Turn by dragging, and come nearer with the wheel or two fingers. */
-  #listen() {
-    const fingers = new Map();
-    const zoom = (factor) => {
-      this.view.distance = Math.min(Math.max(this.view.distance * factor, DISTANCE.near), DISTANCE.far);
-    };
-    this.canvas.addEventListener("pointerdown", (event) => {
-      fingers.set(event.pointerId, [event.clientX, event.clientY]);
-      this.canvas.setPointerCapture(event.pointerId);
-    });
-    this.canvas.addEventListener("pointermove", (event) => {
-      const before = fingers.get(event.pointerId);
-      if (!before) return;
-      const now = [event.clientX, event.clientY];
-      const other = [...fingers].find(([id]) => id !== event.pointerId)?.[1];
-      if (other) {
-        const apart = ([x, y]) => Math.hypot(x - other[0], y - other[1]);
-        zoom(apart(before) / Math.max(apart(now), 1));
-      } else {
-        this.view.azimuth -= 0.008 * (now[0] - before[0]);
-        this.view.elevation = Math.min(Math.max(this.view.elevation + 0.006 * (now[1] - before[1]), 0.03), 1.4);
-      }
-      fingers.set(event.pointerId, now);
-    });
-    for (const end of ["pointerup", "pointercancel"]) {
-      this.canvas.addEventListener(end, (event) => fingers.delete(event.pointerId));
-    }
-    this.canvas.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      zoom(Math.exp(0.001 * event.deltaY));
-    });
   }
 }
 

@@ -12,14 +12,13 @@
  * @returns {Promise<Simulator>}
  */
 export async function createSimulator({ mujoco, ort, manifest, files }) {
+  const sessions = ["policy", "features"].map((name) => ort.InferenceSession.create(files.get(manifest.graphs[name])));
   const text = new TextDecoder();
   const [dynamics, kinematics] = ["dynamics", "kinematics"].map((name) => {
     const model = mujoco.MjModel.from_xml_string(text.decode(files.get(manifest.models[name])));
     return { model, data: new mujoco.MjData(model) };
   });
-  const [policy, features] = await Promise.all(
-    ["policy", "features"].map((name) => ort.InferenceSession.create(files.get(manifest.graphs[name]))),
-  );
+  const [policy, features] = await Promise.all(sessions);
   return new Simulator({ mujoco, ort, manifest, dynamics, kinematics, policy, features });
 }
 

@@ -1,0 +1,242 @@
+"""`coachable export --web` for simulations that do not run in a browser: a page that plays recorded episodes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from tqdm import tqdm
+
+from coachable.domain import Domain
+from coachable.evaluation.outputs import complete_folder
+from coachable.evaluation.rollouts import Rollout
+from coachable.evaluation.style_grid import published
+from coachable.evaluation.wording import readable
+from coachable.export.web.page import about, copy_page, finish_page
+from coachable.export.web.third_party import provide
+from coachable.keys import TASK_REWARD
+from coachable.scene.frame import Frame, Stage
+from coachable.scene.palette import css
+from coachable.scene.recorded import encode_backdrop, encode_frames
+from coachable.styles import Choice, StyleSpace
+from coachable.training.weights import LoadedPolicy, domain_of, load_policy
+
+__all__ = ["Recording", "export_recordings", "record"]
+
+MOST = 40
+"""Largest number of recordings of a page."""
+
+_NEEDED = "three"  # the package that draws
+_FOLDER = "recordings"
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One recorded episode.
+
+    Attributes:
+        frames: What is to be seen at the start and after each step.
+        backdrops: What does not move, as bytes, by `Frame.place`.
+        measured: Summary of the domain's measures over all steps, with "survived" and "task_return", by name; NaN where
+            there is no value.
+        terminated: Whether the episode terminated.
+    """
+
+    frames: list[Frame]
+    backdrops: dict[Hashable, bytes]
+    measured: dict[str, float]
+    terminated: bool
+
+
+def export_recordings(
+    source: str | Path, out: Path, assets: Path | None = None, *, seed: int = 0, progress: bool = True
+) -> int:
+    """Write a page that plays one recorded episode of an agent in each style of a grid.
+
+    Grid and length are the domain's, see `coachable.domain.Recorded`.
+
+    Args:
+        source: Checkpoint, run folder, weights file, exported model, or the name of a domain that ships with weights.
+        out: Folder to write into; files of the same names are replaced.
+        assets: Folder with the files of other projects, see `coachable.export.web.third_party.provide`.
+        seed: Seed of the start and of sampled actions.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        Size of all files of the page [byte].
+
+    Raises:
+        ValueError: If the agent's domain has no scene, more than `MOST` styles, or names an unknown measure.
+        CheckpointError: If the source does not hold a usable policy.
+        OSError: If the files of other projects cannot be fetched, or writing fails.
+    """
+    agent = load_policy(source)
+    domain = domain_of(agent)
+    if domain.make_stage is None:
+        raise ValueError(
+            f"the domain {domain.name} has neither a simulation for the browser nor a scene: expected one that "
+            "declares make_web or make_stage"
+        )
+    cells = domain.recorded_cells()
+    if not 0 < len(cells) <= MOST:
+        raise ValueError(f"the domain {domain.name} has {len(cells)} styles to record: expected 1 to {MOST}")
+    thetas = [agent.space.make(strict=True, **cell) for cell in cells]
+    requests = [agent.space.describe(theta) | cell for theta, cell in zip(thetas, cells, strict=True)]
+    steps = min(domain.episode_steps, max(1, round(domain.recorded.seconds / domain.control_step)))
+    vendored = provide(assets, _NEEDED)
+    recordings = record(
+        domain, agent.actor, torch.stack(thetas), requests, space=agent.space, steps=steps, seed=seed, progress=progress
+    )
+    columns = domain.recorded.columns or published(domain, recordings[0].measured)
+    shown = [_measure(domain, agent.space, *column) for column in columns.items()]
+    if unknown := {measure["name"] for measure in shown} - recordings[0].measured.keys():
+        raise ValueError(
+            f"the domain {domain.name} shows {', '.join(sorted(unknown))}: expected some of "
+            f"{', '.join(sorted(recordings[0].measured))}"
+        )
+    backdrops: dict[bytes, str] = {}
+    with complete_folder(out) as folder:
+        copy_page(folder, vendored)
+        (folder / _FOLDER).mkdir()
+        manifest = _manifest(agent, domain, requests)
+        played = []
+        for number, (recording, request) in enumerate(zip(recordings, requests, strict=True)):
+            for content in recording.backdrops.values():
+                backdrops.setdefault(content, f"{_FOLDER}/backdrop_{len(backdrops)}.bin")
+            names = list(backdrops)
+            places = {place: names.index(content) for place, content in recording.backdrops.items()}
+            file = f"{_FOLDER}/{number}.bin"
+            (folder / file).write_bytes(encode_frames(recording.frames, places))
+            found = {measure["name"]: recording.measured[measure["name"]] for measure in shown}
+            found = {name: value if math.isfinite(value) else None for name, value in found.items()}
+            played.append({"file": file, "style": request, "terminated": recording.terminated, "measured": found})
+        for content, file in backdrops.items():
+            (folder / file).write_bytes(content)
+        manifest |= {"backdrops": list(backdrops.values()), "measures": shown, "recordings": played}
+        return finish_page(folder, manifest, [*backdrops.values(), *(entry["file"] for entry in played)], vendored)
+
+
+def record(
+    domain: Domain,
+    policy: TensorDictModuleBase,
+    theta: Tensor,
+    requests: Sequence[Mapping[str, Any]],
+    *,
+    space: StyleSpace,
+    steps: int,
+    seed: int = 0,
+    progress: bool = False,
+) -> list[Recording]:
+    """Record one episode in each style, all of them in one batch.
+
+    Args:
+        domain: Domain with a scene.
+        policy: Policy that reads `observation` and `style`.
+        theta: Styles (N, d).
+        requests: The same styles by parameter name.
+        space: Their style space.
+        steps: Largest number of steps.
+        seed: Seed of the starts and of sampled actions.
+        progress: Whether to show a progress bar.
+    """
+    make_stage, alike = domain.make_stage, domain.recorded.alike
+    assert make_stage is not None
+    options = {**domain.coached, **(alike(len(requests)) if alike else {})}
+    env = domain.styled_env(space, len(requests), seed=seed, **options)
+    cameras = [_Camera(env, row, make_stage(), request) for row, request in enumerate(requests)]
+    alive, survived = torch.ones(2, len(requests), dtype=torch.bool)
+    task_return = torch.zeros(len(requests))
+    rows: list[dict[str, Tensor]] = []
+    lives: list[Tensor] = []
+    try:
+        rollout = Rollout(env, seed)
+        rollout.begin(theta)
+        for camera in cameras:
+            camera.see()
+        for _ in tqdm(range(steps), "recording", disable=None if progress else True, leave=False):
+            transition = rollout.step(policy, theta)
+            after = transition.get("next")
+            rows.append(domain.measures.step(transition))
+            lives.append(alive)
+            task_return += torch.where(alive, after.get(TASK_REWARD).squeeze(-1), 0.0)
+            survived = survived & ~(alive & after.get("terminated").squeeze(-1))
+            for row in alive.nonzero()[:, 0].tolist():
+                cameras[row].see()
+            alive = alive & ~after.get("done").squeeze(-1)
+            if not alive.any():
+                break
+    finally:
+        env.close()
+    taken = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
+    summary = domain.measures.summarise(taken, torch.stack(lives))
+    summary = {"survived": survived.float(), "task_return": task_return, **summary}
+    return [
+        Recording(camera.frames, camera.backdrops, {name: float(v[row]) for name, v in summary.items()}, bool(~stays))
+        for row, (camera, stays) in enumerate(zip(cameras, survived, strict=True))
+    ]
+
+
+class _Camera:
+    """Frames of one row of a batch."""
+
+    def __init__(self, env: EnvBase, row: int, stage: Stage, request: Mapping[str, Any]) -> None:
+        self._env, self._row, self._stage, self._request = env, row, stage, request
+        self.frames: list[Frame] = []
+        self.backdrops: dict[Hashable, bytes] = {}
+
+    def see(self) -> None:
+        """Take a frame of the present state."""
+        self.frames.append(self._stage.frame(self._env, self._row, self._request))
+        place = self.frames[-1].place
+        if place not in self.backdrops:
+            self.backdrops[place] = encode_backdrop(self._stage.backdrop(self._env, self._row))
+
+
+def _manifest(agent: LoadedPolicy, domain: Domain, requests: list[dict[str, Any]]) -> dict[str, Any]:
+    assert domain.make_stage is not None
+    stage, told = domain.make_stage(), domain.recorded
+    values = {name: list(dict.fromkeys(request[name] for request in requests)) for name in agent.space.names}
+    return {
+        **about(agent),
+        "kind": "recordings",
+        "title": told.title or f"An agent that you coach: {readable(domain.name)}",
+        "summary": told.summary,
+        "parameters": [
+            {
+                "name": parameter.name,
+                "kind": "choice" if isinstance(parameter, Choice) else "number",
+                "unit": getattr(parameter, "unit", ""),
+                "help": parameter.help,
+                "values": values[parameter.name] if isinstance(parameter, Choice) else sorted(values[parameter.name]),
+            }
+            for parameter in agent.space.parameters
+        ],
+        "terminated": domain.words.terminated,
+        "control_step": domain.control_step,
+        "viewpoint": vars(stage.viewpoint),
+        "legend": [[css(colour), meaning] for colour, meaning in stage.legend],
+    }
+
+
+def _measure(domain: Domain, space: StyleSpace, column: str, form: str) -> dict[str, Any]:
+    """Return what the page has to know of a published column."""
+    name = column.removeprefix("measured_")
+    beside = domain.recorded.beside.get(name, name if name in space.names else "")
+    unit = domain.units.get(name) or (getattr(space[name], "unit", "") if name in space.names else "")
+    digits = int("".join(c for c in form.partition(".")[2] if c.isdigit()) or 3)
+    return {
+        "name": name,
+        "parameter": beside,
+        "text": "mean over the recording" if name == beside else readable(name),
+        "unit": unit,
+        "share": form.endswith("%"),
+        "digits": digits,
+        "significant": form.endswith("g"),
+    }

@@ -1,0 +1,86 @@
+// What all pages share: messages, buttons, keys and links.
+
+import { at, megabytes } from "./dom.js";
+
+export class Page {
+  resting = "Play"; // what the button says while the page is paused
+
+  constructor(manifest) {
+    this.manifest = manifest;
+  }
+
+  pause(paused) {
+    this.paused = paused;
+    at("pause").textContent = paused ? this.resting : "Pause";
+  }
+
+  tell(text, milliseconds = 0) {
+    at("banner").textContent = text;
+    at("banner").hidden = !text;
+    clearTimeout(this.quiet);
+    if (milliseconds) this.quiet = setTimeout(() => this.tell(""), milliseconds);
+  }
+
+  /** Address of what is to be seen now. */
+  get link() {
+    return location.href;
+  }
+
+  /** Let buttons and keys act; a button without an action is not shown. */
+  listen(actions) {
+    const all = { pause: () => this.pause(!this.paused), share: () => this.#share(), ...actions };
+    for (const id of ["pause", "push", "again", "share"]) {
+      at(id).hidden = !(id in all);
+      at(id).disabled = false;
+      if (id in all) at(id).addEventListener("click", all[id]);
+    }
+    addEventListener("keydown", (event) => {
+      if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
+      const typing = event.target.closest("button, summary, a, input[type=radio]");
+      const id = { " ": typing ? undefined : "pause", p: "push", r: "again" }[event.key.toLowerCase()];
+      if (id in all) {
+        event.preventDefault();
+        all[id]();
+      }
+    });
+  }
+
+  async #share() {
+    try {
+      await navigator.clipboard.writeText(this.link);
+      at("share").textContent = "Copied";
+    } catch {
+      history.replaceState(null, "", this.link);
+      at("share").textContent = "It is in the address bar";
+    }
+    setTimeout(() => (at("share").textContent = "Copy link"), 2000);
+  }
+}
+
+/**
+ * Begin to load files, with a bar that shows how far it is.
+ *
+ * @param {string[]} names  The files.
+ * @param {{file: string, bytes: number}[]} sizes  The manifest's downloads.
+ * @returns {Map<string, Promise<Uint8Array>>} Content by name.
+ */
+export function download(names, sizes) {
+  const total = sizes.filter(({ file }) => names.includes(file)).reduce((sum, { bytes }) => sum + bytes, 0);
+  let loaded = 0;
+  const read = async (name) => {
+    const answer = await fetch(name);
+    if (!answer.ok) throw new Error(`${name}: ${answer.status} ${answer.statusText}`);
+    const chunks = [];
+    for (const reader = answer.body.getReader(); ; ) {
+      const { done, value } = await reader.read();
+      if (done) break;
+      chunks.push(value);
+      loaded += value.length;
+      at("loading-bar").value = loaded / total;
+      at("loading-text").textContent =
+        loaded < total ? `Loading: ${megabytes(loaded)} of ${megabytes(total)}` : "Starting …";
+    }
+    return new Uint8Array(await new Blob(chunks).arrayBuffer());
+  };
+  return new Map(names.map((name) => [name, read(name)]));
+}

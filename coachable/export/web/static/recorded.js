@@ -1,0 +1,194 @@
+// A page that plays recorded episodes, one for each of some styles.
+
+import { at, make, shape } from "./dom.js";
+import { Page, download } from "./page.js";
+import { RecordedPanel } from "./recorded_panel.js";
+import { decode, fragmentOf, fromFragment, nearest } from "./recording.js";
+
+const AFTER_END = 1500; // [ms] before the recording begins anew
+const SLOW = 0.2; // [s] between pictures, from which on fewer details are drawn
+
+class RecordedPage extends Page {
+  async load() {
+    const { manifest } = this;
+    const count = manifest.recordings.length;
+    at("notice").textContent =
+      `Recording: this page plays ${count} recorded ${count === 1 ? "episode" : "episodes"} of the agent, one for each ` +
+      "style below, because the simulation of this domain is a Python program, which does not run in a browser.";
+    at("notice").hidden = false;
+    at("where").textContent = "Everything comes from this site.";
+    at("scale").hidden = true;
+    at("trained").hidden = true;
+    at("scene").setAttribute("aria-label", "Recording of the agent");
+    at("keys").textContent = "Keys: Space pauses, R starts again, arrows move the slider in focus.";
+    at("legend-more").hidden = !manifest.legend.length;
+    at("meanings").append(...manifest.legend.map(([colour, meaning]) => {
+      const patch = make("i", {});
+      patch.style.background = colour;
+      return make("li", {}, patch, meaning);
+    }));
+    this.loaded = new Map();
+    const { number, moment } = fromFragment(manifest, location.hash);
+    const files = download([...manifest.backdrops, manifest.recordings[number].file], manifest.downloads);
+    const decoded = [...files.values()].map((bytes) => bytes.then(decode));
+    const drawing = await import("./recorded_scene.js");
+    const recording = decoded.pop();
+    this.loaded.set(number, recording);
+    this.backdrops = await Promise.all(decoded);
+    try {
+      this.scene = new drawing.RecordedScene(at("scene"), at("labels"), manifest.viewpoint);
+    } catch (error) {
+      console.error(error);
+      this.tell("This browser cannot draw in 3-D: the numbers go on.");
+    }
+    this.panel = new RecordedPanel(at("requests"), at("others"), manifest, (name, value) => this.ask(name, value));
+    this.time = moment; // [s]
+    await this.select(number);
+  }
+
+  start() {
+    addEventListener("hashchange", () => {
+      const { number, moment } = fromFragment(this.manifest, location.hash);
+      if (moment) this.seek(moment);
+      this.select(number);
+    });
+    addEventListener("resize", () => this.panel.select(this.number));
+    at("moment-row").hidden = false;
+    at("moment").addEventListener("input", () => this.seek(Number(at("moment").value)));
+    this.listen({ again: () => this.seek(0) });
+    this.pause(matchMedia("(prefers-reduced-motion: reduce)").matches);
+    at("loading").hidden = true;
+    this.before = performance.now();
+    requestAnimationFrame(() => this.frame());
+    this.#prefetch();
+  }
+
+  /** Show the recording in which a parameter has a value, or the one with a number. */
+  ask(name, value) {
+    const { style } = this.manifest.recordings[this.wanted];
+    this.select(name === null ? value : nearest(this.manifest, { ...style, [name]: value }, name));
+  }
+
+  /** Show a recording from the present moment on. */
+  async select(number) {
+    this.wanted = number;
+    this.panel.select(number);
+    history.replaceState(null, "", fragmentOf(this.manifest, number));
+    const recording = await this.#read(number);
+    if (this.wanted !== number) return; // the visitor asked for something else meanwhile
+    this.number = number;
+    this.recording = recording;
+    this.length = (recording.frames - 1) * this.manifest.control_step;
+    at("moment").max = this.length.toFixed(1);
+    this.scene?.play(recording, this.backdrops);
+    this.shown = null;
+    this.seek(this.time);
+    at("announcement").textContent = this.panel.sentences(number);
+  }
+
+  /** Go to a moment [s]. */
+  seek(moment) {
+    this.time = Math.min(moment, this.length);
+    this.ended = null;
+    this.tell("");
+  }
+
+  get link() {
+    return new URL(fragmentOf(this.manifest, this.number, this.time), location.href).href;
+  }
+
+  frame() {
+    const now = performance.now();
+    const elapsed = (now - this.before) / 1000;
+    this.before = now;
+    if (elapsed > SLOW) this.slow = (this.slow ?? 0) + 1;
+    if (this.slow > 5) this.scene?.spare();
+    if (this.ended !== null && !this.paused && now - this.ended > AFTER_END) this.seek(0);
+    else if (!this.paused && this.ended === null) {
+      this.time = Math.min(this.time + Math.min(elapsed, 1), this.length);
+      if (this.time >= this.length) this.#end(now);
+    }
+    this.#show();
+    requestAnimationFrame(() => this.frame());
+  }
+
+  #show() {
+    const moment = this.time / this.manifest.control_step;
+    this.scene?.draw(moment);
+    const index = Math.min(Math.floor(moment + 1e-6), this.recording.frames - 1);
+    at("clock").textContent = `${this.time.toFixed(1)} s of ${this.length.toFixed(1)} s`;
+    if (document.activeElement !== at("moment") || !this.paused) at("moment").value = this.time;
+    at("moment").setAttribute("aria-valuetext", `${this.time.toFixed(1)} seconds`);
+    if (index === this.shown) return;
+    this.shown = index;
+    this.#gauges(this.recording.gauges[index]);
+    this.#map(index);
+  }
+
+  #end(now) {
+    this.ended = now;
+    const { terminated } = this.manifest.recordings[this.number];
+    this.tell(terminated ? `The agent ${this.manifest.terminated} after ${this.length.toFixed(1)} s` : "The recording ends here");
+  }
+
+  #gauges(gauges) {
+    const box = at("gauges");
+    if (box.children.length !== gauges.length) {
+      box.replaceChildren(...gauges.map(() => make("div", {}, make("b", {}), make("span", {}, make("i", {}), make("em", {})))));
+    }
+    gauges.forEach(([name, text, share, colour], i) => {
+      const [title, value] = box.children[i].children;
+      const [bar, words] = value.children;
+      if (title.textContent !== name) title.textContent = name;
+      words.textContent = text;
+      bar.hidden = share === null;
+      bar.style.width = `${100 * Math.min(Math.max(share ?? 0, 0), 1)}%`;
+      bar.style.background = colour;
+    });
+  }
+
+  #map(index) {
+    const { map, arrays } = this.recording;
+    at("map").toggleAttribute("hidden", !map);
+    if (!map) return;
+    if (at("map").dataset.of !== String(this.number)) {
+      at("map").dataset.of = this.number;
+      const points = map.outline.map((point) => point.join()).join(" ");
+      const dots = map.colours.map((fill) => shape("circle", { r: 4, fill }));
+      at("map").replaceChildren(shape("polygon", { points }), ...dots.reverse());
+    }
+    const dots = [...at("map").children].slice(1).reverse();
+    const places = arrays.get("map").subarray(2 * dots.length * index, 2 * dots.length * (index + 1));
+    dots.forEach((dot, i) => {
+      const [x, y] = places.subarray(2 * i, 2 * i + 2);
+      dot.toggleAttribute("hidden", Number.isNaN(x));
+      if (!Number.isNaN(x)) dot.setAttribute("transform", `translate(${x} ${y})`);
+    });
+  }
+
+  #read(number) {
+    if (!this.loaded.has(number)) {
+      const { file } = this.manifest.recordings[number];
+      this.loaded.set(number, fetchBytes(file).then(decode));
+    }
+    return this.loaded.get(number);
+  }
+
+  /** Load the other recordings one after the other, so that the sliders act at once. */
+  async #prefetch() {
+    for (const number of this.manifest.recordings.keys()) await this.#read(number).catch(() => this.loaded.delete(number));
+  }
+}
+
+async function fetchBytes(name) {
+  const answer = await fetch(name);
+  if (!answer.ok) throw new Error(`${name}: ${answer.status} ${answer.statusText}`);
+  return new Uint8Array(await answer.arrayBuffer());
+}
+
+/** Start the page of a manifest. */
+export async function start(manifest) {
+  const page = new RecordedPage(manifest);
+  await page.load();
+  page.start();
+}

@@ -1,0 +1,162 @@
+// An agent that acts in the browser: load everything, then step in real time.
+
+import { at } from "./dom.js";
+import { Page, download } from "./page.js";
+import { Panel } from "./panel.js";
+import { Readout } from "./readout.js";
+import { controlsOf, defaultsOf, entriesOf, fragmentOf, fromFragment, thetaOf } from "./request.js";
+import { createSimulator } from "./simulator.js";
+
+const THIRD_PARTY = "third_party";
+const MUJOCO = `${THIRD_PARTY}/@mujoco/mujoco/mujoco`;
+const ONNX = `${THIRD_PARTY}/onnxruntime-web/dist`;
+const BEHIND = 0.25; // [s] that a frame catches up at most; beyond this the agent acts slower than real time
+const AFTER_FALL = 1200; // [ms] before the next episode
+const ANNOUNCE = 4; // [s] after a request, what was measured is read out
+
+class SimulatedPage extends Page {
+  resting = "Walk on";
+
+  async load() {
+    const { manifest } = this;
+    const own = [...Object.values(manifest.models), ...Object.values(manifest.graphs)];
+    const engines = [`${MUJOCO}.wasm`, `${ONNX}/ort-wasm-simd-threaded.wasm`];
+    const files = download([...own, ...engines], manifest.downloads);
+    // Each engine starts as soon as its own files are here.
+    const physics = Promise.all([import(`./${MUJOCO}.js`), files.get(engines[0])]).then(([mujoco, wasmBinary]) =>
+      mujoco.default({ wasmBinary }),
+    );
+    const graphs = Promise.all([import(`./${ONNX}/ort.wasm.min.mjs`), files.get(engines[1])]).then(([ort, wasmBinary]) => {
+      ort.env.wasm.numThreads = 1; // more need headers that a static host does not send
+      ort.env.wasm.wasmBinary = wasmBinary;
+      return ort;
+    });
+    const [mujoco, ort, drawing, ...contents] = await Promise.all([
+      physics,
+      graphs,
+      import("./scene.js"),
+      ...own.map((name) => files.get(name)),
+    ]);
+    const parts = new Map(own.map((name, i) => [name, contents[i]]));
+    this.simulator = await createSimulator({ mujoco, ort, manifest, files: parts });
+    try {
+      this.scene = new drawing.Scene(at("scene"), this.simulator.kinematics, manifest.followed);
+    } catch (error) {
+      console.error(error);
+      this.tell("This browser cannot draw in 3-D: the numbers go on.");
+    }
+  }
+
+  start() {
+    const { manifest } = this;
+    this.entries = entriesOf(manifest);
+    this.readout = new Readout(manifest.measures);
+    this.panel = new Panel(at("requests"), at("others"), this.entries, manifest.measures, (name, value) =>
+      this.ask({ ...this.request, [name]: value }),
+    );
+    this.request = fromFragment(this.entries, location.hash, defaultsOf(this.entries));
+    this.episode = 0;
+    this.ask(this.request);
+    this.again();
+    addEventListener("hashchange", () => this.ask(fromFragment(this.entries, location.hash, this.request)));
+    this.listen({ push: () => this.push(), again: () => this.again() });
+    this.pause(matchMedia("(prefers-reduced-motion: reduce)").matches);
+    at("loading").hidden = true;
+    this.before = performance.now();
+    requestAnimationFrame(() => this.frame());
+  }
+
+  /** Take over what is asked for, from the next control step on. */
+  ask(request) {
+    this.request = request;
+    this.simulator.style = Float32Array.from(thetaOf(this.entries, request));
+    this.simulator.controls = Float64Array.from(controlsOf(this.entries, request));
+    this.readout.clear();
+    this.panel.request(request);
+    this.panel.measured(this.readout);
+    this.announceAt = this.time + ANNOUNCE;
+    history.replaceState(null, "", fragmentOf(this.entries, request));
+  }
+
+  /** Begin an episode in another of the initial states. */
+  again() {
+    this.simulator.reset(this.episode++);
+    this.readout.clear();
+    this.panel.measured(this.readout);
+    this.pending = 0;
+    this.fell = null;
+    this.tell("");
+    this.announceAt = ANNOUNCE;
+    this.scene?.restart();
+    this.scene?.draw();
+  }
+
+  push() {
+    if (this.paused) this.pause(false);
+    this.simulator.push(2 * Math.PI * Math.random());
+    this.tell(`pushed with ${this.manifest.push.force} N`, 1000);
+  }
+
+  /** Time since the episode began [s]. */
+  get time() {
+    return this.simulator.steps * this.manifest.physics.control_step;
+  }
+
+  async frame() {
+    const now = performance.now(); // the time that the browser hands over lies in the past where drawing is slow
+    const elapsed = (now - this.before) / 1000;
+    this.before = now;
+    const { control_step: step } = this.manifest.physics;
+    if (!this.paused && this.fell === null) {
+      this.pending += Math.min(elapsed, BEHIND);
+      let steps = 0;
+      for (; this.pending >= step && this.fell === null; steps++) {
+        await this.advance();
+        this.pending -= step;
+      }
+      this.#pace(elapsed, steps * step);
+      if (steps) this.panel.measured(this.readout);
+      this.scene?.draw(Math.min(this.pending / step, 1));
+      at("clock").textContent = `${this.time.toFixed(1)} s`;
+    } else {
+      if (this.fell !== null && now - this.fell > AFTER_FALL) this.again();
+      this.scene?.draw();
+    }
+    requestAnimationFrame(() => this.frame());
+  }
+
+  /** One control step. */
+  async advance() {
+    const { measured, mark, terminated } = await this.simulator.step();
+    this.readout.add(this.time, measured);
+    this.scene?.take();
+    if (mark.every(Number.isFinite)) {
+      const index = this.manifest.measures.findIndex(({ at_marks }) => at_marks);
+      this.scene?.mark(mark, index < 0 ? "" : measured[index].toFixed(2));
+    }
+    if (this.time >= this.announceAt) {
+      this.announceAt = Infinity;
+      at("announcement").textContent = this.panel.sentences(this.readout);
+    }
+    if (terminated) {
+      this.fell = performance.now();
+      const words = `The agent ${this.manifest.terminated} after ${this.time.toFixed(1)} s`;
+      this.tell(words);
+      at("announcement").textContent = words;
+    }
+  }
+
+  /** Say so if the computer is slower than real time. */
+  #pace(elapsed, simulated) {
+    this.rate = 0.95 * (this.rate ?? 1) + 0.05 * (simulated / Math.max(elapsed, 0.001));
+    if (this.rate < 0.7) this.scene?.spare();
+    at("pace").textContent = this.rate < 0.9 ? `${this.rate.toFixed(1)} × real time` : "";
+  }
+}
+
+/** Start the page of a manifest. */
+export async function start(manifest) {
+  const page = new SimulatedPage(manifest);
+  await page.load();
+  page.start();
+}

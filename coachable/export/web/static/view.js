@@ -1,0 +1,64 @@
+// What the scenes of all pages share: a camera that the visitor turns, and a picture as large as its place.
+
+/**
+ * Turn a view by dragging, and come nearer with the wheel or two fingers.
+ *
+ * @param {HTMLCanvasElement} canvas  Where the visitor drags.
+ * @param {{azimuth: number, elevation: number, distance: number}} view  Angles [rad] and distance [m] to change.
+ * @param {{near: number, far: number}} limits  Of the distance [m].
+ */
+export function orbit(canvas, view, limits) {
+  const fingers = new Map();
+  const zoom = (factor) => {
+    view.distance = Math.min(Math.max(view.distance * factor, limits.near), limits.far);
+  };
+  canvas.addEventListener("pointerdown", (event) => {
+    fingers.set(event.pointerId, [event.clientX, event.clientY]);
+    canvas.setPointerCapture(event.pointerId);
+  });
+  canvas.addEventListener("pointermove", (event) => {
+    const before = fingers.get(event.pointerId);
+    if (!before) return;
+    const now = [event.clientX, event.clientY];
+    const other = [...fingers].find(([id]) => id !== event.pointerId)?.[1];
+    if (other) {
+      const apart = ([x, y]) => Math.hypot(x - other[0], y - other[1]);
+      zoom(apart(before) / Math.max(apart(now), 1));
+    } else {
+      view.azimuth -= 0.008 * (now[0] - before[0]);
+      view.elevation = Math.min(Math.max(view.elevation + 0.006 * (now[1] - before[1]), 0.03), 1.4);
+    }
+    fingers.set(event.pointerId, now);
+  });
+  for (const end of ["pointerup", "pointercancel"]) {
+    canvas.addEventListener(end, (event) => fingers.delete(event.pointerId));
+  }
+  canvas.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    zoom(Math.exp(0.001 * event.deltaY));
+  });
+}
+
+/** Put a camera at a view of a target. */
+export function aim(camera, target, { azimuth, elevation, distance }) {
+  const flat = distance * Math.cos(elevation);
+  camera.position.set(flat * Math.cos(azimuth), flat * Math.sin(azimuth), distance * Math.sin(elevation));
+  camera.position.add(target);
+  camera.lookAt(target);
+}
+
+/** Return a function that makes the picture as large as its canvas, with fewer pixels if `isSparing` returns true. */
+export function fitting(renderer, camera, canvas, isSparing) {
+  let fitted = "";
+  return () => {
+    const { clientWidth: width, clientHeight: height } = canvas;
+    const ratio = isSparing() ? 0.5 : Math.min(devicePixelRatio, 2);
+    const wanted = [width, height, ratio].join();
+    if (fitted === wanted) return;
+    fitted = wanted;
+    renderer.setPixelRatio(ratio);
+    renderer.setSize(width, height, false);
+    camera.aspect = width / Math.max(height, 1);
+    camera.updateProjectionMatrix();
+  };
+}
