@@ -24,7 +24,7 @@ from coachable.styles import Choice, StyleSpace
 
 _PANELS_PER_ROW = 4
 MARKERS = "osD^vP*X"  # distinguishable without colour as well
-_LOOK: dict[Any, Any] = {
+_LOOK = {
     "axes.prop_cycle": cycler(color=list(map(css, LINES))),
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -48,7 +48,8 @@ def drawing(
         grid: Whether the panels have grid lines.
         **options: Further arguments of `matplotlib.pyplot.subplots`.
     """
-    with plt.rc_context(_LOOK | {"axes.grid": grid}):
+    look: dict[Any, Any] = {**_LOOK, "axes.grid": grid}
+    with plt.rc_context(look):
         figure, panels = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained", **options)
         try:
             yield panels
