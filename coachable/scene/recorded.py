@@ -181,7 +181,7 @@ def _joined(parts: Parts) -> Batch:
 
 def _constant(values: np.ndarray) -> np.ndarray:
     """Return which columns (K,) of values (F, K, n) do not change."""
-    return (np.abs(values - values[:1]) < _RIGID).all((0, 2))
+    return np.all(np.abs(values - values[:1]) < _RIGID, axis=(0, 2))
 
 
 def _same_sign(turns: np.ndarray) -> np.ndarray:
