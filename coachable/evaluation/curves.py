@@ -111,7 +111,8 @@ def draw_learning_curves(
     with drawing(out, size=(5.6, 3.8)) as ((axes,),):
         for label, runs in groups.items():
             grid, mean, (low, high) = summarise_runs(runs, x, y, smooth)
-            (line,) = axes.plot(grid, mean, label=f"{label} ({len(runs)} seeds)")
+            count = "1 seed" if len(runs) == 1 else f"{len(runs)} seeds"
+            (line,) = axes.plot(grid, mean, label=f"{label} ({count})")
             axes.fill_between(grid, low, high, color=line.get_color(), alpha=0.2, lw=0)
             last[label] = float(mean[-1])
         axes.set_xlabel(readable(x))
