@@ -19,14 +19,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from learner_workers import ACT, ALPHA, GAMMA, LAYERS, LR, OBS, STYLE, TAU, _Space
-from tensordict import TensorDict
-from torchrl.objectives import SACLoss
+from learner_workers import LAYERS, make_batch, sac_learner
 
 from coachable.evaluation.evaluate import evaluate
-from coachable.networks import make_critic, make_gaussian_actor
 from coachable.training.hardware import detect
-from coachable.training.learner import Learner
 
 RECIPE = Path(__file__).resolve().parent.parent / "recipes" / "humanoid_sac.py"
 WAYS: dict[str, dict[str, Any]] = {
@@ -70,13 +66,7 @@ def measure_learner(options: argparse.Namespace) -> None:
 
 def updates_per_second(width: int, size: int, way: str, options: argparse.Namespace) -> float:
     """Return the rate of updates, after warm-up and compilation; the device has finished when the clock stops."""
-    torch.manual_seed(0)
-    widths = (width,) * LAYERS
-    actor = make_gaussian_actor(OBS, ACT, _Space(), widths).to(options.device)
-    critics = [make_critic(OBS, ACT, _Space(), widths).to(options.device) for _ in range(2)]
-    loss = SACLoss(actor, critics, loss_function="l2", fixed_alpha=True, alpha_init=ALPHA).to(options.device)
-    loss.make_value_estimator(gamma=GAMMA)
-    learner = Learner(loss, actor_lr=LR, critic_lr=LR, tau=TAU, **WAYS[way])
+    learner = sac_learner(width, options.device, **WAYS[way])
     batch = make_batch(size).to(options.device)
     for _ in range(5):
         learner.update(batch)
@@ -88,14 +78,6 @@ def updates_per_second(width: int, size: int, way: str, options: argparse.Namesp
         updates += 20
         synchronize(options.device)
     return updates / (time.perf_counter() - start)
-
-
-def make_batch(size: int) -> TensorDict:
-    style, done = torch.rand(size, STYLE), torch.rand(size, 1) < 0.02
-    after = {"observation": torch.randn(size, OBS), "style": style, "reward": torch.randn(size, 1)}
-    after |= {"done": done, "terminated": done.clone()}
-    action = torch.tanh(torch.randn(size, ACT))
-    return TensorDict({"observation": torch.randn(size, OBS), "style": style, "action": action, "next": after}, [size])
 
 
 def synchronize(device: str) -> None:

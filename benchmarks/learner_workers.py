@@ -44,17 +44,18 @@ def flops_per_update() -> int:
     return 2 * B * macs_per_sample()
 
 
-def _batch():
+def make_batch(size=B):
+    """Return `size` random transitions, which are the same at each call."""
     import torch
     from tensordict import TensorDict
 
     gen = torch.Generator().manual_seed(0)
 
     def normal(n):
-        return torch.randn(B, n, generator=gen)
+        return torch.randn(size, n, generator=gen)
 
-    style = torch.rand(B, STYLE, generator=gen)
-    done = torch.zeros(B, 1, dtype=torch.bool)
+    style = torch.rand(size, STYLE, generator=gen)
+    done = torch.zeros(size, 1, dtype=torch.bool)
     done[::50] = True
     return TensorDict(
         {
@@ -69,7 +70,7 @@ def _batch():
                 "terminated": done,
             },
         },
-        [B],
+        [size],
     )
 
 
@@ -88,16 +89,16 @@ def _updates(learner, batch):
     return run
 
 
-def coachable(precision, fast="on", order="simultaneous"):
+def sac_learner(width=WIDTH, device="cpu", **options):
+    """Return our learner of SAC with networks of `LAYERS` x `width`; `options` are those of `Learner`."""
     import torch
     from torchrl.objectives import SACLoss
 
-    from coachable.fast import accelerate
     from coachable.networks import make_critic, make_gaussian_actor
     from coachable.training.learner import Learner
 
     torch.manual_seed(0)
-    widths = (WIDTH,) * LAYERS
+    widths = (width,) * LAYERS
     loss = SACLoss(
         make_gaussian_actor(OBS, ACT, _Space(), widths),
         [make_critic(OBS, ACT, _Space(), widths) for _ in range(2)],
@@ -106,9 +107,15 @@ def coachable(precision, fast="on", order="simultaneous"):
         alpha_init=ALPHA,
     )
     loss.make_value_estimator(gamma=GAMMA)
-    learner = Learner(loss, actor_lr=LR, critic_lr=LR, tau=TAU, precision=precision, update_order=order)
+    return Learner(loss.to(device), actor_lr=LR, critic_lr=LR, tau=TAU, **options)
+
+
+def coachable(precision, fast="on", order="simultaneous"):
+    from coachable.fast import accelerate
+
+    learner = sac_learner(precision=precision, update_order=order)
     accelerate(learner, fast)
-    return _updates(learner, _batch())
+    return _updates(learner, make_batch())
 
 
 def our_loss(name, precision="bf16"):
@@ -138,7 +145,7 @@ def our_loss(name, precision="bf16"):
     loss.make_value_estimator(gamma=GAMMA)
     learner = Learner(loss, actor_lr=LR, critic_lr=LR, tau=TAU, precision=precision, update_order="policy_first")
     accelerate(learner)
-    return _updates(learner, _batch())
+    return _updates(learner, make_batch())
 
 
 def gamepad(entropy_samples):
@@ -160,7 +167,7 @@ def gamepad(entropy_samples):
     loss.make_value_estimator(gamma=GAMMA)
     learner = Learner(loss, actor_lr=LR, critic_lr=LR, tau=TAU, precision="bf16", update_order="policy_first")
     accelerate(learner)
-    batch = _batch()
+    batch = make_batch()
     batch["action"] = GAMEPAD.spec(batch.batch_size).rand()
     return _updates(learner, batch)
 
@@ -203,7 +210,7 @@ def torchrl(network):
         torch.optim.Adam(list(loss.actor_network_params.flatten_keys().values()), lr=LR),
         torch.optim.Adam(list(loss.qvalue_network_params.flatten_keys().values()), lr=LR),
     )
-    batch = _batch()
+    batch = make_batch()
 
     def run(n):
         for _ in range(n):
@@ -271,7 +278,7 @@ def single_file(precision, network="mlp"):
         log_prob = -0.5 * noise.square() - log_std - half_log_2pi - 2 * (math.log(2) - u - F.softplus(-2 * u))
         return torch.tanh(u), log_prob.sum(-1, keepdim=True)
 
-    data = _batch()
+    data = make_batch()
     obs = torch.cat((data["observation"], data["style"]), -1)
     next_obs = torch.cat((data["next", "observation"], data["next", "style"]), -1)
     action, reward, done = data["action"], data["next", "reward"], data["next", "terminated"].float()

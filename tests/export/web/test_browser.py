@@ -16,6 +16,11 @@ pytestmark = pytest.mark.slow  # a browser without a graphics card draws for a m
 LENGTHS = (0.30, 0.475, 0.65)
 OFFSET = 0.03  # [m], by which the shipped agent misses a request at most, see docs/domains/humanoid.md
 
+SMALL = (
+    "[...document.querySelectorAll('button, .options label, input[type=range]')]"
+    ".filter(e => e.checkVisibility() && e.getBoundingClientRect().height < 44).map(e => e.id)"
+)  # controls that are too small for a finger
+
 
 class Browser:
     """Chromium with one page, driven by its DevTools protocol."""
@@ -141,11 +146,7 @@ def test_nothing_is_wider_than_the_window_and_everything_has_a_name(browser, add
         ".filter(e => !(e.labels?.length || e.textContent.trim() || e.ariaLabel)).length"
     )
     assert browser.evaluate(unnamed) == 0
-    small = (
-        "[...document.querySelectorAll('button, .options label, input[type=range]')]"
-        ".filter(e => e.checkVisibility() && e.getBoundingClientRect().height < 44).map(e => e.id)"
-    )
-    assert browser.evaluate(small) == []
+    assert browser.evaluate(SMALL) == []
     assert browser.evaluate("document.getElementById('pause').textContent") == "Walk on"  # it waits to be started
     assert seconds(browser) == 0
 
@@ -177,6 +178,7 @@ def test_recordings_follow_their_sliders_and_ask_no_other_site(browser, recorded
         )
         wait_for(lambda: seconds(browser) == 0.5, 60)
         assert browser.evaluate("document.documentElement.scrollWidth") <= 360
+        assert browser.evaluate(SMALL) == []
         sent = [e["params"]["request"]["url"] for e in browser.events if e.get("method") == "Network.requestWillBeSent"]
         assert len(sent) > 10
         assert [url for url in sent if not url.startswith((address, "data:", "blob:", "about:"))] == []
