@@ -127,7 +127,7 @@ def _parser() -> argparse.ArgumentParser:
     export = command("export", _export, "write the policy as one ONNX file, to run it without torch", _SOURCE_HELP)
     target = export.add_mutually_exclusive_group()
     target.add_argument("--out", type=Path, default=Path("policy.onnx"), help="(default: %(default)s)")
-    text = "write a page instead, on which the agent acts in the visitor's browser"
+    text = "write a page instead, on which the agent acts in the visitor's browser, or plays recordings"
     target.add_argument("--web", type=Path, metavar="FOLDER", help=text)
     text = "with --web: folder with the files of other projects, like node_modules (default: npm fetches them)"
     export.add_argument("--assets", type=Path, metavar="FOLDER", help=text)
