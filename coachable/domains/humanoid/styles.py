@@ -43,6 +43,7 @@ STRIDE_FRACTION_BOUNDS = (1 / 3, 2 / 3)
 _STRIDE_FRACTION_MARGIN = 1 / 6
 SPEED_MARGIN = 0.2  # [m/s]
 SPEED_SLACK = (WALK_SPEED[1] - WALK_SPEED[0]) / 2  # [m/s] to either side of the request that costs nothing
+_MOST_STEPS = 2.0 / CONTROL_STEP  # control steps for which a step is paid with interest
 _MOST_SPEED = 2.0  # [m/s], difference from the request beyond which the guide does not fall further
 KNEE_RANGE_DEG = (-145.0, 0.0)
 _KNEE_MARGIN_DEG = 30.0
@@ -91,6 +92,7 @@ def humanoid_style_reward(
     gait_scale: float = 1.0,
     gait_guide_scale: float = 1.5,
     timeout_penalty: float = 0.1,
+    step_discount: float = 1.0,
     speed_scale: float = 1.0,
     speed_guide_scale: float = 1.0,
 ) -> StyleReward:
@@ -112,6 +114,8 @@ def humanoid_style_reward(
         gait_scale: Scale lambda_gait of the gait.
         gait_guide_scale: Scale of the gait's guide.
         timeout_penalty: Penalty v_m that r_gait subtracts in every control step in which the step is timed out.
+        step_discount: Discount gamma of the returns. What a step earns in each of its control steps is paid at the
+            strike with the interest that makes up for the delay, so that quick steps are not preferred. 1 pays none.
         speed_scale: Scale of the speed of steps.
         speed_guide_scale: Scale of the speed's guide.
     """
@@ -130,19 +134,19 @@ def humanoid_style_reward(
         knee_margin = math.radians(_KNEE_MARGIN_DEG)
         score = score * tolerance(features[..., KNEE_MIN], knee_low, math.inf, knee_margin, "linear", 0.0)
         score = score * tolerance(features[..., KNEE_MAX], -math.inf, knee_high, knee_margin, "linear", 0.0)
-        return _per_control_step(features, score) - timeout_penalty * features[..., TIMED_OUT]
+        return _per_control_step(features, score, step_discount) - timeout_penalty * features[..., TIMED_OUT]
 
     def gait_guide(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
         error = (features[..., LENGTH] - style["step_length"]).abs()
         near = tolerance(error, margin=_NEAR_MARGIN, sigmoid="long_tail")
         # Negative values penalise a gallop, in which one foot is always behind the other.
         far = (1 - error / _FAR_MARGIN).clamp(min=-1.0)
-        return _per_control_step(features, 0.5 * (near + far))
+        return _per_control_step(features, 0.5 * (near + far), step_discount)
 
     def speed(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
         stepped = features[..., LENGTH] / features[..., DURATION].clamp(min=CONTROL_STEP)
         score = tolerance(stepped, style["speed"], style["speed"], SPEED_MARGIN, "long_tail")
-        return _per_control_step(features, score)
+        return _per_control_step(features, score, step_discount)
 
     def speed_guide(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
         difference = (features[..., SPEED] - style["speed"]).abs()
@@ -161,6 +165,14 @@ def humanoid_style_reward(
     return StyleReward(space, terms, scales=scales)
 
 
-def _per_control_step(features: Tensor, score: Tensor) -> Tensor:
-    """Return the score of a completed step times its number of control steps, which is independent of the cadence."""
-    return features[..., COMPLETED] * (features[..., DURATION] / CONTROL_STEP) * score
+def _per_control_step(features: Tensor, score: Tensor, discount: float) -> Tensor:
+    """Return what a completed step of D control steps earns if each of them earns `score`, which is paid at its end.
+
+    With a discount below 1 this is `score * sum_(k=0)^(D-1) discount^(-k)`, whose discounted value at the beginning of
+    the step is that of `score` in every control step, and D counts for two seconds at most.
+    """
+    steps = features[..., DURATION] / CONTROL_STEP
+    if discount < 1.0:
+        rate = -math.log(discount)
+        steps = ((steps.clamp(max=_MOST_STEPS) * rate).exp() - 1) / math.expm1(rate)
+    return features[..., COMPLETED] * steps * score

@@ -155,6 +155,21 @@ def test_reward_sums_the_scaled_terms_and_is_the_papers_without_guides():
     assert paper(a_step(0.45), theta).item() == pytest.approx(1.0 + 20 * 0.1, rel=1e-5)
 
 
+def test_with_a_step_discount_the_discounted_reward_does_not_depend_on_the_duration():
+    discount, theta = 0.97, SPACE.make(step_length=0.5)[None]
+    reward = humanoid_style_reward(SPACE, step_discount=discount)
+    for steps in (1, 8, 20, 80):
+        step = a_step(0.5)
+        step[0, DURATION] = steps * CONTROL_STEP
+        for name in ("gait", "gait_guide"):
+            paid = reward.terms_of(step, theta)[name].item()
+            evenly = sum(discount**k for k in range(steps))  # 1 in each control step
+            assert discount ** (steps - 1) * paid == pytest.approx(evenly, rel=1e-5)
+    longest = reward.terms_of(step, theta)["gait"].item()
+    step[0, DURATION] = 1000.0
+    assert reward.terms_of(step, theta)["gait"].item() == pytest.approx(longest), "nobody is paid for waiting"
+
+
 GAIT_SPACE = gait_style_space()
 
 

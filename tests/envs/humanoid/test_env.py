@@ -9,7 +9,7 @@ from torchrl.envs.utils import check_env_specs
 from coachable.domains.humanoid import gait_style_space, humanoid_style_reward, humanoid_style_space
 from coachable.envs.humanoid import HumanoidEnv
 from coachable.envs.humanoid.features import BEARING, SPEED
-from coachable.envs.humanoid.model import JOINTS, MOTORS, build_model
+from coachable.envs.humanoid.model import CONTROL_STEP, JOINTS, MOTORS, build_model
 from coachable.envs.humanoid.observation import OBSERVATION_GROUPS, suite_observation
 from coachable.transforms import TaskImpersonation, coachable_env
 
@@ -143,6 +143,21 @@ def test_a_fall_terminates_and_time_truncates():
     assert not current["terminated"].item()
 
 
+def test_standing_still_terminates_at_the_step_limit():
+    env, free = make_env(step_limit=0.1), make_env()
+    zeros = torch.zeros(3, 21)
+    data = env.reset()
+    limit = round(0.1 / CONTROL_STEP)
+    for step in range(1, limit + 2):
+        data = env.step(data.set("action", zeros))["next"]
+        assert data["terminated"].all().item() is (step > limit)
+    assert not data["truncated"].any()
+    data = free.reset()
+    for _ in range(limit + 1):
+        data = free.step(data.set("action", zeros))["next"]
+    assert not data["done"].any()
+
+
 def test_exploding_physics_ends_the_episode_without_a_non_finite_number():
     env = make_env()
     current = env.reset()
@@ -200,6 +215,7 @@ def test_a_diverged_policy_is_named():
     [
         {"num_envs": 0},
         {"step_max": 0.0},
+        {"step_limit": 0.0},
         {"costs": {"powr": 1.0}},
         {"costs": {"power": -1.0}},
         {"push_force": -1.0},
