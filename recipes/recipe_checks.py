@@ -57,7 +57,7 @@ RANGES: dict[str, Range] = {entry.name: entry.metadata["range"] for entry in fie
     "traps": AMOUNT,
     "cars": COUNT,
     "costs.*": NOT_NEGATIVE,
-    "step_limit": Range("(0, inf)", optional=True),
+    "start_speed": NOT_NEGATIVE,
     "push_force": NOT_NEGATIVE,
     "push_interval": POSITIVE,
     "shares.*": SHARE,

@@ -126,10 +126,15 @@ def humanoid_style_reward(
         joints, margin = slice(0, NUM_ARM_JOINTS), math.radians(margin_deg)
         return ChoiceTolerance("pose", joints, bounds[..., 0], bounds[..., 1], margin, sigmoid, value_at_margin)
 
+    def balance(features: Tensor) -> Tensor:
+        """Return 1 where both feet contribute to the stride, falling to 0 where one of them does not."""
+        return tolerance(
+            features[..., STRIDE_FRACTION], *STRIDE_FRACTION_BOUNDS, _STRIDE_FRACTION_MARGIN, "linear", 0.0
+        )
+
     def gait(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
-        length, fraction, target = features[..., LENGTH], features[..., STRIDE_FRACTION], style["step_length"]
-        score = tolerance(length, target, target, LENGTH_MARGIN, "long_tail")
-        score = score * tolerance(fraction, *STRIDE_FRACTION_BOUNDS, _STRIDE_FRACTION_MARGIN, "linear", 0.0)
+        length, target = features[..., LENGTH], style["step_length"]
+        score = tolerance(length, target, target, LENGTH_MARGIN, "long_tail") * balance(features)
         knee_low, knee_high = (math.radians(angle) for angle in KNEE_RANGE_DEG)
         knee_margin = math.radians(_KNEE_MARGIN_DEG)
         score = score * tolerance(features[..., KNEE_MIN], knee_low, math.inf, knee_margin, "linear", 0.0)
@@ -138,7 +143,8 @@ def humanoid_style_reward(
 
     def gait_guide(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
         error = (features[..., LENGTH] - style["step_length"]).abs()
-        near = tolerance(error, margin=_NEAR_MARGIN, sigmoid="long_tail")
+        # Without the balance a long step and a short one in turn would earn more than two of medium length.
+        near = tolerance(error, margin=_NEAR_MARGIN, sigmoid="long_tail") * balance(features)
         # Negative values penalise a gallop, in which one foot is always behind the other.
         far = (1 - error / _FAR_MARGIN).clamp(min=-1.0)
         return _per_control_step(features, 0.5 * (near + far), step_discount)

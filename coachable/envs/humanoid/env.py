@@ -47,8 +47,8 @@ class HumanoidEnv(EnvBase):
     """DeepMind Control humanoid on an infinite plane, observed for walking with a style.
 
     The env knows no style: it emits `task_reward` and the raw `style_features` from which `StyleReward` computes the
-    style's part. Episodes start upright with random arms and end when the head falls below 1.1 m, or no foot has struck
-    for `step_limit` (terminated), or after `episode_steps` (truncated).
+    style's part. Episodes start upright with random arms and end when the head falls below 1.1 m (terminated) or
+    after `episode_steps` (truncated).
 
     Args:
         num_envs: N, stepped together.
@@ -56,7 +56,8 @@ class HumanoidEnv(EnvBase):
         seed: seed of the initial states.
         episode_steps: control steps (25 ms) after which an episode is truncated.
         step_max: time without a foot strike after which a step times out [s].
-        step_limit: time without a foot strike after which the episode ends like a fall [s]; none by default.
+        start_speed: largest speed along the course at the start of an episode [m/s]; it is drawn uniformly from 0.
+        end_at_timeout: whether a step that times out ends the episode like a fall, so that standing still does not pay.
         costs: weights of `walk_costs`, which are taken off the task reward; none by default, as in the paper.
         push_force: largest force of random pushes of the torso [N], in any horizontal direction for 0.2 s; 0 for none.
         push_interval: mean time between pushes [s].
@@ -81,7 +82,8 @@ class HumanoidEnv(EnvBase):
         seed: int | None = None,
         episode_steps: int = EPISODE_STEPS,
         step_max: float = STEP_MAX,
-        step_limit: float | None = None,
+        start_speed: float = 0.0,
+        end_at_timeout: bool = False,
         costs: Mapping[str, float] | None = None,
         push_force: float = 0.0,
         push_interval: float = 2.0,
@@ -92,9 +94,8 @@ class HumanoidEnv(EnvBase):
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
         if step_max <= 0:
             raise ValueError(f"step_max must be positive seconds, got {step_max}")
-        if step_limit is not None:
-            POSITIVE.check("step_limit", step_limit)
         COUNT.check("episode_steps", episode_steps)
+        NOT_NEGATIVE.check("start_speed", start_speed)
         NOT_NEGATIVE.check("push_force", push_force)
         POSITIVE.check("push_interval", push_interval)
         if unknown := set(costs or {}) - set(COSTS):
@@ -106,7 +107,7 @@ class HumanoidEnv(EnvBase):
             num_threads = min(len(os.sched_getaffinity(0)), num_envs)
         self.num_envs = num_envs
         self.episode_steps = episode_steps
-        self.step_limit = np.inf if step_limit is None else step_limit
+        self.start_speed, self.end_at_timeout = start_speed, end_at_timeout
         # One thread is the calling one: no pool to wake.
         self.simulation = HumanoidSimulation(num_envs, 0 if num_threads == 1 else num_threads)
         self.gait = GaitTracker.create(num_envs, step_max)
@@ -207,8 +208,10 @@ class HumanoidEnv(EnvBase):
             costs = walk_costs(power, forces, kinematics.foot_clearance, report)
             task_reward = task_reward - sum(weight * costs[name] for name, weight in self.costs.items())
         arms = self.simulation.positions[:, self.simulation.model.arm_positions]
-        stalled = self.gait.clock * CONTROL_STEP > self.step_limit
-        terminated = torch.from_numpy((kinematics.head_height < FALL_HEIGHT) | stalled | diverged)[:, None]
+        ended = (kinematics.head_height < FALL_HEIGHT) | diverged
+        if self.end_at_timeout:
+            ended |= report.timed_out
+        terminated = torch.from_numpy(ended)[:, None]
         truncated = torch.from_numpy(self.steps >= self.episode_steps)[:, None] & ~terminated
         reward = torch.from_numpy(task_reward.astype(np.float32))[:, None]
         self._observation = self._observe(kinematics, np.arange(self.num_envs))
@@ -278,6 +281,10 @@ class HumanoidEnv(EnvBase):
         self.simulation.state[rows, 0] = 0.0
         self.simulation.state[rows, 1 : 1 + NUM_POSITIONS] = positions
         self.simulation.state[rows, 1 + NUM_POSITIONS :] = 0.0
+        if self.start_speed:
+            speed = self._random.uniform(0.0, self.start_speed, len(rows))
+            forward = np.stack([np.cos(self.course[rows]), np.sin(self.course[rows])], axis=1)
+            self.simulation.state[rows, 1 + NUM_POSITIONS : 3 + NUM_POSITIONS] = speed[:, None] * forward
         self.steps[rows] = 0
         self._push_left[rows] = 0
         kinematics = self.simulation.kinematics(rows)

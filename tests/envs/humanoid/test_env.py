@@ -114,6 +114,17 @@ def test_episodes_start_upright_with_the_feet_on_the_ground_and_random_arms():
     assert set(env.gait.expected) == {0, 1}
 
 
+def test_episodes_start_with_a_speed_along_the_course():
+    env = make_env(num_envs=200, start_speed=0.8)
+    env.steer(np.pi / 2)
+    env.reset()
+    speeds = env.simulation.velocities[:, :3]
+    assert np.allclose(speeds[:, [0, 2]], 0, atol=1e-12)
+    assert speeds[:, 1].min() >= 0 and speeds[:, 1].max() <= 0.8
+    assert speeds[:, 1].mean() == pytest.approx(0.4, abs=5 * 0.8 / np.sqrt(12 * 200))
+    assert not env.simulation.velocities[:, 3:].any()
+
+
 def test_no_arm_touches_the_body_at_the_start():
     env = make_env(num_envs=1)
     state = env.simulation.state[0].copy()
@@ -143,8 +154,8 @@ def test_a_fall_terminates_and_time_truncates():
     assert not current["terminated"].item()
 
 
-def test_standing_still_terminates_at_the_step_limit():
-    env, free = make_env(step_limit=0.1), make_env()
+def test_standing_still_terminates_where_a_timeout_ends_the_episode():
+    env, free = make_env(step_max=0.1, end_at_timeout=True), make_env(step_max=0.1)
     zeros = torch.zeros(3, 21)
     data = env.reset()
     limit = round(0.1 / CONTROL_STEP)
@@ -215,7 +226,7 @@ def test_a_diverged_policy_is_named():
     [
         {"num_envs": 0},
         {"step_max": 0.0},
-        {"step_limit": 0.0},
+        {"start_speed": -0.1},
         {"costs": {"powr": 1.0}},
         {"costs": {"power": -1.0}},
         {"push_force": -1.0},
