@@ -69,7 +69,7 @@ def test_the_paper_preset_is_the_papers():
 
 def test_the_configuration_lists_what_its_targets_take():
     """Every key is an argument of what it configures, and the style rewards' values are the library's defaults."""
-    config = _compose("preset=cpu")
+    config = _compose("preset=smoke")
     defaults = {
         name: parameter.default
         for name, parameter in inspect.signature(humanoid_style_reward).parameters.items()

@@ -132,6 +132,9 @@ def test_uneven_strides_and_bent_or_overstretched_knees_cost():
     assert terms(a_step(0.5, fraction=2 / 3))["gait"] == pytest.approx(20)
     assert terms(a_step(0.5, fraction=3 / 4))["gait"] == pytest.approx(10, rel=1e-4)
     assert terms(a_step(0.5, fraction=5 / 6))["gait"] == pytest.approx(0, abs=1e-5)
+    assert terms(a_step(0.5, fraction=3 / 4))["gait_guide"] == pytest.approx(15, rel=1e-4)
+    long, short = terms(a_step(0.5, fraction=1.0)), terms(a_step(0.0, fraction=0.0))
+    assert long["gait_guide"] + short["gait_guide"] < 2 * terms(a_step(0.25))["gait_guide"]
     assert terms(a_step(0.5, knee_min=math.radians(-160)))["gait"] == pytest.approx(10, rel=1e-4)
     assert terms(a_step(0.5, knee_max=math.radians(10)))["gait"] == pytest.approx(40 / 3, rel=1e-4)
 
