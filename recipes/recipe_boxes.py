@@ -169,12 +169,12 @@ def make_replay(run: Run, env: EnvBase, *transforms: Transform) -> ReplayBuffer:
 
     Args:
         run: The training.
-        env: One environment; its scenarios are the tables of `replay=multi_tables`.
+        env: One environment; its `scenario_names` are the tables of `replay=multi_tables`, or else there is one table.
         *transforms: Transforms of sampled batches, such as `MirrorSymmetry` and `TaskImpersonation`.
 
     Raises:
-        ValueError: If batches are too small for the tables, or the domain has no mirror images or scenarios although
-            the settings need them.
+        ValueError: If batches are too small for the tables, or the domain has no mirror images although the settings
+            need them.
     """
     settings = run.settings
     if settings.mirror and not any(isinstance(transform, MirrorSymmetry) for transform in transforms):
@@ -182,10 +182,9 @@ def make_replay(run: Run, env: EnvBase, *transforms: Transform) -> ReplayBuffer:
     relabelled_sums = settings.impersonation.n and settings.n_steps > 1
     options: dict[str, Any] = {"discounted_keys": [("next", STYLE_FEATURES)]} if relabelled_sums else {}
     if _has_scenario_tables(settings):
-        scenarios = getattr(simulation_env(env), "scenario_names", None)
-        if scenarios is None:
-            raise ValueError(f"replay=multi_tables: {settings.domain} has no scenarios; expected replay=uniform")
-        options["scenarios"] = scenarios
+        options["scenarios"] = getattr(simulation_env(env), "scenario_names", ())
+        if not options["scenarios"]:
+            print(f"replay=multi_tables: {settings.domain} has no scenarios, so that there is one table")
     replay = make(settings.replay)(**options)
     tables = len(replay.names) if isinstance(replay, EventTableBuffer) else 0
     if settings.train.batch_size < tables:
