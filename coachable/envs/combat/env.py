@@ -40,6 +40,7 @@ from coachable.envs.combat.traits import (
 from coachable.envs.combat.traps import TrapNumbers
 from coachable.finite import require_finite_action
 from coachable.keys import EVENTS, SCENARIO, STYLE_FEATURES, TASK_REWARD
+from coachable.ranges import AMOUNT, COUNT, Range
 
 COMPONENTS_KEY = "components"
 """Key of the raw components of a step, `(N, 44)`, for evaluation; see `rewards.COMPONENTS`."""
@@ -100,14 +101,10 @@ class CombatEnv(EnvBase):
         components: bool = False,
         device: torch.device | str = "cpu",
     ) -> None:
-        for name, value, low, high in (
-            ("num_envs", num_envs, 1, None),
-            ("num_enemies", num_enemies, 1, 2),
-            ("episode_steps", episode_steps, 1, None),
-            ("traps", traps, 0, None),
-        ):
-            if value < low or (high is not None and value > high):
-                raise ValueError(f"{name} must be at least {low}{f' and at most {high}' if high else ''}, got {value}")
+        COUNT.check("num_envs", num_envs)
+        Range("[1, 2]", whole=True).check("num_enemies", num_enemies)
+        COUNT.check("episode_steps", episode_steps)
+        AMOUNT.check("traps", traps)
         if assist not in c.ASSIST:
             raise ValueError(f"assist is {assist!r}: expected one of {list(c.ASSIST)}")
         super().__init__(device=device, batch_size=torch.Size((num_envs,)))

@@ -177,8 +177,8 @@ def test_scenarios_can_be_assigned():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"num_envs": 0}, "num_envs must be at least 1"),
-        ({"num_enemies": 3}, "num_enemies must be at least 1 and at most 2"),
+        ({"num_envs": 0}, "num_envs is 0: expected a whole number of at least 1"),
+        ({"num_enemies": 3}, "num_enemies is 3: expected a whole number in"),
         ({"machines": ["Scrounger", "Toaster"]}, "machines are .*Toaster"),
         ({"machines": []}, "expected a list of at least one"),
         ({"sites": ["Moon"]}, "sites are .*Moon"),
