@@ -24,14 +24,14 @@ def within(expected: Range) -> Any:
     return field(metadata={"range": expected})
 
 
-def ranges(**arguments: Range | list[Range]) -> dict[str, Any]:
-    """Return metadata of a field for the arguments of a target, also nested ones.
+def arguments(**ranges: Range | list[Range]) -> Any:
+    """Return a dataclass field for a target.
 
     Args:
-        **arguments: Range by the name of the argument, or in a list the range of each of several numbers. A number with
-            the name of one of `Settings` has its range; others must be finite, and the target checks them.
+        **ranges: Range by the name of an argument, also a nested one; in a list the range of each of several numbers. A
+            number with the name of one of `Settings` has its range. Others must be finite; the target checks them.
     """
-    return {"ranges": arguments}
+    return field(metadata={"ranges": ranges})
 
 
 @dataclass
@@ -53,8 +53,8 @@ class Support:
 class Network:
     """Actor and critics."""
 
-    actor: Target = field(metadata=ranges(widths=[COUNT], categorical=[COUNT], axes=AMOUNT, head_gain=NOT_NEGATIVE))
-    critic: Target = field(metadata=ranges(widths=[COUNT], num_outputs=COUNT, num_atoms=ATOMS))
+    actor: Target = arguments(widths=[COUNT], categorical=[COUNT], axes=AMOUNT, head_gain=NOT_NEGATIVE)
+    critic: Target = arguments(widths=[COUNT], num_outputs=COUNT, num_atoms=ATOMS)
     num_critics: int = within(COUNT)
 
 
@@ -132,13 +132,11 @@ class Settings:
     seed: int = within(Range("[0, 4e9]", whole=True))
     stages: list[dict[str, Any]]
     stage: str | None
-    env: Target = field(
-        metadata=ranges(
-            num_envs=COUNT, episode_steps=COUNT, cars=COUNT, seconds=POSITIVE, shares=[SHARE], weights=[NOT_NEGATIVE]
-        )
+    env: Target = arguments(
+        num_envs=COUNT, episode_steps=COUNT, cars=COUNT, seconds=POSITIVE, shares=[SHARE], weights=[NOT_NEGATIVE]
     )
-    style_reward: dict[str, Any] = field(metadata=ranges(**{"margin": POSITIVE, "*": NOT_NEGATIVE}))
-    sampler: Target = field(metadata=ranges(share=SHARE, neutral=SHARE, independent=SHARE, positive=SHARE, full=SHARE))
+    style_reward: dict[str, Any] = arguments(**{"margin": POSITIVE, "*": NOT_NEGATIVE})
+    sampler: Target = arguments(share=SHARE, neutral=SHARE, independent=SHARE, positive=SHARE, full=SHARE)
     gamma: float = within(SHARE)
     alpha: float = within(POSITIVE)
     entropy_samples: int = within(COUNT)
@@ -153,18 +151,16 @@ class Settings:
     impersonation: Impersonation
     learner: Learner
     network: Network
-    loss: Target = field(metadata=ranges(alpha_init=POSITIVE, num_atoms=ATOMS, sigma_ratio=POSITIVE))
-    replay: Target = field(metadata=ranges(table_capacities=[COUNT], table_proportions=[SHARE], capacity=COUNT))
-    collector: Target = field(
-        metadata=ranges(
-            num_collectors=COUNT,
-            steps_per_batch=COUNT,
-            cpus_per_worker=POSITIVE,
-            weights_every=COUNT,
-            queue_size=COUNT,
-            worker_throttle=Range("(0, inf)", optional=True),
-            patience=POSITIVE,
-        )
+    loss: Target = arguments(alpha_init=POSITIVE, num_quantiles=COUNT, num_atoms=ATOMS, sigma_ratio=POSITIVE)
+    replay: Target = arguments(table_capacities=[COUNT], table_proportions=[SHARE], capacity=COUNT)
+    collector: Target = arguments(
+        num_collectors=COUNT,
+        steps_per_batch=COUNT,
+        cpus_per_worker=POSITIVE,
+        weights_every=COUNT,
+        queue_size=COUNT,
+        worker_throttle=Range("(0, inf)", optional=True),
+        patience=POSITIVE,
     )
     train: Loop
     init_random_frames: int = within(AMOUNT)

@@ -24,7 +24,6 @@ OF_TARGETS = {  # the function or class checks them itself, before anything is w
     "env.num_enemies=3": r"num_enemies is 3: expected a whole number in \[1, 2\]",
     "env.traps=1.5": r"traps is 1.5: expected a whole number of at least 0",
     "loss.kappa=-1": r"kappa is -1: expected a number of at least 0",
-    "loss.num_quantiles=0": r"num_outputs=0: expected a whole number of at least 1",
     "+network.actor.dropout=1": r"dropout is 1: expected a number in \[0, 1\)",
 }
 
