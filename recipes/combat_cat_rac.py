@@ -62,7 +62,7 @@ def build(config: dict[str, Any]) -> Trainer:
 
     # Collector, evaluation, what checkpoints say about the agent, and the training loop
     collector = boxes.make_collector(run, make_env, actor)
-    evaluate = boxes.make_evaluation(run, partial(make_env, components=True), actor)  # the style is measured on them
+    evaluate = boxes.make_evaluation(run, partial(make_env, components=True), actor)  # from which the style is measured
     describe = boxes.make_description(run, space, actor, loss, network)
     trainer = boxes.make_trainer(run, example, collector, replay, learner, evaluate, describe, style_reward)
     boxes.close_example(run, example)
