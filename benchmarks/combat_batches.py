@@ -18,8 +18,8 @@ from tensordict import TensorDict
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "recipes"))
 
-import recipe_boxes as boxes
 from recipe_config import compose_config
+from recipe_target import Target
 
 from coachable.domains.combat import combat_style_reward, combat_style_space
 from coachable.envs.combat.bots import BOTS
@@ -37,7 +37,7 @@ KINDS = ("neutral", "one weight", "several weights")
 def styles_of(config: dict[str, Any]) -> tuple[StyleSpace, torch.Tensor]:
     """The space with the training's distribution, and draws from it (DRAWS, m)."""
     space = combat_style_space(config["env"]["styles"], config["env"]["reward_scale"])
-    space = space.with_sampler(boxes.make(config["sampler"])(space))
+    space = space.with_sampler(Target(config["sampler"]).build(space))
     return space, space.sample((DRAWS,), torch.Generator().manual_seed(0))
 
 

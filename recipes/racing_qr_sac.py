@@ -25,46 +25,49 @@ from coachable.transforms import CoachableEnv, StyleRewardTransform, StyleSample
 
 
 def build(config: dict[str, Any]) -> Trainer:
-    """Make the training from its parts, see recipe_boxes.py."""
+    """Make the training, one part after the other; recipe_boxes.py makes the parts that are alike in all recipes."""
     run = boxes.start_run(config)
     cfg = run.settings
 
     # Styles and their reward
-    space, family_reward = family_style(config["family"])
-    space = space.with_sampler(boxes.make(cfg.sampler)(space))
+    space, family_reward = family_style(cfg.family)
+    space = space.with_sampler(cfg.sampler.build(space))
     style_reward = boxes.make_style_reward(run, family_reward, space)
 
     # Environment: styles are drawn at reset, the reward is the sum of the task's and the style's
     def make_env(seed: int, **settings: Any) -> EnvBase:
-        race = boxes.make(cfg.env)(seed=seed, **settings)
+        race = cfg.env.build(seed=seed, **settings)
         env = CoachableEnv(race, Compose(StyleSampler(space), StyleRewardTransform(style_reward), EpisodeSums()))
         env.set_seed(seed)
         return env
 
-    example = make_env(cfg.seed, num_envs=1)
+    example = make_env(cfg.seed, num_envs=1)  # shows the sizes of observations and actions
 
-    # Actor, critics and loss
-    network = boxes.network_settings(run, example)
-    actor = boxes.make(network["actor"])(space=space).to(run.device)
-    critics = [boxes.make(network["critic"])(space=space).to(run.device) for _ in range(cfg.network.num_critics)]
+    # Actor, critics, their loss, and the learner that minimises it
+    network = boxes.fitted_network(run, example)
+    actor = network.actor.build(space=space).to(run.device)
+    critics = [network.critic.build(space=space).to(run.device) for _ in range(network.num_critics)]
     loss = boxes.make_loss(run, actor, critics, example)
     if cfg.init_from:
         initialise_from(cfg.init_from, actor, loss, space, cfg.init_new_observations)
-    learner = boxes.make(run.config["learner"])(loss)
-    accelerate(learner, cfg.fast)
+    learner = cfg.learner.build(loss)
+    accelerate(learner, cfg.fast)  # same results up to rounding
 
-    # Replay buffer: sums over n steps, and relabelling with other styles
-    relabelled = []
+    # Replay buffer, which sums rewards over n steps; its samples are relabelled with other styles
+    replay = boxes.make_replay(run, example)
     if cfg.impersonation.n:
-        relabelled.append(TaskImpersonation(style_reward, n=cfg.impersonation.n, seed=cfg.seed))
-    replay = boxes.make_replay(run, example, *relabelled)
-    boxes.open_run_dir(run, example, replay)
+        replay.append_transform(TaskImpersonation(style_reward, n=cfg.impersonation.n, seed=cfg.seed))
+    boxes.open_run_dir(run, example, replay)  # files are written from here on
 
-    # Collector, evaluation and training loop
+    # Collector, evaluation, what checkpoints say about the agent, and the training loop
     collector = boxes.make_collector(run, make_env, actor)
     evaluate = boxes.make_evaluation(run, make_env, actor)
     describe = boxes.make_description(run, space, actor, loss, network)
-    return boxes.make_trainer(run, example, collector, replay, learner, evaluate, describe, style_reward)
+    trainer = boxes.make_trainer(run, example, collector, replay, learner, evaluate, describe, style_reward)
+    boxes.close_example(run, example)
+    if cfg.resume:
+        trainer.resume(cfg.resume)
+    return trainer
 
 
 if __name__ == "__main__":

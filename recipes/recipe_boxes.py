@@ -1,23 +1,23 @@
-"""Parts of a training that all recipes share; recipes/humanoid_sac.py shows how they are combined."""
+"""Parts of a training that are alike in all recipes; each function makes one part for a recipe's composition."""
 
+import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
-from inspect import Parameter, isclass, signature
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
 import torch
-from configs.schema import Settings
-from hydra.utils import instantiate
-from recipe_checks import choices, typed_settings
-from recipe_config import save_config
+from configs.schema import Network, Settings
+from recipe_checks import typed_settings
+from recipe_target import Target
 from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.collectors import BaseCollector
 from torchrl.data import ReplayBuffer
-from torchrl.envs import EnvBase, Transform
+from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 
 from coachable.domain import domain_names, load_domain
@@ -34,7 +34,6 @@ from coachable.training.logging import MetricsLog, Progress, wandb_logger
 from coachable.training.rng import seed_everything
 from coachable.training.trainer import Trainer, replay_keys
 from coachable.training.weights import agent_state
-from coachable.transforms import MirrorSymmetry
 
 
 @dataclass(frozen=True)
@@ -43,17 +42,15 @@ class Run:
 
     Attributes:
         config: The configuration as plain containers, as it is saved in checkpoints.
-        settings: The same, typed.
+        settings: The same, typed; `FamilySettings` in recipes with families of styles.
         device: Device of the networks.
         simulator_threads: Threads of one simulator.
-        learner_threads: Threads of the learner.
     """
 
     config: dict[str, Any]
     settings: Settings
     device: torch.device
     simulator_threads: int
-    learner_threads: int
 
 
 def start_run(config: dict[str, Any]) -> Run:
@@ -66,49 +63,18 @@ def start_run(config: dict[str, Any]) -> Run:
         ValueError: If settings are of a wrong type or contradict each other.
     """
     settings = typed_settings(config)
-    if "events" in settings.replay and settings.replay["events"] is None:
+    if settings.replay.get("events", {}) is None:
         raise ValueError(f"replay=event_tables: {settings.domain} names no events; expected replay=uniform")
-    threads = share_threads(**config["threads"])
+    threads = share_threads(settings.threads.simulator, settings.threads.learner)
     # Rounding depends on the learner's number of threads, so that a resumed training has to use the same number.
-    config = {**config, "threads": {**config["threads"], "learner": threads.learner}}
+    settings.threads.learner = threads.learner
     torch.set_num_threads(threads.learner)
     seed_everything(settings.seed)
-    device = pick_device(settings.device)
-    per_simulator = max(1, threads.simulator // settings.collector["num_collectors"])
+    per_simulator = max(1, threads.simulator // settings.collector.num_collectors)
     if "cpus_per_worker" in settings.collector:  # of machines that may be others than this one
-        per_simulator = max(1, int(settings.collector["cpus_per_worker"]))
-    return Run(config, typed_settings(config), device, per_simulator, threads.learner)
-
-
-def make(target: dict[str, Any]) -> Callable[..., Any]:
-    """Return the function or class that `_target_` names, with the arguments that the YAML gives.
-
-    Raises:
-        ValueError: If it takes no such argument, or an argument is `true` or `false` and the value is not.
-    """
-    made = instantiate(target, _convert_="all", _partial_=True)
-    known = _arguments_of(made.func)
-    for name, value in made.keywords.items():
-        if name not in known and not any(argument.kind is Parameter.VAR_KEYWORD for argument in known.values()):
-            valid = [other for other in known if other not in ("self", "args", "space")]
-            raise ValueError(f"{target['_target_']} takes no {name!r}.{choices(name, valid)}")
-        if name in known and known[name].annotation in (bool, "bool") and not isinstance(value, bool):
-            raise ValueError(f"{name}={value} of {target['_target_']}: expected true or false")
-    return made
-
-
-def _arguments_of(function: Callable[..., Any]) -> dict[str, Parameter]:
-    """Return the arguments of a function, and for a class or its factory also those passed on by `**options`."""
-    kind = function if isclass(function) else getattr(function, "__self__", None)
-    known = {} if isclass(function) else dict(signature(function).parameters)
-    for base in kind.__mro__ if isclass(kind) else ():
-        options = [name for name, argument in known.items() if argument.kind is Parameter.VAR_KEYWORD]
-        if known and not options:
-            break
-        for name in options:
-            del known[name]
-        known = {**signature(base.__init__).parameters, **known}
-    return known
+        per_simulator = max(1, int(settings.collector.cpus_per_worker))
+    config = {**config, "threads": asdict(settings.threads)}
+    return Run(config, settings, pick_device(settings.device), per_simulator)
 
 
 def make_style_reward(run: Run, factory: Callable[..., StyleReward], space: StyleSpace) -> StyleReward:
@@ -132,15 +98,14 @@ def make_style_reward(run: Run, factory: Callable[..., StyleReward], space: Styl
     return style_reward
 
 
-def network_settings(run: Run, env: EnvBase) -> dict[str, dict[str, Any]]:
-    """Return the arguments of actor and critic, with the widths of the environment's observations and actions."""
+def fitted_network(run: Run, env: EnvBase) -> Network:
+    """Return the settings of actor and critics, with the widths of the environment's observations and actions."""
     network = run.settings.network
-    widths = {"obs_dim": env.observation_spec["observation"].shape[-1]}
-    filled = {"actor": {**network.actor, **widths}, "critic": {**network.critic, **widths}}
-    for part in filled.values():
-        if "heads" not in part:  # the heads of a mixed action define its width
-            part["action_dim"] = env.action_spec.shape[-1]
-    return filled
+    widths = {"obs_dim": env.observation_spec["observation"].shape[-1], "action_dim": env.action_spec.shape[-1]}
+    actor, critic = Target(network.actor, **widths), Target(network.critic, **widths)
+    if "heads" in actor:  # they define the width of a mixed action
+        del actor["action_dim"]
+    return replace(network, actor=actor, critic=critic)
 
 
 def make_loss(run: Run, actor: nn.Module, critics: list[nn.Module], env: EnvBase) -> LossModule:
@@ -157,54 +122,51 @@ def make_loss(run: Run, actor: nn.Module, critics: list[nn.Module], env: EnvBase
     """
     settings = run.settings
     buttons = settings.network.actor.get("heads", {}).get("categorical")
-    if settings.loss["_target_"].endswith(".SACLoss") and buttons:
+    if settings.loss._target_.endswith(".SACLoss") and buttons:
         raise ValueError(f"loss=sac serves continuous actions only, {settings.domain} has buttons: expected cat_rac")
-    loss = make(settings.loss)(actor, critics, action_spec=env.action_spec, num_qvalue_nets=len(critics))
+    loss = settings.loss.build(actor, critics, action_spec=env.action_spec, num_qvalue_nets=len(critics))
     loss.make_value_estimator(gamma=settings.gamma)
     return loss.to(run.device)
 
 
-def make_replay(run: Run, env: EnvBase, *transforms: Transform) -> ReplayBuffer:
+def make_replay(run: Run, env: EnvBase, *, mirrored: bool = False) -> ReplayBuffer:
     """Make the replay buffer, which sums rewards over `n_steps` and allocates memory at the first write.
 
     Args:
         run: The training.
-        env: One environment; its scenarios are the tables of `replay=multi_tables`.
-        *transforms: Transforms of sampled batches, such as `MirrorSymmetry` and `TaskImpersonation`.
+        env: One environment; its `scenario_names` are the tables of `replay=multi_tables`, or else there is one table.
+        mirrored: Whether the domain has mirror images, as `mirror` needs them.
 
     Raises:
-        ValueError: If batches are too small for the tables, or the domain has no mirror images or scenarios although
-            the settings need them.
+        ValueError: If batches are too small for the tables, or the domain has no mirror images although the settings
+            need them.
     """
     settings = run.settings
-    if settings.mirror and not any(isinstance(transform, MirrorSymmetry) for transform in transforms):
+    if settings.mirror and not mirrored:
         raise ValueError(f"mirror={settings.mirror}: {settings.domain} has no mirror images, expected mirror=0")
     relabelled_sums = settings.impersonation.n and settings.n_steps > 1
     options: dict[str, Any] = {"discounted_keys": [("next", STYLE_FEATURES)]} if relabelled_sums else {}
     if _has_scenario_tables(settings):
-        scenarios = getattr(simulation_env(env), "scenario_names", None)
-        if scenarios is None:
-            raise ValueError(f"replay=multi_tables: {settings.domain} has no scenarios; expected replay=uniform")
-        options["scenarios"] = scenarios
-    replay = make(settings.replay)(**options)
+        options["scenarios"] = getattr(simulation_env(env), "scenario_names", ())
+        if not options["scenarios"]:
+            print(f"replay=multi_tables: {settings.domain} has no scenarios, so that there is one table")
+    replay = settings.replay.build(**options)
     tables = len(replay.names) if isinstance(replay, EventTableBuffer) else 0
     if settings.train.batch_size < tables:
         raise ValueError(
             f"train.batch_size={settings.train.batch_size}: every batch holds at least one transition of each of "
             f"the {tables} tables ({', '.join(replay.names)})"
         )
-    for transform in transforms:
-        replay.append_transform(transform)
     return replay
 
 
 def make_collector(run: Run, make_env: Callable[..., EnvBase], actor: nn.Module) -> BaseCollector | AsyncCollector:
     """Make the collector of the group `collector`: in this process, in several processes, or on several hosts."""
     settings = run.settings
-    return make(settings.collector)(
+    return settings.collector.build(
         make_env,
         actor,
-        frames_per_batch=settings.env["num_envs"] * settings.collector["num_collectors"],
+        frames_per_batch=settings.env.num_envs * settings.collector.num_collectors,
         init_random_frames=settings.init_random_frames,
         seed=settings.seed,
         policy_device=run.device,
@@ -230,7 +192,7 @@ def make_evaluation(run: Run, make_env: Callable[..., EnvBase], actor: nn.Module
 
 
 def make_description(
-    run: Run, space: StyleSpace, actor: TensorDictModuleBase, loss: LossModule, network: dict[str, dict[str, Any]]
+    run: Run, space: StyleSpace, actor: TensorDictModuleBase, loss: LossModule, network: Network
 ) -> Callable[[], dict[str, Any]]:
     """Return a function that returns the agent's description for checkpoints; see `agent_state`."""
     return partial(
@@ -239,7 +201,7 @@ def make_description(
         space=space,
         actor=actor,
         loss_module=loss,
-        network=network,
+        network={"actor": dict(network.actor), "critic": dict(network.critic)},
         config=run.config,
     )
 
@@ -263,17 +225,17 @@ def open_run_dir(run: Run, env: EnvBase, replay: ReplayBuffer) -> None:
     if settings.checkpoint.replay:  # two at a time: the old one is removed when the new one is complete
         size = replay_bytes(env, stored_keys(run, env, replay), settings.replay_capacity)
         check_writable(run_dir, required_bytes=2 * size)
-    save_config(run.config, run_dir)
+    (run_dir / "config.json").write_text(json.dumps(run.config, indent=1) + "\n", encoding="utf-8")
 
 
 def stored_keys(run: Run, env: EnvBase, replay: ReplayBuffer) -> tuple[NestedKey, ...]:
     """Return the entries of a transition that the replay buffer stores."""
-    tables = isinstance(replay, EventTableBuffer)
-    return replay_keys(env, tables=tables, scenarios=_has_scenario_tables(run.settings))
+    scenarios = _has_scenario_tables(run.settings)
+    return replay_keys(env, tables=isinstance(replay, EventTableBuffer), scenarios=scenarios)
 
 
 def _has_scenario_tables(settings: Settings) -> bool:
-    return settings.replay["_target_"].endswith(".for_scenarios")
+    return settings.replay._target_.endswith(".for_scenarios")
 
 
 def make_trainer(
@@ -286,11 +248,11 @@ def make_trainer(
     describe: Callable[[], dict[str, Any]],
     style_reward: StyleReward,
 ) -> Trainer:
-    """Make the training loop with its log and its checkpoints; a resumed run continues where it stopped.
+    """Make the training loop, with its log and its checkpoints in the run's folder.
 
     Args:
         run: The training.
-        env: One environment, which is closed here.
+        env: One environment, whose specification shows which entries are stored.
         collector: Collector of transitions.
         replay: Replay buffer that stores them.
         learner: Learner that is trained on them.
@@ -299,7 +261,7 @@ def make_trainer(
         style_reward: Style reward, whose terms are logged as metrics.
     """
     settings, run_dir = run.settings, Path(run.settings.run_dir)
-    trainer = Trainer(
+    return Trainer(
         settings=settings.train,
         collector=collector,
         replay=replay,
@@ -307,13 +269,17 @@ def make_trainer(
         evaluate=evaluate,
         describe=describe,
         style_terms=style_reward.terms_of,
-        log=MetricsLog(run_dir, wandb_logger(settings.domain, run_dir, **run.config["wandb"])),
+        log=MetricsLog(run_dir, wandb_logger(settings.domain, run_dir, **asdict(settings.wandb))),
         progress=Progress(settings.train.total_frames),
-        checkpoints=CheckpointStore(run_dir / "checkpoints", **run.config["checkpoint"]),
+        checkpoints=CheckpointStore(run_dir / "checkpoints", **asdict(settings.checkpoint)),
         replay_keys=stored_keys(run, env, replay),
     )
-    env.close()  # here and not at garbage collection, because closing a SerialEnv changes the number of threads
-    torch.set_num_threads(run.learner_threads)
-    if settings.resume:
-        print(f"resumed {trainer.resume(settings.resume)} at {trainer.frames} env-steps")
-    return trainer
+
+
+def close_example(run: Run, env: EnvBase) -> None:
+    """Close the environment that showed the sizes, and restore the number of threads, which closing may change.
+
+    TorchRL changes it when a `SerialEnv` is closed, so that this must not be left to garbage collection.
+    """
+    env.close()
+    torch.set_num_threads(run.settings.threads.learner)

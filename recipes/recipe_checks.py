@@ -1,80 +1,19 @@
 """Checks of a configuration; the error messages name the key, the given value and the valid ones."""
 
-import difflib
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import Field, fields, is_dataclass
+from functools import reduce
 from typing import Any
 
 from configs.schema import FamilySettings, Settings, composed_type
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException, ValidationError
+from recipe_target import Target, choices
 
-from coachable.ranges import AMOUNT, COUNT, FINITE, NOT_NEGATIVE, POSITIVE, SHARE, Range
+from coachable.ranges import FINITE, Range
 
-# Ranges of numbers in the groups with a `_target_`, by the end of the number's path; `*` is any entry of a list or
-# group. The schema declares the other ranges; `replay.gamma` and `loss.alpha` have those of `gamma` and `alpha`.
-RANGES: dict[str, Range] = {entry.name: entry.metadata["range"] for entry in fields(Settings) if entry.metadata} | {
-    # losses
-    "alpha_init": POSITIVE,
-    "num_quantiles": COUNT,
-    "kappa": NOT_NEGATIVE,
-    "num_atoms": Range("[2, inf)", whole=True),
-    "sigma_ratio": POSITIVE,
-    # replay
-    "capacity": COUNT,
-    "table_capacities.*": COUNT,
-    "table_proportions.*": SHARE,
-    "priority_alpha": NOT_NEGATIVE,
-    "priority_beta": NOT_NEGATIVE,
-    # sampler
-    "share": SHARE,
-    "neutral": SHARE,
-    "independent": SHARE,
-    "positive": SHARE,
-    "full": SHARE,
-    # network
-    "widths.*": COUNT,
-    "categorical.*": COUNT,
-    "axes": AMOUNT,
-    "num_outputs": COUNT,
-    "head_gain": NOT_NEGATIVE,
-    "dropout": Range("[0, 1)"),
-    # learner, beyond what the configuration lists
-    "alpha_lr": NOT_NEGATIVE,
-    "check_every": AMOUNT,
-    # collector, env and style_reward
-    "num_collectors": COUNT,
-    "steps_per_batch": COUNT,
-    "cpus_per_worker": POSITIVE,
-    "weights_every": COUNT,
-    "queue_size": COUNT,
-    "worker_throttle": Range("(0, inf)", optional=True),
-    "patience": POSITIVE,
-    "num_envs": COUNT,
-    "episode_steps": COUNT,
-    "seconds": POSITIVE,
-    "num_enemies": COUNT,
-    "traps": AMOUNT,
-    "cars": COUNT,
-    "costs.*": NOT_NEGATIVE,
-    "start_speed": NOT_NEGATIVE,
-    "push_force": NOT_NEGATIVE,
-    "push_interval": POSITIVE,
-    "shares.*": SHARE,
-    "weights.*": NOT_NEGATIVE,
-    "style_reward.margin": POSITIVE,
-    "style_reward.*": NOT_NEGATIVE,
-}
-
+_NUMBERS = {entry.name: entry for entry in fields(Settings) if "range" in entry.metadata}
 _KINDS = {bool: "true or false", str: "a name or path", str | None: "a name or path, or null"}
-
-
-def choices(given: str, valid: Iterable[str]) -> str:
-    """Return the end of a message about an unknown name: the closest valid name, and all valid ones."""
-    valid = list(valid)
-    close = difflib.get_close_matches(given, valid, n=1)
-    guess = f" Did you mean {close[0]}?" if close else ""
-    return f"{guess} Valid: {', '.join(valid) or 'none'}"
 
 
 def mistake_in(error: OmegaConfBaseException) -> str:
@@ -85,8 +24,8 @@ def mistake_in(error: OmegaConfBaseException) -> str:
     if isinstance(error, ConfigAttributeError | ConfigKeyError) and isinstance(parent, DictConfig):
         names = [str(name) for name in parent if name != "hydra" and not str(name).startswith("_")]
         return f"{key} does not exist: {where or 'the configuration'} has no {part!r}.{choices(part, names)}"
-    entry = _declared(tuple(key.split(".")))
-    if isinstance(error, ValidationError) and entry is not None:
+    entry = declared(*key.split("."))
+    if isinstance(error, ValidationError) and isinstance(entry, Field):
         return f"{key}={error.value}: expected {_in_words(entry)}".replace("None", "null")
     return f"{key}: {str(error).splitlines()[0]}"
 
@@ -97,24 +36,42 @@ def typed_settings(config: dict[str, Any]) -> Settings:
     Args:
         config: Plain containers, resolved.
 
+    Returns:
+        Settings, or `FamilySettings` if the configuration names a family.
+
     Raises:
         ValueError: If a key is missing or unknown, or a value has another type.
     """
+    kind = FamilySettings if "family" in config else Settings
     config = {"stages": [], "stage": None, **config}
-    known = {entry.name: config[entry.name] for entry in fields(Settings) if entry.name in config}
+    known = {entry.name: config[entry.name] for entry in fields(kind) if entry.name in config}
     try:
-        merged = OmegaConf.merge(OmegaConf.structured(composed_type(Settings)), known)
-        return _typed(Settings, OmegaConf.to_container(merged, throw_on_missing=True))
+        merged = OmegaConf.merge(OmegaConf.structured(composed_type(kind)), known)
+        return _typed(kind, OmegaConf.to_container(merged, throw_on_missing=True))
     except OmegaConfBaseException as error:
         raise ValueError(mistake_in(error)) from None
 
 
-def range_of(path: tuple[str, ...]) -> Range | None:
-    """Return the range of the number at a path, or None if any finite number is valid."""
-    if entry := _declared(path):
-        return entry.metadata.get("range")
-    ends = [".".join(path[i:]) for i in range(len(path))] + [".".join((*path[-2:-1], "*"))]
-    return next((RANGES[end] for end in ends if end in RANGES), None)
+def declared(*path: str) -> Any:
+    """Return what the schema declares at a path: a field, a range, a list of the range of each entry, or None."""
+    return reduce(_inside, path, FamilySettings)
+
+
+def range_of(entry: Any) -> Range | None:
+    """Return the range that the result of `declared` sets for a number, or None if any finite number is valid."""
+    entry = entry.metadata.get("range") if isinstance(entry, Field) else entry
+    return entry if isinstance(entry, Range) else None
+
+
+def _inside(outer: Any, part: str) -> Any:
+    """Return what is declared for a part of a group, see `declared`."""
+    if isinstance(outer, Field):
+        outer = FamilySettings if outer.name == "stages" else outer.metadata.get("ranges", outer.type)
+    if isinstance(outer, Mapping):  # arguments, which may be nested
+        return outer.get(part) or _NUMBERS.get(part) or outer.get("*", outer)
+    if isinstance(outer, list):
+        return outer[0]
+    return {entry.name: entry for entry in fields(outer)}.get(part) if is_dataclass(outer) else None
 
 
 def checked_values(config: dict[str, Any]) -> dict[str, Any]:
@@ -129,43 +86,30 @@ def checked_values(config: dict[str, Any]) -> dict[str, Any]:
     Raises:
         ValueError: If a value is not valid; the message names the key, the value and the valid range.
     """
-    checked = _checked(config, ())
+    checked = _checked(config, FamilySettings, ())
     for group in ("critic_support", "loss", "network.critic"):
-        support = _at(checked, group)
+        support: dict[str, Any] = reduce(lambda outer, part: outer.get(part) or {}, group.split("."), checked)
         if "v_min" in support and not support["v_min"] < support["v_max"]:
             raise ValueError(f"{group}.v_min={support['v_min']}: expected less than v_max, which is {support['v_max']}")
-    for group in ("network.actor", "network.critic"):
-        if _at(checked, group).get("widths") == []:
-            raise ValueError(f"{group}.widths=[]: expected the width of one layer at least")
     return checked
 
 
-def _checked(value: Any, path: tuple[str, ...]) -> Any:
+def _checked(value: Any, entry: Any, path: tuple[str, ...]) -> Any:
     if isinstance(value, dict):
-        return {key: _checked(entry, (*path, str(key))) for key, entry in value.items()}
-    if isinstance(value, list):
-        return [_checked(entry, (*path, "*")) for entry in value]
-    entry = _declared(path)
+        return {key: _checked(inner, _inside(entry, str(key)), (*path, str(key))) for key, inner in value.items()}
+    if isinstance(value, list) and (value or not isinstance(entry, list)):
+        return [_checked(inner, _inside(entry, "*"), path) for inner in value]
     number = isinstance(value, int | float) and not isinstance(value, bool)
-    expected = None if path[-1] == "_target_" else range_of(path) or (FINITE if number else None)
+    expected = None if path[-1] == "_target_" else range_of(entry) or (FINITE if number else None)
     if expected is not None and not expected.holds(value):
         wanted = str(expected)
-    elif entry is not None and entry.type is bool and not isinstance(value, bool):
+    elif isinstance(entry, Field) and entry.type is bool and not isinstance(value, bool):
         wanted = _KINDS[bool]
-    elif value is not None and (each := range_of((*path, "*"))):
-        wanted = f"a list, each entry {each}"
+    elif isinstance(entry, list) and value is not None:
+        wanted = f"a list of at least one entry, each {entry[0]}"
     else:
         return int(value) if expected is not None and expected.whole and number else value
-    raise ValueError(f"{'.'.join(path).replace('.*', '')}={value}: expected {wanted}".replace("None", "null"))
-
-
-def _declared(path: tuple[str, ...]) -> Field[Any] | None:
-    """Return the field of the schema at a path, or None in a group with a `_target_`."""
-    kind, entry = FamilySettings, None
-    for part in path:
-        entry = {field.name: field for field in fields(kind)}.get(part) if is_dataclass(kind) else None
-        kind = entry and entry.type
-    return entry
+    raise ValueError(f"{'.'.join(path)}={value}: expected {wanted}".replace("None", "null"))
 
 
 def _in_words(entry: Field[Any]) -> str:
@@ -175,13 +119,8 @@ def _in_words(entry: Field[Any]) -> str:
 
 
 def _typed(kind: Any, value: Any) -> Any:
+    if kind is Target:
+        return Target(value)
     if not is_dataclass(kind):
         return value
     return kind(**{entry.name: _typed(entry.type, value[entry.name]) for entry in fields(kind)})  # pyright: ignore
-
-
-def _at(config: dict[str, Any], path: str) -> dict[str, Any]:
-    """Return the group of settings at a path, or an empty dictionary if there is none."""
-    for part in path.split("."):
-        config = config.get(part) or {}
-    return config

@@ -1,6 +1,5 @@
 """Composition of a checked, plain configuration from a command line, shared by the recipes."""
 
-import json
 import logging
 import os
 import sys
@@ -22,15 +21,17 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from recipe_checks import checked_values, choices, mistake_in, typed_settings
+from recipe_checks import checked_values, mistake_in, typed_settings
 from recipe_saved import CONFIGS, check_saved_config
 from recipe_stages import composed_stages
+from recipe_target import choices
 
 from coachable.files import CheckpointError, check_contained, refusing
 from coachable.finite import NonFiniteError
 from coachable.training.checkpoint import find_checkpoint, read_state
 from coachable.training.curriculum import Curriculum
 from coachable.training.hardware import choose_preset, detect, estimate_update_seconds, pick_device
+from coachable.training.train_settings import TrainSettings
 from coachable.training.trainer import Trainer
 from coachable.training.worker_errors import WorkerError
 
@@ -245,11 +246,9 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
     elif cfg.get("stages"):
         stages = composed_stages(cfg, {key: OmegaConf.select(cfg, key) for key in _said(overrides)})
         cfg = _chosen_stage(cfg, stages)
-    config = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
-    assert isinstance(config, dict)
+    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)  # pyright: ignore
     config.pop("hydra", None)
     config["run_dir"] = str(Path(config["run_dir"] or _new_run_dir(config["domain"])).expanduser().absolute())
-    config = {str(key): value for key, value in config.items()}
     try:
         return checked_values(config)
     except (AttributeError, KeyError, TypeError) as error:  # only a saved configuration can have wrong types
@@ -265,33 +264,31 @@ def _chosen_stage(cfg: DictConfig, stages: list[dict[str, Any]]) -> DictConfig:
     return OmegaConf.create({**chosen, "stages": stages if cfg.stage is None else []})
 
 
-def announce(config: dict[str, Any], train: Trainer) -> None:
+def announce(config: dict[str, Any], trainer: Trainer) -> None:
     """Print the chosen settings and about how long the training will take, with the stages that follow."""
-    parameters = sum(p.numel() for p in train.learner.loss_module.actor_network_params.parameters())
-    bf16 = train.learner.precision == "bf16"
-    seconds = estimate_update_seconds(parameters, config["train"]["batch_size"], bf16, pick_device(config["device"]))
+    settings, learner = typed_settings(config), trainer.learner
+    parameters = sum(p.numel() for p in learner.loss_module.actor_network_params.parameters())
+    device, bf16 = pick_device(settings.device), learner.precision == "bf16"
+    seconds = estimate_update_seconds(parameters, settings.train.batch_size, bf16, device)
 
-    def hours(stage: dict[str, Any], frames: int) -> float:
-        settings = typed_settings(stage).train
-        return max(frames * (settings.utd_ratio or 0) * seconds, frames / (settings.throttle or float("inf"))) / 3600
+    def hours(train: TrainSettings, frames: int) -> float:
+        return max(frames * (train.utd_ratio or 0) * seconds, frames / (train.throttle or float("inf"))) / 3600
 
-    remaining = max(0, config["train"]["total_frames"] - train.frames)
-    time_left = hours(config, remaining)
-    names = [stage["stage"] for stage in config.get("stages") or []]
-    number = names.index(config["stage"]) + 1 if names else 0
-    later = sum(hours(stage, stage["train"]["total_frames"]) for stage in (config.get("stages") or [])[number:])
-    stage = f"stage {number} of {len(names)}, {config['stage']}: " if names else ""
-    print(f"Found {detect().describe()}: preset {config['preset']}, {train.learner.precision} updates")
-    estimate = f"{stage}{remaining:,} env-steps to go, about {time_left:.1f} h ({seconds * 1e3:.0f} ms per update)"
+    remaining = max(0, settings.train.total_frames - trainer.frames)
+    time_left = hours(settings.train, remaining)
+    stages = [typed_settings(stage) for stage in settings.stages]
+    number = next((i for i, stage in enumerate(stages, 1) if stage.stage == settings.stage), 0)
+    later = sum(hours(stage.train, stage.train.total_frames) for stage in stages[number:])
+    if settings.resume:
+        print(f"Resumed {settings.resume} at {trainer.frames:,} env-steps")
+    print(f"Found {detect().describe()}: preset {settings.preset}, {learner.precision} updates")
+    estimate = f"{remaining:,} env-steps to go, about {time_left:.1f} h ({seconds * 1e3:.0f} ms per update)"
+    if stages:
+        estimate = f"Stage {number} of {len(stages)}, {settings.stage}: {estimate}"
     if later:
         estimate += f"; with the stages that follow about {time_left + later:.1f} h"
-    print(estimate[0].upper() + estimate[1:])
-    print(f"Writing to {config['run_dir']}; Ctrl-C saves a checkpoint and stops")
-
-
-def save_config(config: dict[str, Any], run_dir: Path) -> None:
-    """Write the resolved configuration into the run's folder."""
-    (run_dir / "config.json").write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")
+    print(estimate)
+    print(f"Writing to {settings.run_dir}; Ctrl-C saves a checkpoint and stops")
 
 
 def _quoted_paths(arguments: list[str]) -> list[str]:

@@ -44,10 +44,9 @@ def composed_stages(cfg: DictConfig, said: Mapping[str, Any]) -> list[dict[str, 
         for key, value in said.items():
             if key.split(".")[0] not in _OF_THE_RUN:
                 OmegaConf.update(current, key, value, merge=False, force_add=True)
-        stage = OmegaConf.to_container(current, resolve=True, throw_on_missing=True)
-        assert isinstance(stage, dict)
-        config = {str(key): value for key, value in stage.items() if key not in ("hydra", "stages")}
-        stage = checked_values({**config, "stage": name})
+        stage: dict[str, Any] = OmegaConf.to_container(current, resolve=True, throw_on_missing=True)  # pyright: ignore
+        stage = {key: value for key, value in stage.items() if key not in ("hydra", "stages")}
+        stage = checked_values({**stage, "stage": name})
         typed_settings(stage)
         stages.append(stage)
         OmegaConf.update(current, "init_new_observations", 0)  # the next stage starts with these observations

@@ -155,11 +155,14 @@ class EventTableBuffer(TensorDictReplayBuffer):
         """Build a buffer with one table per scenario, all of one size and one share of each batch (multi-tables).
 
         Args:
-            scenarios: Names of the scenarios, in the order of the numbers under `scenario` in the data.
+            scenarios: Names of the scenarios, in the order of the numbers under `scenario` in the data. Without any,
+                the data need no `scenario`, and the only table is "default".
             capacity: Number of records of all tables together.
             **kwargs: Further arguments of the class.
         """
-        return cls(dict.fromkeys(scenarios, capacity // len(scenarios)), route=KeyRoute(scenarios), **kwargs)
+        tables = scenarios or ("default",)
+        route = KeyRoute(scenarios) if scenarios else None
+        return cls(dict.fromkeys(tables, capacity // len(tables)), route=route, **kwargs)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -2,26 +2,36 @@
 
 `register_schema` registers them with Hydra; the YAML file of a recipe names its class first in its list of defaults.
 Unknown keys and values of another type are then errors. Groups with a `_target_` (loss, replay, sampler, collector,
-environment) have the arguments of the target as entries: recipe_checks.py lists their ranges, and `make` in
-recipe_boxes.py compares their names with the target's arguments.
+environment) have the arguments of the target as entries, whose names `Target.build` compares with the target's.
 """
 
-from dataclasses import dataclass, field, fields, is_dataclass, make_dataclass
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, make_dataclass
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING
+from recipe_target import Target
+from torchrl.objectives import LossModule
 
 from coachable.ranges import AMOUNT, COUNT, NOT_NEGATIVE, POSITIVE, SHARE, Range
 from coachable.training.train_settings import TrainSettings
 
-Target = dict[str, Any]
-"""Function or class under `_target_`, and its arguments."""
+ATOMS = Range("[2, inf)", whole=True)
 
 
 def within(expected: Range) -> Any:
     """Return a dataclass field for a number in a range."""
     return field(metadata={"range": expected})
+
+
+def arguments(**ranges: Range | list[Range]) -> Any:
+    """Return a dataclass field for a target.
+
+    Args:
+        **ranges: Range by the name of an argument, also a nested one; in a list the range of each of several numbers. A
+            number with the name of one of `Settings` has its range. Others must be finite; the target checks them.
+    """
+    return field(metadata={"ranges": ranges})
 
 
 @dataclass
@@ -43,8 +53,8 @@ class Support:
 class Network:
     """Actor and critics."""
 
-    actor: Target
-    critic: Target
+    actor: Target = arguments(widths=[COUNT], categorical=[COUNT], axes=AMOUNT, head_gain=NOT_NEGATIVE)
+    critic: Target = arguments(widths=[COUNT], num_outputs=COUNT, num_atoms=ATOMS)
     num_critics: int = within(COUNT)
 
 
@@ -61,6 +71,10 @@ class Learner:
     adam_eps: float = within(POSITIVE)
     tau: float = within(Range("(0, 1]"))
     max_grad_norm: float | None = within(Range("(0, inf)", optional=True))
+
+    def build(self, loss: LossModule) -> Any:
+        """Make the learner of a loss."""
+        return Target(asdict(self)).build(loss)
 
 
 @dataclass(frozen=True)
@@ -104,7 +118,7 @@ class Threads:
 
 @dataclass(kw_only=True)
 class Settings:
-    """Configuration of a recipe."""
+    """Configuration of a recipe; the numbers of `env` are those of all recipes' environments."""
 
     summary: str
     domain: str
@@ -118,15 +132,17 @@ class Settings:
     seed: int = within(Range("[0, 4e9]", whole=True))
     stages: list[dict[str, Any]]
     stage: str | None
-    env: Target
-    style_reward: dict[str, Any]
-    sampler: Target
+    env: Target = arguments(
+        num_envs=COUNT, episode_steps=COUNT, cars=COUNT, seconds=POSITIVE, shares=[SHARE], weights=[NOT_NEGATIVE]
+    )
+    style_reward: dict[str, Any] = arguments(**{"margin": POSITIVE, "*": NOT_NEGATIVE})
+    sampler: Target = arguments(share=SHARE, neutral=SHARE, independent=SHARE, positive=SHARE, full=SHARE)
     gamma: float = within(SHARE)
     alpha: float = within(POSITIVE)
     entropy_samples: int = within(COUNT)
     n_steps: int = within(COUNT)
     replay_capacity: int = within(COUNT)
-    events: Target | None
+    events: dict[str, Any] | None
     event_capacity: int = within(COUNT)
     event_share: float = within(Range("(0, 1)"))
     event_horizon: int = within(COUNT)
@@ -135,9 +151,17 @@ class Settings:
     impersonation: Impersonation
     learner: Learner
     network: Network
-    loss: Target
-    replay: Target
-    collector: Target
+    loss: Target = arguments(alpha_init=POSITIVE, num_quantiles=COUNT, num_atoms=ATOMS, sigma_ratio=POSITIVE)
+    replay: Target = arguments(table_capacities=[COUNT], table_proportions=[SHARE], capacity=COUNT)
+    collector: Target = arguments(
+        num_collectors=COUNT,
+        steps_per_batch=COUNT,
+        cpus_per_worker=POSITIVE,
+        weights_every=COUNT,
+        queue_size=COUNT,
+        worker_throttle=Range("(0, inf)", optional=True),
+        patience=POSITIVE,
+    )
     train: Loop
     init_random_frames: int = within(AMOUNT)
     eval: Evaluation
@@ -167,7 +191,7 @@ def composed_type(kind: Any) -> Any:
     `checked_values` in recipe_checks.py checks these values.
     """
     if not is_dataclass(kind):
-        return {int: int | float, int | None: int | float | None, bool: Any}.get(kind, kind)
+        return {Target: dict[str, Any], int: int | float, int | None: int | float | None, bool: Any}.get(kind, kind)
     entries = []
     for entry in fields(kind):
         composed = composed_type(entry.type)

@@ -22,6 +22,7 @@ TINY += ["train.total_frames=28", "train.utd_ratio=0.125", "impersonation.n=0", 
 TINY += ["replay_capacity=100", "event_capacity=60"]
 BRIEF = ["train.utd_ratio=0", "train.total_frames=3"]
 FULLY = ("humanoid_sac", "combat_cat_rac")  # continuous actions, and mixed ones
+SCENARIOS = {"racing_qr_sac": ("solo", "recovery"), "combat_cat_rac": ("Scrounger", "Ravager")}
 POLICY_FIRST = {"qr_sac", "rac", "cat_rac", "sac_categorical"}  # paper, Appendix B
 
 
@@ -36,10 +37,6 @@ def _is_served(recipe, loss):
     return recipe != "combat_cat_rac" or loss not in ("sac", "qr_sac")
 
 
-def _has_tables(recipe, replay):
-    return recipe == "racing_qr_sac" or replay != "multi_tables"
-
-
 def _losses_and_buffers():
     """Every loss with one buffer for each kind of action; the other recipes share the losses, with every buffer each.
 
@@ -48,12 +45,12 @@ def _losses_and_buffers():
     losses = itertools.cycle(config_groups("humanoid_sac")["loss"])
     for recipe in RECIPES:
         groups = config_groups(recipe)
-        buffers = [name for name in groups["replay"] if _has_tables(recipe, name)]
         if recipe in FULLY:
             served = [loss for loss in groups["loss"] if _is_served(recipe, loss)]
-            yield from ((recipe, loss, buffer) for loss, buffer in zip(served, itertools.cycle(buffers), strict=False))
+            buffers = itertools.cycle(groups["replay"])
+            yield from ((recipe, loss, buffer) for loss, buffer in zip(served, buffers, strict=False))
         else:
-            yield from ((recipe, next(losses), buffer) for buffer in buffers)
+            yield from ((recipe, next(losses), buffer) for buffer in groups["replay"])
 
 
 def test_recipes_were_found():
@@ -61,7 +58,7 @@ def test_recipes_were_found():
 
 
 @pytest.mark.parametrize("recipe, loss, replay", list(_losses_and_buffers()))
-def test_every_loss_and_every_replay_buffer_train(recipe, loss, replay, tmp_path):
+def test_every_loss_and_every_replay_buffer_train(recipe, loss, replay, tmp_path, capsys):
     choice = [f"loss={loss}", f"replay={replay}", "impersonation.n=1", "n_steps=1", "train.total_frames=26"]
     train = _train(recipe, tmp_path, *choice)
     assert train.learner.updates == (26 - 8) // 8
@@ -71,7 +68,11 @@ def test_every_loss_and_every_replay_buffer_train(recipe, loss, replay, tmp_path
     sample = train.replay.sample(8)
     assert set(REPLAY_KEYS) - {("next", "style_features")} <= set(sample.keys(True))
     if replay == "multi_tables":
-        assert train.replay.names == ("solo", "recovery") and "scenario" in set(sample.keys())
+        scenarios = SCENARIOS.get(recipe, ())
+        assert train.replay.names == (scenarios or ("default",))
+        stored = sample.get("scenario", None)
+        assert torch.equal(stored.squeeze(-1), sample["table"]) if scenarios else stored is None
+        assert ("there is one table" in capsys.readouterr().out) == (not scenarios)
         return
     assert train.replay.names[:1] == ("default",) and (len(train.replay.names) > 1) == (replay == "event_tables")
 
@@ -240,7 +241,6 @@ def test_runs_with_tables_resume_bit_for_bit(loss, replay, tmp_path):
         ("combat_cat_rac", ["env.machines=[Thunderclaw]"], r"Thunderclaw"),
         ("combat_cat_rac", ["loss=sac"], r"continuous actions only"),
         ("combat_cat_rac", ["loss=qr_sac"], r"continuous actions only"),
-        ("cheetah_speed", ["replay=multi_tables"], r"replay=multi_tables: cheetah has no scenarios"),
         ("cheetah_speed", ["mirror=0.5"], r"cheetah has no mirror images, expected mirror=0"),
     ],
 )

@@ -1,6 +1,7 @@
 """Numbers of a configuration that lie outside their range: refused before anything is allocated."""
 
 import math
+import re
 import sys
 from dataclasses import fields, is_dataclass
 from importlib import import_module
@@ -10,13 +11,21 @@ import pytest
 import recipe_config
 import yaml
 from configs.schema import Settings
-from recipe_checks import RANGES, checked_values, range_of
+from recipe_checks import checked_values, declared, range_of
 from recipe_config import compose_config
 
 from coachable.finite import NonFiniteError
 
 CONFIGS = Path(recipe_config.CONFIGS)
 FREE = {"critic_support", "network.critic.initial_value", "env.conditions"}  # any finite number
+OF_TARGETS = {  # the function or class checks them itself, before anything is written
+    "env.costs={power: -1}": r"costs.power is -1: expected a number of at least 0",
+    "env.push_force=-1": r"push_force is -1: expected a number of at least 0",
+    "env.num_enemies=3": r"num_enemies is 3: expected a whole number in \[1, 2\]",
+    "env.traps=1.5": r"traps is 1.5: expected a whole number of at least 0",
+    "loss.kappa=-1": r"kappa is -1: expected a number of at least 0",
+    "+network.actor.dropout=1": r"dropout is 1: expected a number in \[0, 1\)",
+}
 
 
 def _numbers(value, path=()):
@@ -44,8 +53,9 @@ def _every_number():
 def test_every_number_of_the_configurations_has_a_range():
     found = list(_every_number())
     assert len(found) > 100
-    lacking = {".".join(path) for _, path in found if range_of(path) is None}
-    assert {name for name in lacking if not any(name.startswith(free) for free in FREE)} == set()
+    lacking = {".".join(path) for _, path in found if range_of(declared(*path)) is None}
+    known = FREE | {argument.strip("+").partition("=")[0] for argument in OF_TARGETS}
+    assert {name for name in lacking if not any(name.startswith(free) for free in known)} == set()
 
 
 def _declared(kind=Settings, path=()):
@@ -54,6 +64,9 @@ def _declared(kind=Settings, path=()):
             yield from _declared(entry.type, (*path, entry.name))
         elif entry.type in (int, float, int | None, float | None):
             yield (*path, entry.name), entry.metadata.get("range")
+        for name, range_ in entry.metadata.get("ranges", {}).items():
+            each = isinstance(range_, list)
+            yield (*path, entry.name, name.replace("*", "any"), *["any"] * each), range_[0] if each else range_
 
 
 def test_every_number_that_the_schema_declares_has_a_range():
@@ -78,15 +91,31 @@ def _outside(range_):
     return [below, above, math.nan, math.inf, "many", True] + [1.5] * range_.whole + [None] * (not range_.optional)
 
 
-@pytest.mark.parametrize("key", RANGES)
-def test_what_lies_outside_is_named_with_the_range(key):
-    parts = [part if part != "*" else "any" for part in key.split(".")]
-    for value in _outside(RANGES[key]):
+def test_numbers_of_a_target_are_named_with_their_place_and_range():
+    cases = {
+        ("replay", "gamma"): (2, "a number in [0, 1]"),  # as `gamma` itself
+        ("env", "scenarios", "cars"): (0, "a whole number of at least 1"),
+        ("network", "actor", "heads", "categorical"): (
+            3,
+            "a list of at least one entry, each a whole number of at least 1",
+        ),
+        ("env", "own", "number"): (math.inf, "a number that is finite"),
+    }
+    for path, (value, expected) in cases.items():
         config = value
-        for part in reversed(["group", *parts]):
+        for part in reversed(path):
             config = {part: config}
-        with pytest.raises(ValueError, match=rf"^group\.{'.'.join(parts)}=.*: expected a .*number "):
+        with pytest.raises(ValueError, match=re.escape(f"{'.'.join(path)}={value}: expected {expected}")):
             checked_values(config)
+
+
+@pytest.mark.parametrize("argument", OF_TARGETS)
+def test_what_a_target_checks_itself_is_refused_before_anything_is_written(argument, tmp_path):
+    recipe = "racing_qr_sac" if "loss" in argument else "humanoid_sac"
+    recipe = "combat_cat_rac" if argument.startswith(("env.num_enemies", "env.traps")) else recipe
+    with pytest.raises(ValueError, match=OF_TARGETS[argument]):
+        import_module(recipe).build(compose_config(recipe, ["preset=smoke", f"run_dir={tmp_path / 'run'}", argument]))
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(
@@ -98,7 +127,10 @@ def test_what_lies_outside_is_named_with_the_range(key):
         ("train.batch_size=0", r"train.batch_size=0: expected a whole number of at least 1"),
         ("mirror=1.2", r"mirror=1.2: expected a number in \[0, 1\]"),
         ("network.actor.widths=[32,0]", r"network.actor.widths=0: expected a whole number of at least 1"),
-        ("network.critic.widths=[]", r"network.critic.widths=\[\]: expected the width of one layer"),
+        (
+            "network.critic.widths=[]",
+            r"network.critic.widths=\[\]: expected a list of at least one entry, each a whole number",
+        ),
         ("critic_support.v_min=700", r"critic_support.v_min=700.*: expected less than v_max, which is 650.0"),
         ("replay.gamma=-1", r"replay.gamma=-1: expected a number in \[0, 1\]"),
         ("style_reward.pose_scale=nan", r"style_reward.pose_scale=nan: expected a number of at least 0"),

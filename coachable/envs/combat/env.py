@@ -39,7 +39,8 @@ from coachable.envs.combat.traits import (
 )
 from coachable.envs.combat.traps import TrapNumbers
 from coachable.finite import require_finite_action
-from coachable.keys import EVENTS, STYLE_FEATURES, TASK_REWARD
+from coachable.keys import EVENTS, SCENARIO, STYLE_FEATURES, TASK_REWARD
+from coachable.ranges import AMOUNT, COUNT, Range
 
 COMPONENTS_KEY = "components"
 """Key of the raw components of a step, `(N, 44)`, for evaluation; see `rewards.COMPONENTS`."""
@@ -54,7 +55,7 @@ class CombatEnv(EnvBase):
 
     Args:
         num_envs: Number N of fights.
-        seed: Seed of scenarios and fights.
+        seed: Seed of machines, sites and fights.
         machines: Machine types from which each fight draws uniformly; the paper's 19 by default.
         sites: Sites from which each fight draws uniformly; all three by default.
         num_enemies: Number of machines per fight, 1 or 2, of independently drawn types.
@@ -70,7 +71,8 @@ class CombatEnv(EnvBase):
         device: Device of all tensors.
 
     Keys written: `observation` (N, 629), `task_reward` (N, 1), `style_features` (N, 18), `events` (N, 18) bool,
-    `done`, `terminated`, `truncated` (N, 1).
+    `scenario` (N, 1) int64, `done`, `terminated`, `truncated` (N, 1). The scenario of a fight is its machine, the first
+    one of two: an index into `scenario_names`, or -1 for an assigned machine that is not among `machines`.
 
     Raises:
         ValueError: If an option or a name is unknown, or a number is out of range.
@@ -99,14 +101,10 @@ class CombatEnv(EnvBase):
         components: bool = False,
         device: torch.device | str = "cpu",
     ) -> None:
-        for name, value, low, high in (
-            ("num_envs", num_envs, 1, None),
-            ("num_enemies", num_enemies, 1, 2),
-            ("episode_steps", episode_steps, 1, None),
-            ("traps", traps, 0, None),
-        ):
-            if value < low or (high is not None and value > high):
-                raise ValueError(f"{name} must be at least {low}{f' and at most {high}' if high else ''}, got {value}")
+        COUNT.check("num_envs", num_envs)
+        Range("[1, 2]", whole=True).check("num_enemies", num_enemies)
+        COUNT.check("episode_steps", episode_steps)
+        AMOUNT.check("traps", traps)
         if assist not in c.ASSIST:
             raise ValueError(f"assist is {assist!r}: expected one of {list(c.ASSIST)}")
         super().__init__(device=device, batch_size=torch.Size((num_envs,)))
@@ -114,7 +112,9 @@ class CombatEnv(EnvBase):
         self.observation, self.episode_steps, self.traps, self.assist = observation, episode_steps, traps, assist
         self.styles = check_styles(styles)
         self.kill_event, self.emit_components = kill_event, components
-        self._machine_pool = _numbers("machines", list(MACHINES) if machines is None else machines, MACHINE_NAMES)
+        machines = tuple(MACHINES) if machines is None else machines
+        self._machine_pool = _numbers("machines", machines, MACHINE_NAMES)
+        self.scenario_names = tuple(dict.fromkeys(machines))
         self._site_pool = _numbers("sites", SITES if sites is None else sites, SITES)
         self._assigned: tuple[Tensor, Tensor] | None = None
         self._load_tables(reward_scale)
@@ -125,7 +125,7 @@ class CombatEnv(EnvBase):
         self._look_up()
 
     def assign(self, machines: Sequence[str | Sequence[str]], sites: Sequence[str]) -> None:
-        """Assign scenarios to the fights from their next reset on, instead of drawing them.
+        """Assign machines and sites to the fights from their next reset on, instead of drawing them.
 
         Args:
             machines: Machine type, or one type per enemy, of each of the N fights.
@@ -156,6 +156,7 @@ class CombatEnv(EnvBase):
         weights = torch.cat([task_weights().unsqueeze(0), style_weights(reward_scale)[chosen]])
         self._weights, self._fires = weights.to(on), event_components()[chosen].to(on)
         self._machine_pool, self._site_pool = self._machine_pool.to(on), self._site_pool.to(on)
+        self._scenarios = torch.tensor([_position(name, self.scenario_names) for name in MACHINE_NAMES], device=on)
         self._place_pillars(self._site_pool)
 
     def _place_pillars(self, sites: Tensor) -> None:
@@ -177,6 +178,7 @@ class CombatEnv(EnvBase):
             TASK_REWARD: Unbounded(dtype=torch.float32, **rows(1)),
             STYLE_FEATURES: Unbounded(dtype=torch.float32, **rows(len(self.styles))),
             EVENTS: Binary(n=events, dtype=torch.bool, **rows(events)),
+            SCENARIO: Unbounded(dtype=torch.int64, **rows(1)),
         }
         if self.emit_components:
             entries[COMPONENTS_KEY] = Unbounded(dtype=torch.float32, **rows(NUM_COMPONENTS))
@@ -224,6 +226,7 @@ class CombatEnv(EnvBase):
             TASK_REWARD: values[:, :1].contiguous(),
             STYLE_FEATURES: values[:, 1:].contiguous(),
             EVENTS: events.contiguous(),
+            SCENARIO: self._scenarios[self.state.machine[0]].unsqueeze(-1),
             "done": ended | late,
             "terminated": ended,
             "truncated": late,
@@ -288,3 +291,8 @@ def _numbers(what: str, names: Sequence[str], known: Sequence[str]) -> Tensor:
     if unknown or isinstance(names, str) or not names:
         raise ValueError(f"{what} are {names!r}: expected a list of at least one of {list(known)}")
     return torch.tensor([known.index(name) for name in names])
+
+
+def _position(name: str, names: Sequence[str]) -> int:
+    """Return the index of a name, or -1 if it is not among the names."""
+    return names.index(name) if name in names else -1

@@ -116,6 +116,17 @@ def test_partial_reset_touches_nothing_else_and_leaks_nothing():
         assert (first[COMPONENT_SLICES[name]] == 0).all(), name
 
 
+def test_the_scenario_of_a_fight_is_its_machine():
+    env = make_env(num_envs=40, machines=["Ravager", "Scrounger", "Ravager"])
+    assert env.scenario_names == ("Ravager", "Scrounger")
+    numbers = env.reset()["scenario"]
+    assert [list(MACHINES)[i] for i in env.state.machine[0]] == [env.scenario_names[i] for i in numbers.flatten()]
+    assert set(numbers.flatten().tolist()) == {0, 1}
+    assert torch.equal(env.rand_step()["next", "scenario"], numbers)
+    env.assign(["Scrounger", "Longleg"] * 20, ["Ice-lake"] * 40)
+    assert env.reset()["scenario"].flatten().tolist() == [1, -1] * 20
+
+
 def test_outputs_do_not_share_memory_with_the_env():
     env = make_env()
     current = env.reset()
@@ -166,8 +177,8 @@ def test_scenarios_can_be_assigned():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"num_envs": 0}, "num_envs must be at least 1"),
-        ({"num_enemies": 3}, "num_enemies must be at least 1 and at most 2"),
+        ({"num_envs": 0}, "num_envs is 0: expected a whole number of at least 1"),
+        ({"num_enemies": 3}, "num_enemies is 3: expected a whole number in"),
         ({"machines": ["Scrounger", "Toaster"]}, "machines are .*Toaster"),
         ({"machines": []}, "expected a list of at least one"),
         ({"sites": ["Moon"]}, "sites are .*Moon"),

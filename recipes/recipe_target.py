@@ -1,0 +1,56 @@
+"""Functions and classes that a configuration names under `_target_`, with their arguments."""
+
+import difflib
+from collections.abc import Callable, Iterable
+from inspect import Parameter, isclass, signature
+from typing import Any
+
+from hydra.utils import instantiate
+
+
+class Target(dict[str, Any]):
+    """Arguments of a function or class, and its name under `_target_`; the arguments are attributes, too."""
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return self[name]
+        except KeyError:
+            raise AttributeError(f"{self.get('_target_')} is given no {name!r}.{choices(name, self)}") from None
+
+    def build(self, *args: Any, **arguments: Any) -> Any:
+        """Call the function or class with the arguments of the configuration, and with further ones.
+
+        Raises:
+            ValueError: If it takes no such argument, or an argument is `true` or `false` and the value is not.
+        """
+        made = instantiate(self, _convert_="all", _partial_=True)
+        known = _arguments_of(made.func)
+        for name, value in made.keywords.items():
+            if name not in known and not any(argument.kind is Parameter.VAR_KEYWORD for argument in known.values()):
+                valid = [other for other in known if other not in ("self", "args", "space")]
+                raise ValueError(f"{self['_target_']} takes no {name!r}.{choices(name, valid)}")
+            if name in known and known[name].annotation in (bool, "bool") and not isinstance(value, bool):
+                raise ValueError(f"{name}={value} of {self['_target_']}: expected true or false")
+        return made(*args, **arguments)
+
+
+def choices(given: str, valid: Iterable[str]) -> str:
+    """Return the end of a message about an unknown name: the closest valid name, and all valid ones."""
+    valid = list(valid)
+    close = difflib.get_close_matches(given, valid, n=1)
+    guess = f" Did you mean {close[0]}?" if close else ""
+    return f"{guess} Valid: {', '.join(valid) or 'none'}"
+
+
+def _arguments_of(function: Callable[..., Any]) -> dict[str, Parameter]:
+    """Return the arguments of a function, and for a class or its factory also those passed on by `**options`."""
+    kind = function if isclass(function) else getattr(function, "__self__", None)
+    known = {} if isclass(function) else dict(signature(function).parameters)
+    for base in kind.__mro__ if isclass(kind) else ():
+        options = [name for name, argument in known.items() if argument.kind is Parameter.VAR_KEYWORD]
+        if known and not options:
+            break
+        for name in options:
+            del known[name]
+        known = {**signature(base.__init__).parameters, **known}
+    return known
