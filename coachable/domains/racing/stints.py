@@ -42,7 +42,7 @@ class Stint:
 
     Attributes:
         laps: Times of the completed laps, counted from the car's start [s].
-        clean: Whether each lap had never three wheels off the track.
+        clean: Whether each lap had at most two wheels off the track at any time.
         left: State of the resource at the end of each lap: fuel left [l], or wear.
         per_km: Resource used per kilometre after the first lap, or in total if there is no other lap.
     """

@@ -194,7 +194,7 @@ class GaitTracker:
         self.knee_max = np.where(column, knees, self.knee_max)
 
     def observe(self) -> np.ndarray:
-        """Return what the policy observes of the step under way.
+        """Return what the policy observes of the current step.
 
         Returns:
             (N, 11): one-hot of the expected foot 2, smallest and largest angle of each knee since the step began 4

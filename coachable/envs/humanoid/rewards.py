@@ -88,9 +88,10 @@ _DRIFT = 0.10  # [m] to either side over a stride that cost 1
 def walk_costs(
     power: np.ndarray, forces: np.ndarray, clearance: np.ndarray, report: StepReport
 ) -> dict[str, np.ndarray]:
-    """Return what a walk costs that is not soft, low, straight and economical: 0 at best, 1 where it looks wrong.
+    """Return the costs of an unnatural walk.
 
-    None of them is in the paper. Quantities of a step are paid once for each control step that it took.
+    A cost is 0 at best and 1 where the walk looks wrong. None of the costs is in the paper. A cost that is measured
+    once per step is multiplied by the number of control steps that the step took.
 
     Args:
         power: (N,) mechanical power of the motors [W].
