@@ -85,7 +85,12 @@ class Share:
 
 
 def has_direct_gradients(loss_module: LossModule, *plans: Plan) -> bool:
-    """Return whether :class:`DirectGradients` computes a loss, given the plans of its networks."""
+    """Return whether :class:`DirectGradients` computes a loss, given the plans of its networks.
+
+    Args:
+        loss_module: The loss.
+        *plans: Plans of its networks.
+    """
     loss: Any = loss_module
     if load_sac() is None or type(loss) not in (SACLoss, QRSACLoss) or len(loss.actor_network) != 2:
         return False

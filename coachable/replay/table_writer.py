@@ -69,7 +69,7 @@ class TableWriter(Writer):
         return int(self.regions.written[: self.base_tables].sum())
 
     def add(self, data: TensorDictBase) -> Tensor:
-        """Write one step."""
+        """Write one step of batch shape `()`, and return the slots `(k,)` of its records."""
         return self.extend(data.unsqueeze(0))
 
     def extend(self, data: TensorDictBase) -> Tensor:

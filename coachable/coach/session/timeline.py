@@ -90,7 +90,11 @@ class Timeline:
             )
 
     def recording(self, observation: Tensor) -> Recording:
-        """Return a copy of the recording up to now, with a checksum of the current observation."""
+        """Return a copy of the recording up to now.
+
+        Args:
+            observation: Current observation (1, D), whose checksum is added.
+        """
         copy = Recording.from_json(self._recording.to_json())
         copy.steps = self.step
         if self.step % _CHECK_EVERY:

@@ -87,7 +87,12 @@ class GaitTracker:
 
     @classmethod
     def create(cls, num_envs: int, step_max: float) -> GaitTracker:
-        """Return a tracker of `num_envs` walkers that have not started."""
+        """Return a tracker of `num_envs` walkers that have not started.
+
+        Args:
+            num_envs: Number of walkers N.
+            step_max: Time after which a step times out [s].
+        """
         return cls(
             expected=np.zeros(num_envs, dtype=np.int64),
             clock=np.zeros(num_envs, dtype=np.int64),

@@ -57,9 +57,20 @@ def move_reward(
 def bearing_reward(
     head_height: np.ndarray, upright: np.ndarray, facing: np.ndarray, controls: np.ndarray
 ) -> np.ndarray:
-    """Return the factors of `move_reward` without that of the speed (N,), within [0, 1].
+    """Return the factors of `move_reward` without that of the speed.
 
     It is the task reward where the style sets the speed. The arguments are those of `move_reward`.
+
+    It is the task reward if the style sets the speed. The arguments are those of `move_reward`.
+
+    Args:
+        head_height: (N,) height of the head [m].
+        upright: (N,) z component of the torso's upward axis.
+        facing: (N,) cosine between the pelvis' forward axis and the course.
+        controls: (N, 21) actions in [-1, 1].
+
+    Returns:
+        (N,) in [0, 1].
     """
     standing, effortless = _bearing(head_height, upright, facing, controls)
     return standing * (1 + effortless) / 2
