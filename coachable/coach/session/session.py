@@ -149,10 +149,6 @@ class CoachSession:
     def push(self, forward: float = 0.0, left: float = 0.0) -> None:
         """Push the agent before the next step; see `coachable.domain.Push`, whose largest strength limits the push.
 
-        Args:
-            forward: Strength in the agent's direction, in the unit of the domain's push.
-            left: Strength to its left.
-
         Raises:
             ValueError: If the domain has no push, or a strength is not finite.
         """

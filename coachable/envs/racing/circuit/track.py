@@ -182,14 +182,9 @@ class Track:
 
 
 def turn_pieces(angle: float, radius: float) -> list[tuple[float, float, float]]:
-    """Return ramp, arc and ramp of a turn as (length, curvature at the start, curvature at the end).
+    """Return ramp, arc and ramp of a turn as (length [m], curvature at the start, curvature at the end [1/m]).
 
-    Args:
-        angle: Angle of the turn, positive to the left [deg].
-        radius: Radius of the arc [m].
-
-    Returns:
-        Length [m], curvature at the start and curvature at the end [1/m] of each piece.
+    The angle is positive to the left [deg]; the radius is that of the arc [m].
     """
     arc = radius * math.radians(abs(angle))
     ramp = min(0.45 * arc, 45.0)
@@ -373,13 +368,6 @@ class Course(torch.nn.Module):
         """Project points (N,) on the centre line of one circuit like `project`, without an estimate.
 
         All nodes are compared.
-
-        Args:
-            x: Positions (N,) [m].
-            y: Positions (N,) [m].
-
-        Returns:
-            The results of `project`.
         """
         distance = (x[..., None] - self.table[:, 0]) ** 2 + (y[..., None] - self.table[:, 1]) ** 2
         return self.project(x, y, self.distance(distance.argmin(-1)))
@@ -406,14 +394,6 @@ class Course(torch.nn.Module):
         return x + dx * tx - dy * ty, y + dx * ty + dy * tx, torch.atan2(ty, tx) + angle
 
     def past(self, node: Tensor, s: Tensor) -> Tensor:
-        """Return how far distances along the track are past nodes near them, negative before [m].
-
-        Args:
-            node: Numbers of nodes (N,).
-            s: Distances along the track (N,) [m].
-
-        Returns:
-            (N,) [m].
-        """
+        """Return how far (N,) [m] distances along the track (N,) [m] are past nodes (N,) near them, negative before."""
         half = self.length / 2
         return torch.remainder(s - self.distance(node) + half, self.length) - half
