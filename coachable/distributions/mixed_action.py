@@ -214,5 +214,5 @@ class MixedAction(Distribution):
 
     @property
     def mode(self) -> Tensor:
-        """Deterministic action, under the name that torch uses."""
+        """Deterministic action `(..., action_dim)`, under the name that torch uses."""
         return self.deterministic_sample

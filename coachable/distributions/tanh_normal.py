@@ -80,7 +80,7 @@ class TanhGaussian(TanhNormal):
 
     @property
     def deterministic_sample(self) -> Tensor:
-        """Median, `tanh(loc)`."""
+        """Median `tanh(loc)`, `(..., A)`."""
         return torch.tanh(self.loc)
 
     @property

@@ -137,7 +137,7 @@ class DirectGradients:
 
     @torch.no_grad()
     def both(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Return what the loss returns, after the gradients of policy, critics and temperature are set."""
+        """Set the gradients of policy, critics and temperature, and return the scalar losses, alpha and entropy."""
         found = self._gradients(batch, critic=True, actor=True)
         loss_actor, log_prob = self._actor_loss(found, batch)
         batch.set(self._loss.tensor_keys.priority, found["td_error"].view(batch.batch_size))

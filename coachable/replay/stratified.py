@@ -168,7 +168,7 @@ class StratifiedSampler(Sampler):
             tree.update(index, self._largest_priority(index.device).expand(len(index)))
 
     def add(self, index: int | Tensor) -> None:
-        """Give a new record the largest priority so far."""
+        """Give a new record, with the slot `index` `()`, the largest priority so far."""
         self.extend(torch.as_tensor(index).reshape(-1))
 
     def update_priority(self, index: Any, priority: Any, *, storage: Storage | None = None) -> None:

@@ -71,7 +71,7 @@ class Timeline:
         """Count a step, record its checksum every 40 steps, and compare a replay with its recording.
 
         Args:
-            observation: The observation after the step.
+            observation: The observation (1, D) after the step.
 
         Raises:
             ReplayMismatch: If they differ; later steps are not compared.
