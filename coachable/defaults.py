@@ -59,7 +59,7 @@ class RewardMeasures:
         self._reward = reward
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
-        """See `StyleMeasures.step`."""
+        """Return the measures (N,) of a step by name; see `StyleMeasures.step`."""
         theta, features = transition.get(STYLE), transition.get(("next", STYLE_FEATURES))
         style, paid = self._reward.space.view(theta), self._reward.terms_of(features, theta)
         found: dict[str, Tensor] = {}
@@ -80,11 +80,19 @@ class RewardMeasures:
         return found
 
     def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
-        """Compute means over the steps that count; see `StyleMeasures.summarise`."""
+        """Compute means over the steps that count; see `StyleMeasures.summarise`.
+
+        Args:
+            record: Outputs of `step` (T, N), by name.
+            alive: Steps that count (T, N) bool.
+
+        Returns:
+            Means (N,) by name.
+        """
         return {name: torch.where(alive, values, torch.nan).nanmean(0) for name, values in record.items()}
 
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
-        """See `StyleMeasures.complies`."""
+        """Return whether the agent complies in each step, (T, N) bool; see `StyleMeasures.complies`."""
         kept = [
             record[name] <= limit if is_error else record[name] >= limit for name, limit, is_error in self._limits()
         ]

@@ -16,6 +16,9 @@ EXTRAS = {
 def how_to_install(extra: str) -> str:
     """Return the commands that install an extra, for an installed package and for a clone of the repository.
 
+    Raises:
+        ValueError: If there is no such extra.
+
     Example:
         >>> how_to_install("ui")
         "pip install 'coachable[ui]' (in a clone: pip install -e '.[ui]')"

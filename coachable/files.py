@@ -90,6 +90,10 @@ def save_state(state: Mapping[str, Any], file: Path) -> None:
 
     The file is a zip archive, which has a checksum of every member.
 
+    Args:
+        state: The containers.
+        file: File to write.
+
     Raises:
         CheckpointError: If `state` contains anything else, which could not be read back.
         OSError: If writing fails.
@@ -175,7 +179,12 @@ def check_contained(folder: Path) -> None:
 
 
 def write_text(file: Path, text: str) -> None:
-    """Write a text file and sync it to disk."""
+    """Write a text file and sync it to disk.
+
+    Args:
+        file: File to write.
+        text: Its content.
+    """
     with file.open("w", encoding="utf-8") as stream:
         stream.write(text)
         stream.flush()

@@ -45,6 +45,10 @@ class Range:
     def check(self, name: str, value: Any) -> None:
         """Refuse a value that is not in the range.
 
+        Args:
+            name: Name of the quantity, for the message.
+            value: The value.
+
         Raises:
             ValueError: If it does not; the message names the quantity, the value and the range.
         """

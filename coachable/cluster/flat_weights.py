@@ -9,12 +9,16 @@ __all__ = ["flat_weights", "load_flat_weights", "portable_copy"]
 
 
 def flat_weights(policy: nn.Module) -> Tensor:
-    """Return all parameters and buffers of floating point as one new vector (float32) in the CPU's memory."""
+    """Return all parameters and buffers of floating point as one new vector `(n,)` float32 in the CPU's memory."""
     return torch.cat([value.detach().reshape(-1).float() for value in _values(policy)]).cpu()
 
 
 def load_flat_weights(policy: nn.Module, flat: Tensor) -> None:
     """Copy what `flat_weights` returned into a policy of the same shape.
+
+    Args:
+        policy: Policy of the same shape.
+        flat: Weights (n,) in the order of `flat_weights`.
 
     Raises:
         ValueError: If the number of weights differs.

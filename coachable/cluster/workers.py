@@ -119,7 +119,12 @@ class Workers:
         self._reason = "none has started"
 
     def offer(self, version: int, flat: Tensor) -> None:
-        """Offer new weights, which workers get when they are asked for their next batch."""
+        """Offer new weights, which workers get when they are asked for their next batch.
+
+        Args:
+            version: Number of the weights, which rises.
+            flat: Weights (n,) from `flat_weights`.
+        """
         self._offer = _Offer(version, flat, self._offer.stored, self._offer.reference)
 
     def start(self) -> None:

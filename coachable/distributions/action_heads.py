@@ -82,7 +82,14 @@ class ActionHeads:
         return torch.stack([part.argmax(-1) for part in one_hots.split(self.categorical, -1)], -1)
 
     def from_choices(self, choices: Tensor, axes: Tensor | None = None) -> Tensor:
-        """Build an action from head indices `(..., heads)` and axes `(..., axes)`; the inverse of `choices`.
+        """Build an action; the inverse of `choices`.
+
+        Args:
+            choices: Index of each head `(..., heads)`.
+            axes: Axes `(..., axes)` in [-1, 1]; None without axes.
+
+        Returns:
+            Action `(..., action_dim)` float32.
 
         Example:
             >>> ActionHeads((2, 3)).from_choices(torch.tensor([1, 0])).tolist()
@@ -98,7 +105,13 @@ class ActionHeads:
         device: torch.device | str | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> TensorSpec:
-        """Return the action spec `(*batch_shape, action_dim)`: `Bounded` for axes only, else `MixedActionSpec`."""
+        """Return the action spec `(*batch_shape, action_dim)`: `Bounded` for axes only, else `MixedActionSpec`.
+
+        Args:
+            batch_shape: Shape before the action's dimension.
+            device: Device of the spec.
+            dtype: Dtype of actions.
+        """
         shape = torch.Size((*batch_shape, self.action_dim))
         if not self.categorical:
             return Bounded(-1.0, 1.0, shape=shape, device=device, dtype=dtype)
@@ -143,7 +156,14 @@ class MixedActionSpec(TensorSpec):
         return MixedActionSpec(self.heads, shape, device=self.device, dtype=self.dtype)
 
     def rand(self, shape: Sequence[int] | None = None) -> Tensor:
-        """Draw every head and every axis uniformly and independently."""
+        """Draw every head and every axis uniformly and independently.
+
+        Args:
+            shape: Batch shape before that of the spec.
+
+        Returns:
+            Actions `(*shape, ..., action_dim)`.
+        """
         full = torch.Size((*(() if shape is None else shape), *self.shape))
         action = torch.empty(full, device=self.device, dtype=self.dtype)
         one_hots, axes = self.heads.split(action)
@@ -152,7 +172,7 @@ class MixedActionSpec(TensorSpec):
         return action
 
     def is_in(self, val: Tensor) -> bool:
-        """Return whether every head is a one-hot and every axis is in [-1, 1]."""
+        """Return whether every head of actions `(..., action_dim)` is a one-hot and every axis is in [-1, 1]."""
         if val.shape[-len(self.shape) :] != self.shape or val.dtype != self.dtype:
             return False
         one_hots, axes = self.heads.split(val)
@@ -179,7 +199,15 @@ class MixedActionSpec(TensorSpec):
         return self.heads.from_choices(choices).to(device=self.device, dtype=self.dtype)
 
     def index(self, index: Any, tensor_to_index: Tensor) -> Tensor:
-        """Raise an error, because mixed actions cannot index tensors."""
+        """Raise an error, because mixed actions cannot index tensors.
+
+        Args:
+            index: Not used.
+            tensor_to_index: Not used.
+
+        Raises:
+            NotImplementedError: Always.
+        """
         raise NotImplementedError(f"{type(self).__name__} cannot index tensors")
 
     def expand(self, *shape: Any) -> MixedActionSpec:
@@ -195,7 +223,11 @@ class MixedActionSpec(TensorSpec):
         return self._with_shape(lambda x: x.unsqueeze(dim))
 
     def unbind(self, dim: int = 0) -> tuple[MixedActionSpec, ...]:
-        """Return one spec per element of a leading dimension."""
+        """Return one spec per element of a leading dimension.
+
+        Raises:
+            ValueError: If `dim` is not a leading dimension.
+        """
         if not -self.ndim <= dim < self.ndim - 1 or dim == -1:
             raise ValueError(f"cannot unbind dimension {dim} of shape {tuple(self.shape)}")
         return tuple(self._with_shape(lambda x: x.select(dim, 0)) for _ in range(self.shape[dim]))

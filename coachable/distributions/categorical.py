@@ -137,7 +137,10 @@ def regret_matching_probabilities(x: Tensor, layout: HeadLayout) -> Tensor:
 
 
 def exponential_noise(like: Tensor) -> Tensor:
-    """Draw standard exponential numbers E, clamped away from 0; `-log E` is the Gumbel noise of the paper."""
+    """Draw standard exponential numbers E with the shape of `like` `(..., n)`, clamped away from 0.
+
+    `-log E` is the Gumbel noise of the paper (Appendix B).
+    """
     return torch.empty_like(like).exponential_().clamp_min_(_SMALLEST_EXPONENTIAL)
 
 
@@ -181,14 +184,25 @@ def hard_one_hots(pi: Tensor, layout: HeadLayout, noise: Tensor | None = None) -
 
 
 def most_likely_one_hots(weights: Tensor, layout: HeadLayout) -> Tensor:
-    """Return one-hots of the first largest weight of each head, for weights of at least 0."""
+    """Return one-hots of the largest weight of each head, of the first one if several are equal.
+
+    Args:
+        weights: Weights of all heads `(..., sum of sizes)`, at least 0.
+        layout: Layout of the heads.
+
+    Returns:
+        One-hots `(..., sum of sizes)`.
+    """
     padded = layout.pad(weights.detach())
     one_hots = torch.zeros_like(padded).scatter_(-1, padded.argmax(-1, keepdim=True), 1.0)
     return layout.concatenate(one_hots)
 
 
 def log_probabilities(pi: Tensor) -> Tensor:
-    """Return the logarithm of probabilities, which stays finite for all probabilities that a head can have."""
+    """Return the logarithm of probabilities `(..., n)`, in the same shape.
+
+    It stays finite for all probabilities that a head can have.
+    """
     return pi.clamp_min(torch.finfo(pi.dtype).tiny).log()
 
 

@@ -124,7 +124,7 @@ class HLGauss:
         return -(self.encode(value.detach()) * at_least_float32(logits).log_softmax(-1)).sum(-1)
 
     def clipped_fraction(self, value: Tensor) -> Tensor:
-        """Return the fraction of the values outside [v_min, v_max], a scalar."""
+        """Return the fraction of values (any shape) outside [v_min, v_max], a scalar `()`."""
         return ((value < self.v_min) | (value > self.v_max)).to(at_least_float32(value).dtype).mean()
 
 

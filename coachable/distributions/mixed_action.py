@@ -134,16 +134,29 @@ class MixedAction(Distribution):
             return self._expanded(sample_shape).hard_action()
 
     def sample_and_log_prob(self, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
-        """Draw hard actions without gradient, and return them and their differentiable log-densities."""
+        """Draw hard actions without gradient.
+
+        Args:
+            sample_shape: Shape before the batch shape.
+
+        Returns:
+            Actions `(*sample_shape, ..., action_dim)` and their differentiable log-densities `(*sample_shape, ...)`.
+        """
         action = self.sample(sample_shape)
         return action, self.log_prob(action)
 
     def rsample(self, sample_shape: Sequence[int] = ()) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Draw reparameterised axes; see `rsample_and_log_prob`."""
+        """Draw reparameterised axes `(*sample_shape, ..., axes)`; see `rsample_and_log_prob`."""
         return self.rsample_and_log_prob(sample_shape)[0]
 
     def rsample_and_log_prob(self, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
-        """Draw reparameterised axes, and return them and their log-density.
+        """Draw reparameterised axes.
+
+        Args:
+            sample_shape: Shape before the batch shape.
+
+        Returns:
+            Actions `(*sample_shape, ..., axes)` and their log-densities `(*sample_shape, ...)`.
 
         Raises:
             NotImplementedError: If there are categorical heads.
@@ -201,5 +214,5 @@ class MixedAction(Distribution):
 
     @property
     def mode(self) -> Tensor:
-        """Deterministic action, under the name that torch uses."""
+        """Deterministic action `(..., action_dim)`, under the name that torch uses."""
         return self.deterministic_sample

@@ -30,7 +30,7 @@ def at_least_float32(x: Tensor) -> Tensor:
 
 
 def log_cosh(u: Tensor) -> Tensor:
-    """Return the logarithm of cosh, without overflow.
+    """Return the logarithm of cosh elementwise (any shape), without overflow.
 
     Example:
         >>> log_cosh(torch.tensor([0.0, 1000.0])).tolist()

@@ -38,12 +38,27 @@ class TanhGaussian(TanhNormal):
         Distribution.__init__(self, loc.shape[:-1], loc.shape[-1:], validate_args=False)
 
     def rsample_and_log_prob(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
-        """Draw reparameterised actions `(*sample_shape, ..., A)`, and return them and their log-densities."""
+        """Draw reparameterised actions.
+
+        Args:
+            sample_shape: Shape before the batch shape.
+
+        Returns:
+            Actions `(*sample_shape, ..., A)` and their log-densities `(*sample_shape, ...)`.
+        """
         loc, scale = at_least_float32(self.loc), at_least_float32(self.scale)
         return _SampleAndScore.apply(loc, scale, self._noise(sample_shape))  # pyright: ignore[reportReturnType]
 
     def sample_and_log_prob(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
-        """Draw actions without gradient, and return them and their log-densities with the score-function gradient."""
+        """Draw actions without gradient.
+
+        Args:
+            sample_shape: Shape before the batch shape.
+
+        Returns:
+            Actions `(*sample_shape, ..., A)`, and their log-densities `(*sample_shape, ...)` with the score-function
+            gradient.
+        """
         with torch.no_grad():
             u = self.loc + self.scale * self._noise(sample_shape)
         noise = (u - self.loc) / self.scale
@@ -51,11 +66,11 @@ class TanhGaussian(TanhNormal):
         return torch.tanh(u), (log_prob - 0.5 * noise.square()).sum(-1)
 
     def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
-        """Draw reparameterised actions."""
+        """Draw reparameterised actions `(*sample_shape, ..., A)`."""
         return torch.tanh(self.loc + self.scale * self._noise(sample_shape))
 
     def sample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
-        """Draw actions without gradient."""
+        """Draw actions `(*sample_shape, ..., A)` without gradient."""
         with torch.no_grad():
             return self.rsample(sample_shape)
 
@@ -65,7 +80,7 @@ class TanhGaussian(TanhNormal):
 
     @property
     def deterministic_sample(self) -> Tensor:
-        """Median, `tanh(loc)`."""
+        """Median `tanh(loc)`, `(..., A)`."""
         return torch.tanh(self.loc)
 
     @property
@@ -74,12 +89,25 @@ class TanhGaussian(TanhNormal):
         return Normal(self.loc, self.scale)
 
     def expand(self, batch_shape: torch.Size | tuple[int, ...], _instance: None = None) -> TanhGaussian:
-        """Return the distribution with its parameters expanded to a batch shape."""
+        """Return the distribution with its parameters expanded to a batch shape.
+
+        Args:
+            batch_shape: Batch shape of the result.
+            _instance: Not used.
+
+        Returns:
+            Distribution of batch shape `batch_shape`.
+        """
         shape = (*batch_shape, *self.event_shape)
         return TanhGaussian(self.loc.expand(shape), self.scale.expand(shape))
 
     def update(self, loc: Tensor, scale: Tensor) -> None:
-        """Replace the parameters."""
+        """Replace the parameters.
+
+        Args:
+            loc: Location `(..., A)` before the tanh.
+            scale: Scale `(..., A)` above 0.
+        """
         self.__init__(loc, scale)
 
     def _noise(self, sample_shape: torch.Size | tuple[int, ...]) -> Tensor:

@@ -60,7 +60,15 @@ def drawing(
 
 
 def shade(index: int, count: int) -> Any:
-    """Return the colour of line `index` of `count` ordered lines, for example of rising weights."""
+    """Return the colour of line `index` of `count` ordered lines, for example of rising weights.
+
+    Args:
+        index: Number of the line, from 0.
+        count: Number of lines.
+
+    Returns:
+        RGBA colour.
+    """
     return plt.get_cmap("viridis")(0.9 * index / max(count - 1, 1))
 
 
@@ -132,5 +140,10 @@ def grid_lines(cells: Sequence[dict[str, Any]], space: StyleSpace) -> tuple[str 
 
 
 def with_unit(name: str, unit: str) -> str:
-    """Return a readable name with its unit in brackets."""
+    """Return a readable name with its unit in brackets.
+
+    Args:
+        name: Name, with underscores.
+        unit: Unit, or "".
+    """
     return f"{readable(name)} [{unit}]" if unit else readable(name)

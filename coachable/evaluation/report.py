@@ -114,7 +114,7 @@ def write_report(
         agent = next(iter(agents.values()))
         styles = StyleTable(runs, agent.space)
         formats = _formats(styles, domain)
-        page = Page(f"{domain.name}: what was asked, and what was done", _lead(agents, runs, episodes))
+        page = Page(f"{domain.name}: requested and measured style", _lead(agents, runs, episodes))
         _styles(page, styles, formats, agent, folder)
         _requests(page, styles, agent, runs, folder)
         _switches(page, domain, runs, switch_episodes, formats, folder)

@@ -51,7 +51,14 @@ def draw_metrics(
 
 
 def draw_requests(table: StyleTable, space: StyleSpace, parameters: Sequence[str], path: Path) -> None:
-    """Draw measured over requested values of some parameters, one line per option of the first choice."""
+    """Draw measured over requested values of some parameters, one line per option of the first choice.
+
+    Args:
+        table: Estimates by style cell.
+        space: The style space.
+        parameters: Names of the set-points, one panel each.
+        path: Image file to write.
+    """
     choice = next((p for p in space.parameters if isinstance(p, Choice) and p.name in table.cells[0]), None)
     options: Sequence[Any] = choice.options if choice else (None,)
     with _panels(path, len(parameters)) as panels:
@@ -70,7 +77,13 @@ def draw_requests(table: StyleTable, space: StyleSpace, parameters: Sequence[str
 
 
 def draw_switches(runs: Sequence[Run], period_seconds: float, path: Path) -> None:
-    """Draw the share of the switches that the agent complied with over the time since the switch."""
+    """Draw the share of the switches that the agent complied with over the time since the switch.
+
+    Args:
+        runs: Evaluations, over which the 95 % interval is estimated.
+        period_seconds: Time between two switches [s].
+        path: Image file to write.
+    """
     with _panels(path, 1) as (panel,):
         times = np.linspace(0.0, period_seconds, _GROWTH_POINTS)
         counts = np.array([run.switching.switches or np.nan for run in runs])
@@ -86,7 +99,14 @@ def draw_switches(runs: Sequence[Run], period_seconds: float, path: Path) -> Non
 
 
 def draw_tradeoffs(runs: Sequence[Run], success: str, form: str, path: Path) -> None:
-    """Draw task success over the amount of style along each weight, from neutral to maximum (Pareto curves)."""
+    """Draw task success over the amount of style along each weight, from neutral to maximum (Pareto curves).
+
+    Args:
+        runs: Evaluations, over which the 95 % intervals are estimated.
+        success: Metric of task success.
+        form: Format of its values, such as ".0%".
+        path: Image file to write.
+    """
     with _panels(path, len(runs[0].sweeps)) as panels:
         for panel, sweeps in zip(panels, zip(*(run.sweeps for run in runs), strict=True), strict=False):
             score = sweeps[0].score

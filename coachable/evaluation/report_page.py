@@ -75,7 +75,12 @@ class Page:
         self._sections: list[tuple[str, str]] = []
 
     def section(self, title: str, *parts: str) -> None:
-        """Add a section of parts from `paragraph`, `picture` and `table`."""
+        """Add a section of parts from `paragraph`, `picture` and `table`.
+
+        Args:
+            title: Heading of the section.
+            *parts: HTML in order.
+        """
         self._sections.append((title, "\n".join(parts)))
 
     def text(self, footer: str) -> str:
@@ -103,7 +108,12 @@ def paragraph(text: str) -> str:
 
 
 def picture(path: Path, description: str) -> str:
-    """Return a PNG file as inline HTML, at the scale that all pictures share."""
+    """Return a PNG file as inline HTML, at the scale that all pictures share.
+
+    Args:
+        path: PNG file.
+        description: Text for readers who do not see it.
+    """
     content = path.read_bytes()
     width = int.from_bytes(content[16:20], "big")  # from the header (PNG specification, IHDR)
     data = base64.b64encode(content).decode()
@@ -138,7 +148,12 @@ def table(rows: Sequence[Mapping[str, Any]], formats: Mapping[str, str], colour:
 
 
 def shown(value: Any, form: str) -> str:
-    """Return a value as text: a number in a format, an estimate with its interval, "n/a" for NaN."""
+    """Return a value as text: a number in a format, an estimate with its interval, "n/a" for NaN.
+
+    Args:
+        value: A number, an `Estimate` or a word.
+        form: Format of numbers, such as ".2f".
+    """
     if isinstance(value, Estimate):
         if math.isnan(value.value):
             return _NOTHING

@@ -69,7 +69,15 @@ class Rollout:
 
     @torch.no_grad()
     def step(self, policy: TensorDictModuleBase, style: Tensor) -> TensorDictBase:
-        """Make one step with styles (N, d) and return the transition, batch shape (N,)."""
+        """Make one step.
+
+        Args:
+            policy: Policy that writes `action`.
+            style: Raw styles (N, d) to act under.
+
+        Returns:
+            Transition, batch shape (N,).
+        """
         with self._chance.drawn():
             transition = self.env.step(policy(self._current.set(STYLE, style)))
         self._current = step_mdp(transition)

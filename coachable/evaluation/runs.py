@@ -97,7 +97,16 @@ def estimate(scores: np.ndarray | Sequence[float]) -> Estimate:
 
 
 def sweep_estimate(sweeps: Sequence[WeightSweep], metric: str, position: int) -> Estimate:
-    """Aggregate a metric over the runs' sweeps of one weight, at one of its values."""
+    """Aggregate a metric over the runs' sweeps of one weight, at one of its values.
+
+    Args:
+        sweeps: The same sweep of every run.
+        metric: Name of the metric.
+        position: Index of the weight's value.
+
+    Returns:
+        Interquartile mean with its 95 % interval over the runs.
+    """
     return estimate([mean_of(sweep.episodes[metric][position]) for sweep in sweeps])
 
 
@@ -124,7 +133,15 @@ class StyleTable:
         return measured_column(metric, self.cells[0])
 
     def of(self, metric: str, cells: Sequence[int]) -> Estimate:
-        """Estimate a metric over some of the cells."""
+        """Estimate a metric over some of the cells.
+
+        Args:
+            metric: Name of the metric.
+            cells: Numbers of the style cells.
+
+        Returns:
+            Interquartile mean with its 95 % interval over runs and cells.
+        """
         return estimate(self.scores[metric][:, list(cells)])
 
     def rows(self, metrics: Sequence[str]) -> list[dict[str, Any]]:
@@ -158,7 +175,15 @@ class StyleTable:
 
 
 def response_rows(runs: Sequence[Run], space: StyleSpace) -> list[dict[str, Any]]:
-    """Estimate over the runs how measured set-points follow their requests (`StyleGrid.response`)."""
+    """Estimate over the runs how measured set-points follow their requests (`StyleGrid.response`).
+
+    Args:
+        runs: Evaluations of the same grid.
+        space: The style space.
+
+    Returns:
+        One row per set-point; `slope`, `rank_correlation` and `mean_error` are estimates over the runs.
+    """
     per_run = [run.grid.response(space) for run in runs]
     rows = []
     for entries in zip(*per_run, strict=True):

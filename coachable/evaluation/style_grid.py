@@ -109,7 +109,12 @@ def evaluate_grid(
 
 
 def measured_column(name: str, cell: Mapping[str, Any]) -> str:
-    """Return the column of a metric; a measured style parameter gets a prefix to tell it from the request."""
+    """Return the column of a metric; a measured style parameter gets a prefix to tell it from the request.
+
+    Args:
+        name: Name of the metric.
+        cell: The requested style by name.
+    """
     return f"measured_{name}" if name in cell else name
 
 
@@ -119,7 +124,12 @@ def mean_of(values: np.ndarray) -> float:
 
 
 def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Write rows with the same keys as CSV."""
+    """Write rows with the same keys as CSV.
+
+    Args:
+        rows: Rows with the same keys.
+        path: File to write.
+    """
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()

@@ -115,7 +115,18 @@ def render(
 
 
 def default_tour(domain: Domain, space: StyleSpace) -> list[dict[str, Any]]:
-    """Return every option of each choice with low, middle and high set-points, or the domain's grid for weights."""
+    """Return the styles of a film for which no styles were requested.
+
+    A space without weights has every option of each choice with low, middle and high set-points. A space with weights
+    has the domain's evaluation grid.
+
+    Args:
+        domain: The domain.
+        space: The agent's style space.
+
+    Returns:
+        Styles by name, in the order of the film.
+    """
     if any(isinstance(p, Weight) for p in space.parameters):
         return domain.cells()
     choices = [p for p in space.parameters if isinstance(p, Choice)]
@@ -281,7 +292,15 @@ def caption(frame: np.ndarray, lines: tuple[str, str]) -> np.ndarray:
 
 
 def tiled(frames: Sequence[np.ndarray], columns: int = 3) -> np.ndarray:
-    """Return frames of one size (height, width, 3) uint8 as one picture, in rows of `columns`."""
+    """Arrange frames in one picture, in rows from left to right.
+
+    Args:
+        frames: Frames of one size (height, width, 3) uint8.
+        columns: Frames per row.
+
+    Returns:
+        Picture (rows * height, columns * width, 3) uint8; unused places are black.
+    """
     height, width = frames[0].shape[:2]
     columns = min(columns, len(frames))
     rows = -(-len(frames) // columns)

@@ -12,7 +12,12 @@ def readable(name: Any) -> str:
 
 
 def readable_number(value: float, unit: str = "") -> str:
-    """Return a number with three significant digits, or as a whole number from 1000 on, and its unit."""
+    """Return a number with three significant digits, or as a whole number from 1000 on, and its unit.
+
+    Args:
+        value: The number.
+        unit: Unit to append, or "".
+    """
     number = f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
     return f"{number} {unit}".rstrip()
 

@@ -69,6 +69,12 @@ def write_onnx(agent: LoadedPolicy, domain: Domain | None, out: Path) -> float:
         domain: Its domain, in which the recording is made; without one the contract has neither a recording nor a
             control step.
         out: File to write.
+
+    Returns:
+        Largest difference between the actions of the file and those of torch.
+
+    Raises:
+        CheckpointError: If the file differs from torch by more than the tolerance.
     """
     onnx = import_onnx()
     plain = DeterministicAction(agent.actor).eval()

@@ -67,7 +67,16 @@ class Rig:
         return np.stack(seen)
 
     def repeat(self, seed: int, action: np.ndarray, style: np.ndarray | None = None) -> np.ndarray:
-        """Run an episode with given actions (T, A) and styles (T, d), by default the space's default style."""
+        """Run an episode with given actions.
+
+        Args:
+            seed: Seed of the start.
+            action: Actions (T, A).
+            style: Raw styles (T, d); None for the space's default style.
+
+        Returns:
+            Observations (T + 1, D) before the first step and after each, fewer if the episode ends.
+        """
         default = self.space.default
         styles = None if style is None else torch.from_numpy(style)
         return self.run(seed, len(action), lambda k, _: (default if styles is None else styles[k], action[k]))

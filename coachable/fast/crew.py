@@ -29,7 +29,12 @@ def crew_size() -> int:
 
 
 def cut_rows(rows: int, shares: int) -> list[slice]:
-    """Return at most `shares` slices of nearly equal size that cover all rows; few rows are cut less often."""
+    """Return slices of nearly equal size that cover all rows.
+
+    Args:
+        rows: Number of rows.
+        shares: Largest number of slices; few rows are cut into fewer.
+    """
     shares = min(shares, max(1, rows // _FEWEST_ROWS))
     return [slice(start, stop) for start, stop in pairwise(rows * i // shares for i in range(shares + 1))]
 

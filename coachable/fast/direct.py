@@ -85,7 +85,12 @@ class Share:
 
 
 def has_direct_gradients(loss_module: LossModule, *plans: Plan) -> bool:
-    """Return whether :class:`DirectGradients` computes a loss, given the plans of its networks."""
+    """Return whether :class:`DirectGradients` computes a loss, given the plans of its networks.
+
+    Args:
+        loss_module: The loss.
+        *plans: Plans of its networks.
+    """
     loss: Any = loss_module
     if load_sac() is None or type(loss) not in (SACLoss, QRSACLoss) or len(loss.actor_network) != 2:
         return False
@@ -132,7 +137,7 @@ class DirectGradients:
 
     @torch.no_grad()
     def both(self, batch: TensorDictBase) -> dict[str, Tensor]:
-        """Return what the loss returns, after the gradients of policy, critics and temperature are set."""
+        """Set the gradients of policy, critics and temperature, and return the scalar losses, alpha and entropy."""
         found = self._gradients(batch, critic=True, actor=True)
         loss_actor, log_prob = self._actor_loss(found, batch)
         batch.set(self._loss.tensor_keys.priority, found["td_error"].view(batch.batch_size))

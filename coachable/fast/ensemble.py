@@ -44,6 +44,10 @@ def use_plan(network: ResidualMLP, plan: Plan | None) -> None:
     """Evaluate a residual network with `plan` from now on, or layer by layer again (`None`).
 
     With a plan, gradients go where the plan says and not into the parameters' `.grad`.
+
+    Args:
+        network: The network.
+        plan: Its plan, or None.
     """
     if plan is None:
         vars(network).pop("forward", None)
@@ -79,7 +83,12 @@ def make_plan(network: ResidualMLP, name: str, tensors: Mapping[str, Triple], me
 
 
 def planned_copy(module: nn.Module, plans: Mapping[str, Plan]) -> nn.Module:
-    """Copy the structure of `module`, not its tensors, and evaluate the residual networks of the copy with `plans`."""
+    """Copy the structure of `module`, not its tensors, and evaluate the residual networks of the copy with `plans`.
+
+    Args:
+        module: Module that contains residual networks.
+        plans: Plan of each residual network, by its name in the module.
+    """
 
     def shell(part: nn.Module) -> nn.Module:
         new = copy.copy(part)

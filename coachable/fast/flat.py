@@ -60,7 +60,7 @@ class FlatBuffers:
         self._versions = [tensor._version for tensor in self.tensors]
 
     def another_gradient(self) -> tuple[Tensor, list[Tensor]]:
-        """Return a vector like `grad`, and its parts like `grads`."""
+        """Return a vector like `grad` `(n,)`, and its parts like `grads`."""
         return self._views(self.tensors[0].dtype)
 
     def _views(self, dtype: torch.dtype) -> tuple[Tensor, list[Tensor]]:

@@ -36,7 +36,16 @@ class Layer:
         return 0 if self.side == "end" else n - m, 0, m
 
     def skip(self, x: Tensor, hidden: Tensor, *, inplace: bool) -> Tensor:
-        """Return `hidden + fit(x)`; `hidden` may be overwritten if `inplace`."""
+        """Return `hidden + fit(x)`; `hidden` may be overwritten if `inplace`.
+
+        Args:
+            x: Input of the layer (rows, in_features).
+            hidden: Output before the residual connection (rows, out_features).
+            inplace: Whether `hidden` may be overwritten.
+
+        Returns:
+            (rows, out_features).
+        """
         start, to, width = self.skip_columns
         if width == self.out_features:
             x = x[:, start : start + width]
@@ -46,7 +55,11 @@ class Layer:
         return out
 
     def skip_adjoint(self, grad: Tensor) -> Tensor:
-        """Return the gradient of `fit(x)` with respect to x."""
+        """Return the gradient (rows, in_features) of `fit(x)` with respect to x.
+
+        Args:
+            grad: Gradient of the output (rows, out_features).
+        """
         start, to, width = self.skip_columns
         missing = self.in_features - width
         return F.pad(grad, (start, missing - start)) if missing else grad[:, to : to + width]
@@ -82,7 +95,12 @@ class TorchPasses:
         self._kept: list[list[tuple[Tensor, ...]]] = []
 
     def forward(self, inputs: Sequence[Tensor], out: Sequence[Tensor]) -> None:
-        """Evaluate the members on `inputs` `(rows, d_i)` into `out`, each `(rows, o)`."""
+        """Evaluate the members.
+
+        Args:
+            inputs: Parts of the common input, (rows, d_i) each.
+            out: Outputs to write, (rows, o) for each member.
+        """
         dtype = self._members[0].products[0].dtype
         x = torch.cat([t.to(dtype) for t in inputs], -1)
         self._kept = [self._forward(x, member, into) for member, into in zip(self._members, out, strict=True)]

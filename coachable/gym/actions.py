@@ -36,7 +36,19 @@ def action_components(space: spaces.Space) -> tuple[list[int], int]:
 
 
 def native_action(space: spaces.Space, choices: Iterator[int], axes: Iterator[float]) -> Any:
-    """Make an action of a space from the next choices (indices) and axes (in [-1, 1])."""
+    """Make an action of a space from the next choices (indices) and axes (in [-1, 1]).
+
+    Args:
+        space: Space of the environment's actions, possibly nested.
+        choices: Indices of the discrete entries, in order.
+        axes: Values of the continuous entries in [-1, 1], in order.
+
+    Returns:
+        An element of the space.
+
+    Raises:
+        AssertionError: If the space is of an unknown type.
+    """
     match space:
         case spaces.Discrete():
             return space.start + next(choices)

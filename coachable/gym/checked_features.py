@@ -31,7 +31,12 @@ def checked_features(features: ArrayLike) -> np.ndarray:
 
 
 def flat_observation(space: spaces.Space, observation: Any) -> np.ndarray:
-    """Return an observation as a vector (D,), where D is `flatdim(space)`."""
+    """Return an observation as a vector (D,), where D is `flatdim(space)`.
+
+    Args:
+        space: Space of the observation.
+        observation: An element of it.
+    """
     flat = spaces.flatten(space, observation)
     assert isinstance(flat, np.ndarray)  # flatdim has raised for spaces without a fixed size
     return flat

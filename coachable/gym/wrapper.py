@@ -107,7 +107,15 @@ class StyleWrapper(gymnasium.Wrapper, RecordConstructorArgs):
             self._held = self.space.clamp(theta, strict=strict)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode with the style that was set, or else a newly drawn one; `seed` also seeds the draws."""
+        """Start an episode with the style that was set, or else a newly drawn one.
+
+        Args:
+            seed: Seed of the environment and of the draws of styles; None to continue both.
+            options: Options for the environment.
+
+        Returns:
+            Observation as described in the class, and the environment's info with the raw style `(d,)` as "style".
+        """
         observation, info = self.env.reset(seed=seed, options=options)
         if seed is not None:
             self._generator.manual_seed(derive_seed(seed, STYLE))
@@ -116,7 +124,15 @@ class StyleWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         return self._shown(observation), {**info, STYLE: self._style.numpy().copy()}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Make a step and add the reward of the style in the observation before it."""
+        """Make a step and add the reward of the style in the observation before it.
+
+        Args:
+            action: Action of the environment.
+
+        Returns:
+            Observation, the environment's reward plus the style reward, terminated, truncated, and the environment's
+            info with the raw style `(d,)` of the next observation, `task_reward` and `style_reward`.
+        """
         observation, reward, terminated, truncated, info = self.env.step(action)
         features = checked_features(self.features(observation, action, info))
         task_reward = float(reward)  # pyright: ignore[reportArgumentType]  # SupportsFloat

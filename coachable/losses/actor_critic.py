@@ -202,7 +202,18 @@ class ActorCriticLoss(SACLoss):
         self._out_keys = values
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> ActorCriticLoss:
-        """Set `gamma`. Only TD(0) is supported; pass n-step returns as rewards with `steps_to_next_obs`."""
+        """Set `gamma`. Only TD(0) is supported; pass n-step returns as rewards with `steps_to_next_obs`.
+
+        Args:
+            value_type: None or `ValueEstimators.TD0`.
+            **hyperparams: `gamma`, the discount in [0, 1], and `device`.
+
+        Returns:
+            This loss.
+
+        Raises:
+            ValueError: If another estimator or another hyper-parameter is asked for, or gamma is out of range.
+        """
         if value_type not in (None, ValueEstimators.TD0) or set(hyperparams) - {"gamma", "device"}:
             raise ValueError(
                 f"{type(self).__name__} computes its own TD(0) target and takes gamma alone, got value_type="

@@ -60,7 +60,15 @@ def pessimistic_quantiles(quantiles: Tensor) -> Tensor:
 
 
 def quantile_midpoints(num_quantiles: int, like: Tensor) -> Tensor:
-    """Return the quantile fractions `(2i - 1) / (2M)`, i = 1..M, with the device and dtype of `like`."""
+    """Return the quantile fractions `(2i - 1) / (2M)`, i = 1..M, with the device and dtype of `like`.
+
+    Args:
+        num_quantiles: M.
+        like: Tensor with the wanted device and dtype.
+
+    Returns:
+        Quantile fractions `(M,)`.
+    """
     index = torch.arange(num_quantiles, device=like.device, dtype=like.dtype)
     return (index + 0.5) / num_quantiles
 

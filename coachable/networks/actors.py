@@ -68,7 +68,19 @@ class StyleNetwork(nn.Module):
         self.trunk = ResidualMLP(inputs + (0 if space is None else space.dim), outputs, widths, **trunk)
 
     def head(self, observation: Tensor, style: Tensor | None, *further: Tensor) -> Tensor:
-        """Return the output `(..., outputs)` of the head; `style` is not encoded."""
+        """Return the output of the head.
+
+        Args:
+            observation: Observation `(..., obs_dim)`.
+            style: Raw style `(..., d)`, encoded here; None without a style space.
+            *further: Further inputs `(..., d_i)`, after the encoded style.
+
+        Returns:
+            Output `(..., outputs)`.
+
+        Raises:
+            ValueError: If the network has a style space and `style` is None.
+        """
         if self.space is None:
             return self.trunk(observation, *further)
         if style is None:
@@ -108,7 +120,19 @@ class GaussianPolicy(StyleNetwork):
         self.log_scale_range = (float(low), float(high))
 
     def forward(self, observation: Tensor, style: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return location and scale, both `(..., action_dim)` float32; `style` is not encoded."""
+        """Return location and scale of the tanh-Gaussian.
+
+        Args:
+            observation: Observation `(..., obs_dim)`.
+            style: Raw style `(..., d)`, encoded here; None without a style space.
+
+        Returns:
+            Location and scale, both `(..., action_dim)` float32. The scale is `exp(l + (h - l)(tanh(raw) + 1) / 2)`
+            with the bounds (l, h) of its logarithm.
+
+        Raises:
+            ValueError: If the network has a style space and `style` is None.
+        """
         loc, raw = self.head(observation, style).chunk(2, -1)
         low, high = self.log_scale_range
         return loc, torch.exp(torch.tanh(raw) * (0.5 * (high - low)) + 0.5 * (high + low))

@@ -39,7 +39,19 @@ class StyleCritic(StyleNetwork):
         super().__init__(space, obs_dim + action_dim, num_outputs, widths, **trunk)
 
     def forward(self, observation: Tensor, action: Tensor, style: Tensor | None = None) -> Tensor:
-        """Return `(..., num_outputs)` float32; `style` is not encoded."""
+        """Return the critic's output.
+
+        Args:
+            observation: Observation `(..., obs_dim)`.
+            action: Action `(..., action_dim)`.
+            style: Raw style `(..., d)`, encoded here; None without a style space.
+
+        Returns:
+            Output `(..., num_outputs)` float32.
+
+        Raises:
+            ValueError: If the network has a style space and `style` is None.
+        """
         return self.head(observation, style, action)
 
 

@@ -44,7 +44,19 @@ class MixedPolicy(StyleNetwork):
         self.heads = heads
 
     def forward(self, observation: Tensor, style: Tensor | None = None) -> tuple[Tensor, ...]:
-        """Return `probs` if there are categorical heads, then `loc` and `scale` if there are axes, in float32."""
+        """Return the parameters of the action's distribution.
+
+        Args:
+            observation: Observation `(..., obs_dim)`.
+            style: Raw style `(..., d)`, encoded here; None without a style space.
+
+        Returns:
+            `probs` `(..., sum of head sizes)` if there are categorical heads, by regret matching (paper, Appendix B),
+            then `loc` and `scale` `(..., axes)` if there are axes, all float32. The scale is `exp(2 tanh(raw))`.
+
+        Raises:
+            ValueError: If the network has a style space and `style` is None.
+        """
         raw = at_least_float32(self.head(observation, style))
         preferences, loc, raw_scale = raw.split((self.heads.num_categorical, self.heads.axes, self.heads.axes), -1)
         outputs: tuple[Tensor, ...] = ()

@@ -222,7 +222,7 @@ class EventTableBuffer(TensorDictReplayBuffer):
         return index
 
     def add(self, data: TensorDictBase) -> Tensor:
-        """Add one step; see `extend`."""
+        """Add one step of batch shape `()`; see `extend`."""
         return self.extend(data.unsqueeze(0))
 
     def finish(self, trajectories: Tensor | None = None) -> Tensor:
@@ -248,7 +248,15 @@ class EventTableBuffer(TensorDictReplayBuffer):
             self.update_priority(data.get("index"), data.get(self.priority_key))
 
     def update_priority(self, index: Tensor, priority: Tensor) -> None:
-        """Set priorities of slots; see `StratifiedSampler.update_priority`."""
+        """Set priorities of slots; see `StratifiedSampler.update_priority`.
+
+        Args:
+            index: Slots of any shape.
+            priority: TD errors of the same shape, possibly with further dimensions, over which the largest counts.
+
+        Raises:
+            RuntimeError: If the buffer is not prioritised.
+        """
         with self._replay_lock, self._write_lock:
             self._sampler.update_priority(index, priority)
 

@@ -70,7 +70,7 @@ class NStep:
         """Return steps that are held back, with their sums ended at the last step.
 
         Args:
-            streams: The streams whose steps to return; None returns all.
+            streams: Numbers of the streams, `(k,)` int, whose steps to return; None returns all.
 
         Returns:
             The transitions and their bookkeeping, or None without such steps.
@@ -152,7 +152,12 @@ class NStep:
         return {"data": self._data.to_dict(), "steps": self._steps.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any], device: torch.device | None = None) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore the steps that `state_dict` returned.
+
+        Args:
+            state: Result of `state_dict`; empty if no steps were held back.
+            device: Device of the restored steps.
+        """
         self.clear()
         if state:
             self._steps = Steps.from_state_dict(state["steps"])

@@ -84,7 +84,7 @@ class Regions:
         return ascending[np.searchsorted(self.offsets[ascending], slot, side="right") - 1]
 
     def slots(self, table: int) -> np.ndarray:
-        """Return the slots of the live records of one table, oldest first."""
+        """Return the slots `(records,)` int of the live records of one table, oldest first."""
         size, written = int(self.sizes[table]), int(self.written[table])
         return self.offsets[table] + np.arange(written - size, written) % self.capacities[table]
 

@@ -156,6 +156,13 @@ class KeyRoute:
 def checked_events(predicate: EventPredicate, steps: TensorDictBase) -> Tensor:
     """Evaluate a predicate and check the result.
 
+    Args:
+        predicate: Function from steps to events.
+        steps: Transitions, batch shape `(steps,)`.
+
+    Returns:
+        Events `(steps, len(names))` bool.
+
     Raises:
         ValueError: If the result is not boolean `(steps, len(names))`.
     """
@@ -172,6 +179,13 @@ def checked_events(predicate: EventPredicate, steps: TensorDictBase) -> Tensor:
 
 def checked_route(route: Route, steps: TensorDictBase) -> Tensor:
     """Evaluate a route and check the result.
+
+    Args:
+        route: Function from steps to tables.
+        steps: Transitions, batch shape `(steps,)`.
+
+    Returns:
+        Numbers of tables `(steps,)` int.
 
     Raises:
         ValueError: If the result is not integer `(steps,)` or names no table.

@@ -46,7 +46,7 @@ class Steps:
         return Steps(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Steps)})
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the columns as tensors."""
+        """Return the columns as tensors `(steps,)` by name."""
         return {f.name: torch.from_numpy(getattr(self, f.name).copy()) for f in fields(self)}
 
     @staticmethod

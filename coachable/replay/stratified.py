@@ -124,6 +124,10 @@ class StratifiedSampler(Sampler):
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
         """Draw slots, grouped by table.
 
+        Args:
+            storage: The buffer's storage.
+            batch_size: Number of slots.
+
         Returns:
             Slots `(batch_size,)`, and a dictionary with `table` and, if prioritised, `priority_weight`, of that shape.
             The weight is ``(n P(i))^-beta`` over the largest one of the batch. n is the number of records of the table,
@@ -145,7 +149,12 @@ class StratifiedSampler(Sampler):
         return slot, info
 
     def can_sample(self, storage: Storage, batch_size: int) -> bool:
-        """Return whether a batch can be drawn."""
+        """Return whether a batch can be drawn.
+
+        Args:
+            storage: Not used.
+            batch_size: Number of slots.
+        """
         try:
             self._allot(batch_size)
         except ValueError:
@@ -153,13 +162,13 @@ class StratifiedSampler(Sampler):
         return True
 
     def extend(self, index: Tensor) -> None:
-        """Give new records the largest priority so far."""
+        """Give new records, with the slots `index` `(k,)`, the largest priority so far."""
         if self.prioritized and len(index):
             tree = self._tree_on(index.device)
             tree.update(index, self._largest_priority(index.device).expand(len(index)))
 
     def add(self, index: int | Tensor) -> None:
-        """Give a new record the largest priority so far."""
+        """Give a new record, with the slot `index` `()`, the largest priority so far."""
         self.extend(torch.as_tensor(index).reshape(-1))
 
     def update_priority(self, index: Any, priority: Any, *, storage: Storage | None = None) -> None:

@@ -127,7 +127,7 @@ class SumTree:
         return self.get(torch.arange(int(self.capacities.sum()), device=self.device))
 
     def load_leaves(self, leaves: Tensor) -> None:
-        """Restore what `leaves` returned."""
+        """Restore the priorities `(slots,)` that `leaves` returned."""
         self.update(torch.arange(leaves.numel(), device=self.device), leaves)
 
     def _locate(self, slot: Tensor) -> tuple[Tensor, Tensor]:

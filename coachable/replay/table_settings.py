@@ -14,6 +14,11 @@ __all__ = ["checked_horizon", "checked_proportions", "make_regions"]
 def make_regions(capacities: Mapping[str, int], route: Route | None, events: EventPredicate | None) -> Regions:
     """Return the regions of the tables: routed tables, then event tables.
 
+    Args:
+        capacities: Records of each table, by name.
+        route: Route to the tables that every step enters; None for the single table "default".
+        events: Predicate of the event tables; None for none.
+
     Raises:
         ValueError: If names are missing, unknown or given twice, or a capacity is not positive.
     """
@@ -36,6 +41,13 @@ def checked_horizon(
     regions: Regions, routed: int, events: EventPredicate | None, horizon: int | None, num_envs: int | None
 ) -> int:
     """Check H_max against the tables, and return it, or 1 without event tables.
+
+    Args:
+        regions: The tables.
+        routed: Number of routed tables, which come first.
+        events: Predicate of the event tables; None for none.
+        horizon: H_max, the longest window before an event [env-steps].
+        num_envs: Number of environments that fill the buffer.
 
     Raises:
         ValueError: If it is missing, not positive, or larger than a table, or there are no event tables.

@@ -69,7 +69,7 @@ class TableWriter(Writer):
         return int(self.regions.written[: self.base_tables].sum())
 
     def add(self, data: TensorDictBase) -> Tensor:
-        """Write one step."""
+        """Write one step of batch shape `()`, and return the slots `(k,)` of its records."""
         return self.extend(data.unsqueeze(0))
 
     def extend(self, data: TensorDictBase) -> Tensor:
@@ -102,7 +102,7 @@ class TableWriter(Writer):
         return self._write(rows, steps)
 
     def finish(self, streams: np.ndarray | None = None) -> Tensor:
-        """End the open episodes of some streams, or of all; see `EventTableBuffer.finish`."""
+        """End the open episodes of some streams `(k,)` int, or of all; see `EventTableBuffer.finish`."""
         rest = self.n_step.flush(streams) if self.n_step is not None else None
         slots = self._write(*rest) if rest is not None else torch.zeros(0, dtype=torch.long)
         if self.history is not None:

@@ -45,7 +45,7 @@ class WindowHistory:
         self.clear()
 
     def clear(self, streams: Array | None = None) -> None:
-        """Drop the open episodes of some streams, or all."""
+        """Drop the open episodes of some streams `(k,)` int, or of all."""
         if streams is None:
             self._allocate(1)
             return

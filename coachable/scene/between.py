@@ -14,7 +14,12 @@ _JUMP = 20.0  # [m], farther apart, the agent was put somewhere else
 
 
 def continues(before: Frame, after: Frame) -> bool:
-    """Return whether the primitives of one frame are those of another, moved."""
+    """Return whether one frame shows the primitives of another one, moved.
+
+    Args:
+        before: Earlier frame.
+        after: Later frame.
+    """
     near = float(np.linalg.norm(np.subtract(after.focus, before.focus))) < _JUMP
     same = all(len(before.parts.of(shape)) == len(after.parts.of(shape)) for shape in SHAPES)
     return near and same and (before.episode, before.place) == (after.episode, after.place)
@@ -27,6 +32,9 @@ def between(before: Frame, after: Frame, share: float) -> Frame:
         before: Frame at share 0.
         after: Frame at share 1, whose colours, sizes, labels and gauges are used.
         share: Share of the way.
+
+    Returns:
+        Frame whose positions are mixed linearly, and whose rotations are mixed along the shorter way and normalised.
     """
     parts = Parts()
     for shape in SHAPES:

@@ -58,7 +58,15 @@ class Map:
     colours: Sequence[Colour]
 
     def scaled(self, width: float, height: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return outline (n, 2) and places (m, 2) in a picture of a size, with y downwards and a margin of 8 %."""
+        """Return outline and places in a picture, with y downwards and a margin of 8 %.
+
+        Args:
+            width: Width of the picture [pixels].
+            height: Height of the picture [pixels].
+
+        Returns:
+            Outline (n, 2) and places (m, 2) [pixels].
+        """
         low, high = self.outline.min(0), self.outline.max(0)
         scale = 0.84 * min(width / (high[0] - low[0]), height / (high[1] - low[1]))
         middle, centre = (low + high) / 2, np.array([width, height]) / 2
@@ -157,9 +165,20 @@ class Stage(Protocol):
         ...
 
     def backdrop(self, env: EnvBase, row: int = 0) -> Backdrop:
-        """Return what does not move, for the place of the last frame."""
+        """Return what does not move, for the place of the last frame.
+
+        Args:
+            env: The base environment.
+            row: Row of the batch.
+        """
         ...
 
     def frame(self, env: EnvBase, row: int = 0, asked: Mapping[str, float | str] | None = None) -> Frame:
-        """Return what is to be seen of the present state of one row; `asked` is the style in force, if known."""
+        """Return what is visible in the present state of one row.
+
+        Args:
+            env: The base environment.
+            row: Row of the batch.
+            asked: Style in force by name, if known.
+        """
         ...

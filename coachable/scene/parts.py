@@ -56,32 +56,72 @@ class Parts:
         return sum(len(batch) for batches in self._rows.values() for batch in batches)
 
     def box(self, position: Numbers, size: Numbers, colour: Colour, wxyz: Numbers = _UPRIGHT) -> Parts:
-        """Add a box and return this collection; the arguments are as in `Batch`."""
+        """Add a box and return this collection.
+
+        Args:
+            position: Centre (3,) [m].
+            size: Sizes along its own axes (3,) [m].
+            colour: Red, green and blue, 0 to 255.
+            wxyz: Rotation as unit quaternion (4,).
+        """
         return self._add(BOX, position, size, colour, wxyz)
 
     def ball(self, position: Numbers, size: Numbers, colour: Colour, wxyz: Numbers = _UPRIGHT) -> Parts:
-        """Add an ellipsoid and return this collection; the arguments are as in `Batch`."""
+        """Add an ellipsoid and return this collection.
+
+        Args:
+            position: Centre (3,) [m].
+            size: Diameters along its own axes (3,) [m].
+            colour: Red, green and blue, 0 to 255.
+            wxyz: Rotation as unit quaternion (4,).
+        """
         return self._add(BALL, position, size, colour, wxyz)
 
     def cylinder(self, position: Numbers, size: Numbers, colour: Colour, wxyz: Numbers = _UPRIGHT) -> Parts:
-        """Add a cylinder along its z axis and return this collection; the arguments are as in `Batch`."""
+        """Add a cylinder along its z axis and return this collection.
+
+        Args:
+            position: Centre (3,) [m].
+            size: Sizes along its own axes (3,) [m].
+            colour: Red, green and blue, 0 to 255.
+            wxyz: Rotation as unit quaternion (4,).
+        """
         return self._add(CYLINDER, position, size, colour, wxyz)
 
     def capsule(self, start: Numbers, end: Numbers, radius: float, colour: Colour) -> Parts:
-        """Add a cylinder between two points with a ball at each end, and return this collection."""
+        """Add a cylinder between two points with a ball at each end, and return this collection.
+
+        Args:
+            start: First point (3,) [m].
+            end: Second point (3,) [m].
+            radius: Radius [m].
+            colour: Red, green and blue, 0 to 255.
+        """
         self.rod(start, end, radius, colour)
         for point in (start, end):
             self.ball(point, (2 * radius,) * 3, colour)
         return self
 
     def rod(self, start: Numbers, end: Numbers, radius: float, colour: Colour) -> Parts:
-        """Add a cylinder between two points and return this collection."""
+        """Add a cylinder between two points and return this collection.
+
+        Args:
+            start: First point (3,) [m].
+            end: Second point (3,) [m].
+            radius: Radius [m].
+            colour: Red, green and blue, 0 to 255.
+        """
         first, last = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
         length = float(np.linalg.norm(last - first))
         return self.cylinder((first + last) / 2, (2 * radius, 2 * radius, length), colour, towards(last - first))
 
     def batch(self, shape: str, batch: Batch) -> Parts:
-        """Add primitives of one shape and return this collection."""
+        """Add primitives of one shape and return this collection.
+
+        Args:
+            shape: Name of the shape.
+            batch: The primitives.
+        """
         self._rows[shape].append(batch)
         return self
 
@@ -156,7 +196,12 @@ def plain(name: str, low: Numbers, high: Numbers, height: float, cell: float, co
 
 
 def above(place: Numbers, height: float) -> np.ndarray:
-    """Return the place (3,) at a height above another one [m]."""
+    """Return the place (3,) at a height above another one [m].
+
+    Args:
+        place: Place (3,) [m].
+        height: Height above it [m].
+    """
     return np.asarray(place, dtype=float) + np.array([0.0, 0.0, height])
 
 
@@ -185,14 +230,30 @@ def towards(direction: np.ndarray) -> np.ndarray:
 
 
 def rotated(wxyz: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return points (N, 3) rotated by a quaternion (4,)."""
+    """Return points (N, 3) rotated by a quaternion (4,).
+
+    Args:
+        wxyz: Unit quaternion (4,).
+        points: (N, 3).
+
+    Returns:
+        (N, 3).
+    """
     w, axis = wxyz[0], wxyz[1:]
     twice = 2.0 * np.cross(axis, points)
     return points + w * twice + np.cross(axis, twice)
 
 
 def multiplied(one: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the rotations that apply `others` (N, 4) first and then `one` (4,)."""
+    """Return the rotations that apply `others` (N, 4) first and then `one` (4,).
+
+    Args:
+        one: Unit quaternion (4,).
+        others: Unit quaternions (N, 4).
+
+    Returns:
+        Unit quaternions (N, 4).
+    """
     w, axis = one[0], one[1:]
     real = w * others[:, :1] - others[:, 1:] @ axis[:, None]
     rest = w * others[:, 1:] + others[:, :1] * axis + np.cross(axis, others[:, 1:])

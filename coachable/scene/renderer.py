@@ -54,7 +54,15 @@ class SceneRenderer:
         self._build(Backdrop(()))  # raises here if there is no OpenGL
 
     def draw(self, env: EnvBase, row: int = 0) -> np.ndarray:
-        """Return an image (height, width, 3) uint8 of the present state of one row."""
+        """Draw the present state of one row.
+
+        Args:
+            env: The base environment.
+            row: Row of the batch.
+
+        Returns:
+            Image (height, width, 3) uint8.
+        """
         return self.draw_way(env, row)[0]
 
     def draw_way(

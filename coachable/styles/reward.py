@@ -81,7 +81,18 @@ class StyleReward(nn.Module):
         return total.to(theta.dtype).unsqueeze(-1)
 
     def terms_of(self, features: Features, theta: Tensor) -> dict[str, Tensor]:
-        """Return each term `(...,)` before it is scaled, by name."""
+        """Return each term of the reward before it is scaled.
+
+        Args:
+            features: Features `(..., F)`, or a tensordict of batch shape `(...)`, which may broadcast against theta.
+            theta: Style `(..., dim)`, not encoded.
+
+        Returns:
+            Terms `(...,)` by name.
+
+        Raises:
+            ValueError: If a term does not return one number per style.
+        """
         style = self.space.view(theta)
         return {name: self._checked(name, term(features, style), theta) for name, term, _ in self._terms}
 

@@ -14,7 +14,12 @@ _REGISTRY: dict[str, type["Sampler"]] = {}
 
 @lru_cache(maxsize=256)
 def constant(values: tuple[float, ...], device: torch.device) -> Tensor:
-    """Return a float32 constant `(n,)` on a device. It is shared, so do not write to it."""
+    """Return a float32 constant `(n,)` on a device. The tensor is shared, so do not write to it.
+
+    Args:
+        values: The n numbers.
+        device: Device of the result.
+    """
     with torch.inference_mode(False):
         return torch.tensor(values, dtype=torch.float32, device=device)
 
@@ -72,7 +77,16 @@ class Sampler:
     def sample_independent(
         self, shape: Sequence[int] = (), generator: Generator | None = None, device: torch.device | str | None = None
     ) -> Tensor:
-        """Draw styles that are all independent, unlike the rows of a batch of `Shared`; see `sample`."""
+        """Draw styles that are all independent, unlike the rows of a batch of `Shared`.
+
+        Args:
+            shape: Batch shape.
+            generator: Generator to draw from; None for torch's global one.
+            device: Device of the result; None for that of the generator, or without one the CPU.
+
+        Returns:
+            Styles `(*shape, dim)`, float32.
+        """
         return self.sample((*shape, 1), generator, device).squeeze(-2)
 
     def _draw(self, shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
@@ -83,7 +97,11 @@ class Sampler:
         return None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return a description that JSON can represent, for `Sampler.from_dict`."""
+        """Return a description that JSON can represent, for `Sampler.from_dict`.
+
+        Raises:
+            TypeError: If the sampler is not a dataclass.
+        """
         if not is_dataclass(self):
             raise TypeError(f"sampler {type(self).__name__} cannot be described: make it a frozen dataclass.")
         return {"type": type(self).__name__, **{f.name: _plain(getattr(self, f.name)) for f in fields(self)}}

@@ -115,7 +115,16 @@ class StyleSpace:
     def sample(
         self, shape: Sequence[int] = (), generator: Generator | None = None, device: torch.device | str | None = None
     ) -> Tensor:
-        """Draw training styles `(*shape, dim)`, float32; see `Sampler.sample`."""
+        """Draw training styles.
+
+        Args:
+            shape: Batch shape.
+            generator: Generator to draw from; None for torch's global one.
+            device: Device of the result; None for that of the generator, or without one the CPU.
+
+        Returns:
+            Styles `(*shape, dim)`, float32, not encoded.
+        """
         return self.sampler.sample(shape, generator, device)
 
     def with_sampler(self, sampler: Sampler) -> "StyleSpace":
@@ -206,6 +215,9 @@ class StyleSpace:
     def validate(self, theta: Tensor) -> None:
         """Check the shape and the values of theta.
 
+        Args:
+            theta: Styles `(..., dim)`, not encoded.
+
         Raises:
             ValueError: If the shape is wrong, a value is NaN or out of range, or a `Choice` block is not a one-hot.
         """
@@ -226,7 +238,11 @@ class StyleSpace:
         return self._columns_of[names]
 
     def describe(self, theta: Tensor) -> dict[str, float | str]:
-        """Return numbers and option names of one style `(dim,)` by name, from which `make` builds it again."""
+        """Return numbers and option names of one style `(dim,)` by name, from which `make` builds it again.
+
+        Raises:
+            ValueError: If theta is not a single style of this space.
+        """
         if tuple(theta.shape) != (self.dim,):
             raise ValueError(f"style has shape {tuple(theta.shape)}: expected ({self.dim},), one style.")
         values = theta.detach().to("cpu", torch.float32)

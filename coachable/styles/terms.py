@@ -105,7 +105,16 @@ def _no_such_feature(features: Features, name: Any) -> str:
 
 
 def scalar_feature(features: Features, key: FeatureKey, like: Tensor) -> Tensor:
-    """Return a feature `(...,)`, without the last dimension of an entry `(..., 1)` that `like` `(...,)` lacks."""
+    """Return a feature without the last dimension of an entry `(..., 1)` that `like` lacks.
+
+    Args:
+        features: Features `(..., F)`, or a tensordict of batch shape `(...)`.
+        key: Column of the features, or key of the tensordict.
+        like: Tensor `(...,)` with the wanted number of dimensions.
+
+    Returns:
+        The feature `(...,)`.
+    """
     value = feature(features, key)
     return value.squeeze(-1) if value.ndim == like.ndim + 1 and value.shape[-1] == 1 else value
 

@@ -71,11 +71,27 @@ class Backend:
         return outputs
 
     def actor(self, losses: LossFunctions, batch: TensorDictBase) -> tuple[Tensor, Any]:
-        """Return the policy's loss and its metadata, after its gradients are set."""
+        """Evaluate the policy's loss and set its gradients.
+
+        Args:
+            losses: The functions of the loss.
+            batch: Transitions `[B]` or `[B, n + 1]`.
+
+        Returns:
+            The scalar loss and its metadata.
+        """
         return self._differentiated(losses.actor, batch)
 
     def critic(self, losses: LossFunctions, batch: TensorDictBase) -> tuple[Tensor, Any]:
-        """Return the critics' loss and its metadata, after its gradients are set."""
+        """Evaluate the critics' loss and set its gradients.
+
+        Args:
+            losses: The functions of the loss.
+            batch: Transitions `[B]` or `[B, n + 1]`, into which `td_error` is written.
+
+        Returns:
+            The scalar loss and its metadata.
+        """
         return self._differentiated(losses.critic, batch)
 
     def make_optimizer(self, name: str, params: list[nn.Parameter], lr: float, eps: float) -> torch.optim.Adam:
@@ -90,7 +106,15 @@ class Backend:
         return torch.optim.Adam(params, lr=lr, eps=eps, fused=self._device_type in ("cpu", "cuda"))
 
     def gradient_norm(self, name: str, params: list[nn.Parameter]) -> Tensor:
-        """Return the norm of the gradients of `params` after the backward pass; see :meth:`make_optimizer`."""
+        """Return the 2-norm of the gradients after the backward pass.
+
+        Args:
+            name: `"actor"`, `"critic"` or `"alpha"`.
+            params: The trained parameters of that name. Those without a gradient do not count.
+
+        Returns:
+            Scalar norm over all parameters together.
+        """
         return torch.nn.utils.get_total_norm([p.grad for p in params if p.grad is not None])
 
     def move_targets(self) -> None:

@@ -126,6 +126,14 @@ class CheckpointStore:
     def try_save(self, state: Mapping[str, Any], metadata: Mapping[str, Any], replay: Any | None = None) -> Path | None:
         """Call `save`, but warn and return None if writing fails, because a full disk should not end a long training.
 
+        Args:
+            state: Content of `state.pt`.
+            metadata: Content of `metadata.json`; must contain `frames`.
+            replay: Replay buffer; saved if this store keeps replay buffers.
+
+        Returns:
+            Folder of the checkpoint, or None if it was not written.
+
         Raises:
             CheckpointError: If a weight is NaN or infinite.
         """

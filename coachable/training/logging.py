@@ -43,7 +43,15 @@ class CsvLog:
             self._rewrite(rows)
 
     def rewind(self, limit: float, key: str = "frames") -> None:
-        """Drop the rows whose `key` exceeds `limit`, which a resumed training writes again."""
+        """Drop the rows beyond a limit, which a resumed training writes again.
+
+        Args:
+            limit: Largest value to keep.
+            key: Column that is compared.
+
+        Raises:
+            ValueError: If the column has an entry that is not a number, or the file is not a table.
+        """
         rows = self._read()
         try:
             kept = [row for row in rows if float(row.get(key) or 0) <= limit]

@@ -101,13 +101,22 @@ def loaded(loss_module: LossModule, _: Any) -> None:
     """Share the actor and raise the parameters' versions after the loss loaded a state, which does neither.
 
     This hook of a loss uses only its arguments, so that it also works for copies of the loss.
+
+    Args:
+        loss_module: The loss that was loaded.
+        _: Keys that PyTorch passes to the hook; not used.
     """
     share_actor(loss_module)
     increment_version([*loss_module.parameters(), *loss_module.buffers()])
 
 
 def follow(optimizer: torch.optim.Optimizer, params: list[nn.Parameter]) -> None:
-    """Replace the parameters of an optimiser with one group; its state is kept and cast to their dtype."""
+    """Replace the parameters of an optimiser with one group; its state is kept and cast to their dtype.
+
+    Args:
+        optimizer: Optimiser with one group.
+        params: New parameters, in the order of the present ones.
+    """
     (group,) = optimizer.param_groups
     moment = optimizer.state[params[0]].get("exp_avg") if params[0] in optimizer.state else None
     same = all(new is old for new, old in zip(params, group["params"], strict=True))

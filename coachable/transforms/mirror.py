@@ -95,7 +95,7 @@ class MirrorSymmetry(Transform):
         return result
 
     def get_extra_state(self) -> Tensor:
-        """Return the state of the generator, for `state_dict`."""
+        """Return the state of the generator, `(bytes,)` uint8, for `state_dict`."""
         return self.generator.get_state()
 
     def set_extra_state(self, state: Any) -> None:

@@ -20,7 +20,17 @@ _MASK = (1 << 64) - 1
 
 
 def derive_seed(seed: int, salt: str) -> int:
-    """Combine a seed with a name, so that streams with the same seed are independent (splitmix64 finaliser)."""
+    """Combine a seed with a name, so that streams with the same seed are independent.
+
+    The bits are mixed by the finaliser of splitmix64 (Steele et al. 2014).
+
+    Args:
+        seed: Seed of the run.
+        salt: Name of the stream.
+
+    Returns:
+        A seed below 2^63.
+    """
     z = (int(seed) * 0x9E3779B97F4A7C15 + zlib.crc32(salt.encode())) & _MASK
     z = ((z ^ (z >> 30)) * 0xBF58476D1CE4E5B9) & _MASK
     z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) & _MASK
@@ -125,11 +135,11 @@ class StyleSampler(Transform):
         return self.transform_observation_spec(state_spec)
 
     def get_extra_state(self) -> Tensor:
-        """Return the state of the generator, for `state_dict`."""
+        """Return the state of the generator, `(bytes,)` uint8, for `state_dict`."""
         return self.generator.get_state()
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Restore the generator from `state_dict`."""
+        """Restore the generator from the result of `get_extra_state`, `(bytes,)` uint8."""
         self.generator.set_state(state.to("cpu", torch.uint8))
         self._seeded = True
 
@@ -152,9 +162,16 @@ class CoachableEnv(TransformedEnv):
     """`TransformedEnv` whose `set_seed` also seeds its transforms, which TorchRL's does not."""
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
-        """Seed the environment and its transforms, and return the seed for the next environment.
+        """Seed the environment and its transforms.
 
         Seed an environment before you give it to a collector, whose constructor resets it.
+
+        Args:
+            seed: The seed.
+            static_seed: Whether the next environment gets the same seed, as in TorchRL.
+
+        Returns:
+            Seed for the next environment.
         """
         following = super().set_seed(seed, static_seed=static_seed)
         for module in self.transform.modules():
@@ -163,7 +180,12 @@ class CoachableEnv(TransformedEnv):
         return following
 
     def hold_style(self, theta: Tensor, strict: bool = False) -> None:
-        """Use a style at every reset until `release_style`; see `StyleSampler.hold`."""
+        """Use a style at every reset until `release_style`; see `StyleSampler.hold`.
+
+        Args:
+            theta: Styles `(dim,)` or `(N, dim)`, not encoded.
+            strict: Raise instead of clamping a style outside the range.
+        """
         for sampler in self._samplers():
             sampler.hold(theta, strict)
 

@@ -281,7 +281,7 @@ def _light(server: viser.ViserServer) -> None:
 
 
 def _surround(server: viser.ViserServer, view: Viewpoint) -> None:
-    """Show a sky above the horizon, into which what is far fades."""
+    """Show a sky into which distant objects fade."""
     red, green, blue = _LINEAR[list(HAZE)].tolist()
     server.scene.configure_fog(*view.haze, color=(red, green, blue))
     share = np.clip(np.linspace(0.0, 2.0, 64), 0.0, 1.0)[:, None, None]

@@ -68,7 +68,12 @@ def make_server(host: str = "127.0.0.1", port: int = 8080) -> viser.ViserServer:
 
 
 def serve_api(server: viser.ViserServer, api: CoachApi) -> None:
-    """Let other programs use an API on the port of a server from `make_server`."""
+    """Let other programs use an API on the port of a server from `make_server`.
+
+    Args:
+        server: Server of the page.
+        api: The API.
+    """
     _GUARDS[server].api = api
 
 
@@ -98,6 +103,11 @@ def free_port(host: str, port: int) -> int:
 
 
 def page_address(host: str, port: int) -> str:
-    """Return the address of the page for a browser on this machine."""
+    """Return the address of the page for a browser on this machine.
+
+    Args:
+        host: Host that the server listens on.
+        port: Its port.
+    """
     name = "localhost" if host in ("", "0.0.0.0", "::") else f"[{host}]" if ":" in host else host
     return f"http://{name}:{port}"

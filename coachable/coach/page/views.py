@@ -109,7 +109,12 @@ class NoView:
 
 
 def make_view(server: viser.ViserServer, session: CoachSession) -> View:
-    """Make the domain's 3-D view if it has one, else a view of its renderer's pictures, else a note with the reason."""
+    """Make the domain's 3-D view if it has one, else a view of its renderer's pictures, else a note with the reason.
+
+    Args:
+        server: Server of the page.
+        session: The coached session.
+    """
     try:
         if session.domain.make_stage is not None:
             return SceneView(server, session, session.domain.make_stage())

@@ -95,7 +95,12 @@ class MeasuredText:
         self.handle = server.gui.add_markdown(trained(parameter))
 
     def update(self, report: StyleReport, measures: list[str]) -> None:
-        """Show the values of the parameter's `measures` in a report, or say why there are none."""
+        """Show the values of the parameter's `measures` in a report, or say why there are none.
+
+        Args:
+            report: The session's report.
+            measures: Names of the parameter's measures.
+        """
         name, values = self.parameter.name, report.measured
         shown = [f"{self._name(m)}**{self._value(m, values[m])}**" for m in measures if m in values]
         found = "no measure of its own" if report.seconds and not measures else "not measured yet"
@@ -230,6 +235,11 @@ def trained(parameter: Parameter) -> str:
 
 
 def write(handle: Any, text: str) -> None:
-    """Set the content of a text widget; only changes are sent to the browsers."""
+    """Set the content of a text widget; only changes are sent to the browsers.
+
+    Args:
+        handle: Widget of the page.
+        text: Its new content.
+    """
     if handle.content != text:
         handle.content = text

@@ -62,7 +62,12 @@ def default_of(parameter: Weight | Setpoint) -> float:
 
 
 def wrapped(p: Weight | Setpoint | Choice, value: float) -> float:
-    """Return the equivalent angle in the range of a full-circle parameter; return other values unchanged."""
+    """Return the equivalent angle in the range of a full-circle parameter; return other values unchanged.
+
+    Args:
+        p: The parameter.
+        value: Value in the parameter's unit.
+    """
     if _is_circle(p) and not p.low <= value <= p.high:
         return p.low + (value - p.low) % 360.0
     return value

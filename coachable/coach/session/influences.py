@@ -41,6 +41,13 @@ class Influences:
     def fitted_push(self, forward: float, left: float) -> list[float]:
         """Return a push, scaled down to the largest strength.
 
+        Args:
+            forward: Strength in the agent's direction, in the push's unit.
+            left: Strength to its left.
+
+        Returns:
+            Strength forward and to the left.
+
         Raises:
             ValueError: If the domain has no push, or a strength is not finite.
         """
@@ -54,6 +61,11 @@ class Influences:
             self.controls[name].apply(env, value)
 
     def shove(self, env: EnvBase, strength: Sequence[float]) -> None:
-        """Push the agent in the base environment, if the domain has a push."""
+        """Push the agent in the base environment, if the domain has a push.
+
+        Args:
+            env: Environment of the session, with its transforms.
+            strength: Strength forward and to the left, in the push's unit.
+        """
         if self.push is not None:
             self.push.apply(env, *strength)

@@ -136,7 +136,12 @@ def check_seed(seed: int) -> None:
 
 
 def is_trained(parameter: Parameter, value: float | str) -> bool:
-    """Return whether a value is one of the options, or a number in the range of the parameter, as float32."""
+    """Return whether a value is one of the options, or a number in the range of the parameter, as float32.
+
+    Args:
+        parameter: The parameter.
+        value: Name of an option, or a number in the parameter's unit.
+    """
     if isinstance(parameter, Choice):
         return value in parameter.options
     return not isinstance(value, str) and bool(
@@ -187,5 +192,5 @@ _SCHEMA = {
 
 
 def checksum(observation: Tensor) -> int:
-    """Return the CRC-32 of every bit of an observation."""
+    """Return the CRC-32 of every bit of an observation (1, D)."""
     return zlib.crc32(observation.detach().cpu().contiguous().numpy().tobytes())

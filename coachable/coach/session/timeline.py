@@ -71,7 +71,7 @@ class Timeline:
         """Count a step, record its checksum every 40 steps, and compare a replay with its recording.
 
         Args:
-            observation: The observation after the step.
+            observation: The observation (1, D) after the step.
 
         Raises:
             ReplayMismatch: If they differ; later steps are not compared.
@@ -90,7 +90,11 @@ class Timeline:
             )
 
     def recording(self, observation: Tensor) -> Recording:
-        """Return a copy of the recording up to now, with a checksum of the current observation."""
+        """Return a copy of the recording up to now.
+
+        Args:
+            observation: Current observation (1, D), whose checksum is added.
+        """
         copy = Recording.from_json(self._recording.to_json())
         copy.steps = self.step
         if self.step % _CHECK_EVERY:

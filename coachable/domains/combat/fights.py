@@ -159,7 +159,12 @@ def fight_matrix(
 
 
 def damage_rows(fights: Mapping[str, np.ndarray], labels: Sequence[str]) -> list[dict[str, Any]]:
-    """Return for each requested style the shares of damage by source and elemental state, and parts per fight."""
+    """Return for each requested style the shares of damage by source and elemental state, and parts per fight.
+
+    Args:
+        fights: Results of `fight_grid`, (styles, opponents, fights) by name.
+        labels: Names of the requested styles.
+    """
     rows = []
     for index, label in enumerate(labels):
         total = max(fights["damage"][index].sum(), 1e-9)
@@ -211,7 +216,12 @@ def _correlations(sweep: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 
 
 def draw_damage(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw the damage matrix with a column per requested style and a row per kind of damage (paper)."""
+    """Draw the damage matrix with a column per requested style and a row per kind of damage (paper).
+
+    Args:
+        rows: Rows of `damage_rows`.
+        path: Image file to write.
+    """
     kinds = [*SOURCES, *STATES]
     shares = np.array([[row[kind] for row in rows] for kind in kinds])
     size = (2.5 + 0.62 * len(rows), 2.2 + 0.36 * len(kinds))
@@ -229,7 +239,12 @@ def draw_damage(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def draw_sweep(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw the style score over the weight, with a panel per style."""
+    """Draw the style score over the weight, with a panel per style.
+
+    Args:
+        rows: Rows with `style`, `weight`, `style_score` and `won`.
+        path: Image file to write.
+    """
     names = list(dict.fromkeys(row["style"] for row in rows))
     columns = min(len(names), 5)
     count = -(-len(names) // columns)

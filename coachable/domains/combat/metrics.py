@@ -61,13 +61,20 @@ class CombatMeasures:
 
         The score is the share of the damage that counts for the style with the largest weight. It may exceed 1 for part
         styles, for which removals count.
+
+        Args:
+            record: Outputs of `step` (T, N), by name.
+            alive: Steps that count (T, N) bool.
+
+        Returns:
+            Values (N,) by name.
         """
         sums = {name: torch.where(alive, values, 0.0).sum(0) for name, values in record.items()}
         score = sums["requested"] / sums["damage"].clamp(min=1e-6)
         return {**sums, "style_score": torch.where(sums["damage"] > 0, score, torch.nan)}
 
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
-        """Return whether damage counts for the requested style in each step; see `StyleMeasures.complies`."""
+        """Return the steps (T, N) bool in which damage counts for the requested style; see `StyleMeasures.complies`."""
         return record["requested"] > 0
 
     def judged(self, record: Mapping[str, Tensor]) -> Tensor:

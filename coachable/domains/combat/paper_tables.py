@@ -63,6 +63,10 @@ def matrix_rows(grids: Grids, labels: Sequence[str]) -> list[dict[str, Any]]:
 
     The intervals are those over training seeds, or over the fights of a single seed, by opponent. `share` is the share
     of all damage.
+
+    Args:
+        grids: Results of `fight_grid`, one per training seed.
+        labels: Names of the requested styles.
     """
     rows = []
     for index, label in enumerate(labels):
@@ -83,6 +87,10 @@ def obedience_rows(grids: Grids, labels: Sequence[str]) -> list[dict[str, Any]]:
     does not imply the kind: a kind that is there anyway does not count as obeying. `over_kinds` is the damage of the
     requested kind over that of the largest other kind of its group, sources or states, under the same request.
     Less than 1 HP counts as 1 HP. Intervals are as in `matrix_rows`.
+
+    Args:
+        grids: Results of `fight_grid`, one per training seed.
+        labels: Names of the requested styles.
     """
     implied = implied_kinds()
     draws = {label: _resampled(grids, index, KINDS) for index, label in enumerate(labels)}
@@ -115,7 +123,13 @@ def obedience_rows(grids: Grids, labels: Sequence[str]) -> list[dict[str, Any]]:
 
 
 def win_rows(grids: Grids, labels: Sequence[str], opponents: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the share of fights won by request and opponent, with Wilson's 95 % intervals over all fights."""
+    """Return the share of fights won by request and opponent, with Wilson's 95 % intervals over all fights.
+
+    Args:
+        grids: Results of `fight_grid`, one per training seed.
+        labels: Names of the requested styles.
+        opponents: Names of the opponents.
+    """
     rows = []
     for (i, label), (j, opponent) in ((a, b) for a in enumerate(labels) for b in enumerate(opponents)):
         won = np.concatenate([grid["won"][i, j] for grid in grids])
@@ -129,6 +143,11 @@ def record_rows(grids: Grids, labels: Sequence[str], machines: Sequence[str]) ->
     """Return wins, deaths, fights out of bounds and timeouts by machine, beside the paper's record.
 
     Composed requests are left out. The paper's records have 1140 to 1146 fights, ours all of the grid.
+
+    Args:
+        grids: Results of `fight_grid`, one per training seed.
+        labels: Names of the requested styles.
+        machines: Names of the opponents.
     """
     single = [index for index, label in enumerate(labels) if " + " not in label]
     paper = load_table("paper_records")
@@ -165,6 +184,10 @@ def part_rows(grids: Grids, labels: Sequence[str]) -> list[dict[str, Any]]:
 
     Other requests for parts are left out of "others", because one blow often removes parts of several types. Intervals
     are as in `matrix_rows`.
+
+    Args:
+        grids: Results of `fight_grid`, one per training seed.
+        labels: Names of the requested styles.
     """
     rows = []
     for part in PARTS:

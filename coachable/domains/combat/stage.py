@@ -67,11 +67,22 @@ class CombatStage:
         self._begin()
 
     def backdrop(self, env: EnvBase, row: int = 0) -> Backdrop:
-        """See `Stage.backdrop`."""
+        """Return what does not move; see `Stage.backdrop`.
+
+        Args:
+            env: The base environment.
+            row: Row of the batch.
+        """
         return arena(int(_combat(env).state.site[row]))
 
     def frame(self, env: EnvBase, row: int = 0, asked: Mapping[str, float | str] | None = None) -> Frame:
-        """See `Stage.frame`."""
+        """Return what is visible now; see `Stage.frame`.
+
+        Args:
+            env: The base environment.
+            row: Row of the batch.
+            asked: Style in force by name, if known.
+        """
         env = _combat(env)
         s = {name: value[..., row].cpu().numpy() for name, value in env.state.tensors().items()}
         steps, machines = float(s["steps"]), tuple(s["machine"].tolist())

@@ -55,7 +55,10 @@ class HumanoidMeasures:
         self.lower, self.upper = bounds[..., 0] - slack, bounds[..., 1] + slack
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
-        """See `StyleMeasures.step`. A step length is NaN in env steps without a strike."""
+        """Return the measures (N,) of a step by name; see `StyleMeasures.step`.
+
+        A step length is NaN in env-steps without a strike.
+        """
         theta = transition.get(STYLE)
         features = transition.get(("next", STYLE_FEATURES))
         pose = theta[:, : len(POSES)].argmax(-1)
@@ -83,14 +86,22 @@ class HumanoidMeasures:
         }
 
     def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
-        """See `StyleMeasures.summarise`: means over the steps that count."""
+        """Return means over the steps that count; see `StyleMeasures.summarise`.
+
+        Args:
+            record: Outputs of `step` (T, N), by name.
+            alive: Steps that count (T, N) bool.
+
+        Returns:
+            Values (N,) by name; NaN where an episode has no value.
+        """
         means = {name: torch.where(alive, values, torch.nan).nanmean(0) for name, values in record.items()}
         drift = means.pop("sideways_speed").abs() * _DRIFT_SECONDS
         right, left = means.pop("right_knee"), means.pop("left_knee")
         return means | {"drift": drift, "swing_knee": (right + left) / 2, "knee_asymmetry": (right - left).abs()}
 
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
-        """See `StyleMeasures.complies`: a strike of the requested length, with the arms in pose."""
+        """Return the steps (T, N) bool with a strike of the requested length and the arms in pose."""
         return (record["pose_held"] > 0) & (record["step_length_error"] < LENGTH_TOLERANCE)
 
     def judged(self, record: Mapping[str, Tensor]) -> Tensor:
@@ -102,7 +113,10 @@ class GaitMeasures(HumanoidMeasures):
     """Measures of a humanoid whose style sets the speed: also the speed, and its error at each strike [m/s]."""
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
-        """See `StyleMeasures.step`. The error is that of the step's length over its duration."""
+        """Return the measures (N,) of a step by name; see `StyleMeasures.step`.
+
+        The error of the speed is that of the step's length over its duration.
+        """
         found = super().step(transition)
         requested = transition.get(STYLE)[:, len(POSES) + 1]
         duration = transition.get(("next", STYLE_FEATURES))[:, DURATION]
@@ -110,5 +124,5 @@ class GaitMeasures(HumanoidMeasures):
         return {"speed": found.pop("forward_speed"), "speed_error": error, **found}
 
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
-        """See `StyleMeasures.complies`: also at the requested speed."""
+        """Return the steps (T, N) bool in which a strike also has the requested speed."""
         return super().complies(record) & (record["speed_error"] < SPEED_TOLERANCE)

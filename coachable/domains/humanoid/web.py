@@ -76,7 +76,16 @@ class WalkFeatures(nn.Module):
     def forward(
         self, positions: Tensor, velocities: Tensor, sensors: Tensor, controls: Tensor, style: Tensor, memory: Tensor
     ) -> tuple[Tensor, ...]:
-        """Return what `coachable.export.web.part.WebPart.features` returns."""
+        """Return what `coachable.export.web.part.WebPart.features` returns.
+
+        Args:
+            positions: Positions of the simulator (1, nq).
+            velocities: Velocities of the simulator (1, nv).
+            sensors: Sensors of the kinematics model (1, S).
+            controls: Live controls (1, 1): the course [deg].
+            style: Raw style (1, d).
+            memory: Memory of the gait (1, M).
+        """
         state, speeds = positions.numpy(), velocities.numpy()
         course = np.deg2rad(controls.numpy()[:, 0])
         gait, model = self._recall(memory.numpy()), self.model

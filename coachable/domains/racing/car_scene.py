@@ -83,12 +83,24 @@ def wheel(radius: float) -> Parts:
 
 
 def turned_wheel(steer: float, spin: float) -> np.ndarray:
-    """Return the rotation (4,) of a wheel that is steered to the left and has rolled forward by angles [rad]."""
+    """Return the rotation (4,) of a wheel that is steered to the left and has rolled forward by angles [rad].
+
+    Args:
+        steer: Steering angle, positive to the left [rad].
+        spin: Angle by which the wheel has rolled forward [rad].
+    """
     return multiplied(np.array(about_z(steer)), np.array([about_y(spin)]))[0]
 
 
 def wheel_places(front: float, rear: float, track_front: float, track_rear: float) -> np.ndarray:
-    """Return the places (4, 2) of the wheels relative to the centre of gravity, in the order of `CarState` [m]."""
+    """Return the places (4, 2) of the wheels relative to the centre of gravity, in the order of `CarState` [m].
+
+    Args:
+        front: Distance of the front axle from the centre of gravity [m].
+        rear: Distance of the rear axle from the centre of gravity [m].
+        track_front: Track width of the front axle [m].
+        track_rear: Track width of the rear axle [m].
+    """
     return np.array(
         [(front, track_front / 2), (front, -track_front / 2), (-rear, track_rear / 2), (-rear, -track_rear / 2)]
     )

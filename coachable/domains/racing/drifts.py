@@ -101,7 +101,12 @@ def _rows(sweep: str, episodes: Mapping[str, np.ndarray]) -> list[dict[str, Any]
 
 
 def draw_drift(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw the mean sideslip in corners with its 95 % interval, and the pace, over the weight; one line per sweep."""
+    """Draw the mean sideslip in corners with its 95 % interval, and the pace, over the weight; one line per sweep.
+
+    Args:
+        rows: One row per sweep and weight, with the measured angles in degrees.
+        path: Image file to write.
+    """
     with drawing(path, 1, 2, size=(9.0, 3.8)) as ((left, right),):
         for sweep, marker in zip(SWEEPS, "ovs", strict=True):
             own = [row for row in rows if row["sweep"] == sweep]

@@ -150,13 +150,23 @@ def home_track(family: str, settings: Mapping[str, Any]) -> str:
 
 
 def training_tracks(family: str, settings: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the names of the circuits that an agent was trained on; the arguments are those of `home_track`."""
+    """Return the names of the circuits that an agent was trained on.
+
+    Args:
+        family: Name of the family.
+        settings: Options of the environment that the agent was trained in.
+    """
     track = settings.get("track", HOME[family])
     return SETS.get(track, (track,)) if isinstance(track, str) else tuple(track)
 
 
 def typical_car(family: str, settings: Mapping[str, Any]) -> str:
-    """Return the shipped car that an agent drove, or the one after which its pool is made, as in `home_track`."""
+    """Return the shipped car that an agent drove, or the one after which its pool is made.
+
+    Args:
+        family: Name of the family.
+        settings: Options of the environment that the agent was trained in.
+    """
     car = settings.get("car", CAR[family])
     return "gt3" if car == POOL else car
 

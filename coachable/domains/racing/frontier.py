@@ -98,6 +98,10 @@ class LapProgramme:
     def laps(self, resource: str, prices: Sequence[float]) -> list[Lap]:
         """Return the lap of least cost for each price.
 
+        The cost of a lap is its time plus the price times the use of the resource, a Lagrangian of "least use at a
+        given time". Backward dynamic programming over the stages of the lap minimises it (Bellman's equation); a second
+        lap closes the loop.
+
         Args:
             resource: "tyre" or "fuel".
             prices: Values of λ: seconds per unit of mean wear, or per litre.
@@ -254,7 +258,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def draw(curves: Sequence[Rows], path: Path) -> None:
-    """Draw the gain in range over the seconds lost per lap, with one curve per car and resource."""
+    """Draw the gain in range over the seconds lost per lap, with one curve per car and resource.
+
+    Args:
+        curves: One frontier per car and resource, as rows with `seconds_lost` [s] and `range_gain` (share).
+        path: Image file to write.
+    """
     styles = {("tyre", 2.5): "-", ("fuel", 2.5): "--", ("fuel", 1.0): ":"}
     with drawing(path, size=(7.0, 4.2)) as ((axes,),):
         for rows in curves:

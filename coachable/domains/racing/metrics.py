@@ -95,6 +95,13 @@ class RacingMeasures:
 
         For drift, "turns" is the largest rotation against the track in one direction, in whole turns, "turned_per_km"
         how often per kilometre the car turned to face backwards, and "backwards" the share of time that it faced so.
+
+        Args:
+            record: Outputs of `step` (T, N), by name.
+            alive: Steps that count (T, N) bool.
+
+        Returns:
+            Values (N,) by name; NaN where an episode has no value.
         """
         record = dict(record)
         heading = record.pop("heading", None)
@@ -111,7 +118,7 @@ class RacingMeasures:
         return means
 
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
-        """Return whether the car complies in each step; see `StyleMeasures.complies`.
+        """Return whether the car complies in each step, (T, N) bool; see `StyleMeasures.complies`.
 
         By family, it drifts with 15 to 60 degrees of sideslip in corners if asked to and has 8 degrees or less if not,
         it is on the track, or it keeps the margins to the cars nearby.
@@ -138,16 +145,24 @@ class TelemetryMeasures:
         self._columns = {name: _COLUMN[name] for name in columns}
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
-        """Return the columns of a step; see `StyleMeasures.step`."""
+        """Return the columns (N,) of a step by name; see `StyleMeasures.step`."""
         told = transition.get(("next", "telemetry"))
         return {name: told[:, column] for name, column in self._columns.items()}
 
     def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
-        """Return no summaries, because the evaluation computes its own."""
+        """Return no summaries, because the evaluation computes its own.
+
+        Args:
+            record: Not used.
+            alive: Not used.
+
+        Returns:
+            An empty dictionary.
+        """
         return {}
 
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
-        """Return whether the car is on the track in each step; see `StyleMeasures.complies`."""
+        """Return whether the car is on the track in each step, (T, N) bool; see `StyleMeasures.complies`."""
         return record["off"] == 0.0
 
 

@@ -247,7 +247,14 @@ def _rows(cells: Sequence[tuple[str, float]], found: Mapping[str, np.ndarray]) -
 
 
 def draw_radar(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw a radar per setting with a polygon per margin; every axis spans the lowest to the highest value."""
+    """Draw a radar per setting, with a polygon per lateral margin.
+
+    Every axis spans the lowest to the highest value of the setting.
+
+    Args:
+        rows: One row per setting and margin, with the means over races and `lateral`, the margin [m].
+        path: Image file to write.
+    """
     angles = np.linspace(0.0, 2.0 * np.pi, len(_METRICS), endpoint=False) + np.pi / 2
     with drawing(path, 1, len(SETTINGS), size=(9.5, 4.6), grid=False, subplot_kw={"projection": "polar"}) as panels:
         for panel, setting in zip(panels[0], SETTINGS, strict=True):

@@ -57,11 +57,22 @@ class RacingStage:
         self._outline = np.zeros((0, 2))
 
     def backdrop(self, env: EnvBase, row: int = 0) -> Backdrop:
-        """See `Stage.backdrop`."""
+        """Return what does not move; see `Stage.backdrop`.
+
+        Args:
+            env: The base environment.
+            row: Row of the batch.
+        """
         return circuit(_track(_racing(env), row))
 
     def frame(self, env: EnvBase, row: int = 0, asked: Mapping[str, float | str] | None = None) -> Frame:
-        """See `Stage.frame`."""
+        """Return what is visible now; see `Stage.frame`.
+
+        Args:
+            env: The base environment.
+            row: Row of the batch.
+            asked: Style in force by name, if known.
+        """
         env = _racing(env)
         state = env.state.cpu().numpy()
         columns, track = mates(env, row), _track(env, row)
@@ -139,7 +150,12 @@ _NUMBERS = (
 
 
 def mates(env: RacingEnv, row: int) -> list[int]:
-    """Return the columns of the cars that meet the car of a row, itself first."""
+    """Return the columns of the cars that meet the car of a row, itself first.
+
+    Args:
+        env: The base environment.
+        row: Row of the car.
+    """
     car, race = divmod(row, env.races)
     group = env.group[:, race].cpu()
     others = [k for k in range(env.cars) if k != car and group[k] == group[car]]

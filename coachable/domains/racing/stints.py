@@ -42,7 +42,7 @@ class Stint:
 
     Attributes:
         laps: Times of the completed laps, counted from the car's start [s].
-        clean: Whether each lap had never three wheels off the track.
+        clean: Whether each lap had at most two wheels off the track at any time.
         left: State of the resource at the end of each lap: fuel left [l], or wear.
         per_km: Resource used per kilometre after the first lap, or in total if there is no other lap.
     """
@@ -251,7 +251,12 @@ def _summary(
 
 
 def draw_stints(laps: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw the mean resource left and lap times over laps, with one column per resource and one line per weight."""
+    """Draw the mean resource left and lap times over laps, with one column per resource and one line per weight.
+
+    Args:
+        laps: One row per lap, with `resource`, `weight`, `lap`, `time` [s] and `left`.
+        path: Image file to write.
+    """
     labels = {"fuel": "fuel left [l]", "tyre": "mean tyre wear"}
     with drawing(path, 2, len(WEIGHTS), size=(9.5, 6.4)) as axes:
         for column, (resource, name) in enumerate(WEIGHTS.items()):
@@ -276,7 +281,13 @@ def draw_stints(laps: Sequence[Mapping[str, Any]], path: Path) -> None:
 def draw_tradeoff(
     rows: Sequence[Mapping[str, Any]], frontiers: Mapping[str, Sequence[Mapping[str, float]]], path: Path
 ) -> None:
-    """Draw the range over the lap time, for the agent and the frontier."""
+    """Draw the range over the lap time, for the agent and the frontier.
+
+    Args:
+        rows: One row per resource and weight, with `lap_time` [s] and `range_km` [km].
+        frontiers: Points of the bound, by resource.
+        path: Image file to write.
+    """
     with drawing(path, 1, len(frontiers), size=(9.5, 4.0)) as panels:
         for axes, (resource, bound) in zip(panels[0], frontiers.items(), strict=True):
             own = [row for row in rows if row["resource"] == resource]

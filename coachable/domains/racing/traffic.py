@@ -91,7 +91,14 @@ def race_in_traffic(domain: Domain, agent: LoadedPolicy, settings: EvaluationSet
 
 
 def traffic_response(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Return the rank correlations of each weight with metres and places, from the rows of `race_in_traffic`."""
+    """Return the rank correlations of each weight with the metres and places gained.
+
+    Args:
+        rows: Rows of `race_in_traffic`.
+
+    Returns:
+        Correlations "metres" and "places" in [-1, 1], by weight.
+    """
 
     def follows(sweep: str, measure: str) -> float:
         pairs = [(row["weight"], row[measure]) for row in rows if row["sweep"] == sweep]
@@ -121,7 +128,12 @@ def traffic_report(rows: Sequence[dict[str, Any]], response: dict[str, dict[str,
 
 
 def draw_traffic(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Draw the metres and places gained over the weight that asks for them, with 95 % intervals."""
+    """Draw the metres and places gained over the weight that asks for them, with 95 % intervals.
+
+    Args:
+        rows: One row per weight, with metres and places and the ends of their 95 % intervals.
+        path: Image file to write.
+    """
     titles = {"overtake": "on cars ahead, starting last", "defend": "on cars behind, starting first"}
     with drawing(path, 2, len(SLOTS), size=(9.5, 6.4), sharex=True) as panels:
         for column, name in zip(panels.T, SLOTS, strict=True):

@@ -46,7 +46,12 @@ class Totals:
 
     @classmethod
     def zeros(cls, like: Tensor, slots: int) -> Totals:
-        """Return an empty record; `like` is (E, N)."""
+        """Return an empty record; `like` is (E, N).
+
+        Args:
+            like: Tensor (E, N) with the wanted device and dtype.
+            slots: Number of parts of a machine.
+        """
         shapes = (6, len(ELEMENTS), len(ELEMENTS), slots, slots)
         return cls(*(like.new_zeros((rows, *like.shape)) for rows in shapes), taken=like.new_zeros(like.shape[-1]))
 
@@ -189,6 +194,11 @@ def damage_parts(s: State, traits: Traits, damage: Tensor, totals: Totals) -> Te
 def swing(s: State, intent: Intent, traits: Traits) -> Tensor:
     """Advance the spear by one frame; the player lunges and deals damage on the first frame of a swing.
 
+    Args:
+        s: State, changed in place.
+        intent: What the players want.
+        traits: Traits of the machines.
+
     Returns:
         Damage (E, N) [HP].
     """
@@ -241,6 +251,12 @@ def run_elements(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Advance the decay of the gauges, the elemental states and their damage over time by one frame.
 
+    Args:
+        s: State, changed in place.
+        numbers: Numbers of the elements.
+        traits: Traits of the machines.
+        totals: Record of the step, changed in place.
+
     Returns:
         Active states (7, E, N), 0 or 1, including those that end; damage over time (7, E, N) [HP]; whether plasma ends
         (E, N) and whether shock begins (E, N), 0 or 1.
@@ -260,7 +276,15 @@ def run_elements(
 
 
 def hit_factor(s: State, numbers: ElementNumbers) -> Tensor:
-    """Return the factor (E, N) of frost and acid on hits."""
+    """Return the factor of frost and acid on hits.
+
+    Args:
+        s: The state.
+        numbers: Numbers of the elements.
+
+    Returns:
+        (E, N).
+    """
     bonus = 1.0 + numbers.hit_bonus * s.state_timer.clamp(max=1.0)
     return bonus[ACID] * bonus[FROST]
 

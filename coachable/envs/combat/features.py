@@ -136,7 +136,15 @@ def _ground(position: Tensor, s: State, axes: Tensor) -> Tensor:
 
 
 def one_hot_rows(index: Tensor, size: int) -> Tensor:
-    """Return the one-hots (size, ..., N) of indices (..., N)."""
+    """Return the one-hots (size, ..., N) of indices (..., N).
+
+    Args:
+        index: Indices (..., N).
+        size: Number of values.
+
+    Returns:
+        (size, ..., N) float32.
+    """
     return (index == torch.arange(size, device=index.device).view(-1, *[1] * index.ndim)).float()
 
 
@@ -154,7 +162,15 @@ def _attack_id(s: State, traits: Traits) -> Tensor:
 
 
 def kept_features(s: State, traits: Traits) -> Tensor:
-    """Return the row (12, N) of a state in the feature history: place of the nearest enemy, both healths, attack."""
+    """Return what the feature history keeps of a state: place of the nearest enemy, both healths and the attack.
+
+    Args:
+        s: The state.
+        traits: Traits of the machines.
+
+    Returns:
+        (12, N).
+    """
     second = nearest(s)
     return torch.cat(
         [

@@ -60,7 +60,13 @@ class Noise:
 
     @classmethod
     def draw(cls, enemies: int, n: int, generator: torch.Generator) -> Noise:
-        """Draw the numbers of a step; their count depends only on the numbers of enemies and of fights `n`."""
+        """Draw the numbers of a step; their count depends only on the numbers of enemies and of fights `n`.
+
+        Args:
+            enemies: E.
+            n: Number of fights N.
+            generator: Generator to draw from.
+        """
         frames, device = c.FRAMES_PER_STEP, generator.device
         normal = torch.randn((frames, 2 + 2 * enemies, n), generator=generator, device=device)
         uniform = torch.rand((2 * frames + ATTACK_SLOTS + 2, enemies, n), generator=generator, device=device)
@@ -95,7 +101,17 @@ class Rules:
 
 
 def run_frames(s: State, intent: Intent, rules: Rules, noise: Noise) -> Totals:
-    """Advance the fights by all frames of a step; `s` and `intent.loaded` change in place."""
+    """Advance the fights by all frames of a step; `s` and `intent.loaded` change in place.
+
+    Args:
+        s: State, changed in place.
+        intent: What the players want; `loaded` changes in place.
+        rules: Rules of the fights.
+        noise: Random numbers of the step.
+
+    Returns:
+        Damage of the step.
+    """
     totals = Totals.zeros(s.enemy_hp, PART_SLOTS)
     strength = ranged_strength(s, rules.traits)
     for frame in range(c.FRAMES_PER_STEP):
@@ -106,7 +122,17 @@ def run_frames(s: State, intent: Intent, rules: Rules, noise: Noise) -> Totals:
 def run_frame(
     s: State, intent: Intent, rules: Rules, totals: Totals, strength: Tensor, noise: Noise, frame: int
 ) -> None:
-    """Advance the fights by one frame: the player, its attacks, the machines, and theirs."""
+    """Advance the fights by one frame: the player, its attacks, the machines, and theirs.
+
+    Args:
+        s: State, changed in place.
+        intent: What the players want; `loaded` changes in place.
+        rules: Rules of the fights.
+        totals: Record of the step, changed in place.
+        strength: Share of weapon parts left at the beginning of the step (E, N).
+        noise: Random numbers of the step.
+        frame: Number of the frame in the step.
+    """
     traits, site = rules.traits, rules.site
     run_timers(s, intent)
     move_player(s, intent, traits, site)

@@ -41,7 +41,15 @@ _SHOCK_FRAMES = load_table("elements").number("shock", "seconds") * c.FPS
 
 
 def ranged_strength(s: State, traits: Traits) -> Tensor:
-    """Return the share of weapon parts that are left (E, N); it is 1 for machines without any."""
+    """Return the share of weapon parts that are left.
+
+    Args:
+        s: The state.
+        traits: Traits of the machines.
+
+    Returns:
+        (E, N) in [0, 1]; 1 for machines without weapon parts.
+    """
     left = (s.count * traits.part_type[_WEAPON]).sum(0)
     return torch.where(traits.weapon_parts > 0, left / traits.weapon_parts.clamp(min=1.0), 1.0)
 
@@ -244,7 +252,16 @@ def _fire_shots(
 
 
 def segment_blocked(start: Tensor, end: Tensor, pillars: Tensor) -> Tensor:
-    """Return whether one of the pillars (2, 4) is between points (2, E, N), as (E, N) bool."""
+    """Return whether a pillar is between two points.
+
+    Args:
+        start: (2, E, N) [m].
+        end: (2, E, N) [m].
+        pillars: (2, 4) centres of the pillars [m].
+
+    Returns:
+        (E, N) bool.
+    """
     along = end - start
     length = along.square().sum(0).clamp(min=1e-6)
     x, y = pillars.view(2, -1, 1, 1)
@@ -255,7 +272,16 @@ def segment_blocked(start: Tensor, end: Tensor, pillars: Tensor) -> Tensor:
 
 
 def ray_blocked_at(position: Tensor, yaw: Tensor, pillars: Tensor) -> Tensor:
-    """Return the distance (N,) at which level rays from (2, N) meet a pillar (2, 4), or infinity [m]."""
+    """Return the distance at which level rays meet a pillar.
+
+    Args:
+        position: Start of the rays (2, N) [m].
+        yaw: Direction of the rays, counter-clockwise from +x (N,) [rad].
+        pillars: (2, 4) centres of the pillars [m].
+
+    Returns:
+        (N,) [m], infinity where a ray meets no pillar.
+    """
     x, y = pillars.unsqueeze(-1)
     cos, sin = facing(yaw)
     offset_x, offset_y = x - position[0], y - position[1]  # (4, N)

@@ -78,7 +78,14 @@ class Intent:
 
 
 def rows_where(timers: Tensor, row: int, mask: Tensor, value: Tensor | float) -> None:
-    """Write `value` to a row of a tensor in place, where `mask` (N,) holds; no other object may hold the tensor."""
+    """Write a value to a row of a tensor in place, in some fights. No other object may hold the tensor.
+
+    Args:
+        timers: (R, N).
+        row: Number of the row.
+        mask: (N,) bool.
+        value: (N,), or one number.
+    """
     timers[row] = torch.where(mask, value, timers[row])
 
 
@@ -88,21 +95,45 @@ def facing(yaw: Tensor) -> Tensor:
 
 
 def from_stick(stick: Tensor, forward: Tensor) -> Tensor:
-    """Convert a stick (2, N), x to the right and y forward, to a direction of the world (2, N)."""
+    """Convert a stick to a direction of the world.
+
+    Args:
+        stick: (2, N), x to the right and y forward.
+        forward: Direction of the camera (2, N).
+
+    Returns:
+        (2, N).
+    """
     x, y = stick
     fx, fy = forward
     return torch.stack((fx * y + fy * x, fy * y - fx * x))
 
 
 def to_stick(direction: Tensor, yaw: Tensor) -> Tensor:
-    """Convert directions of the world (2, N) to a stick, x to the right and y forward; the inverse of `from_stick`."""
+    """Convert directions of the world to a stick; the inverse of `from_stick`.
+
+    Args:
+        direction: (2, N).
+        yaw: Direction of the camera, counter-clockwise from +x (N,) [rad].
+
+    Returns:
+        Stick (2, N), x to the right and y forward.
+    """
     x, y = direction
     fx, fy = facing(yaw)
     return torch.stack((fy * x - fx * y, fx * x + fy * y))
 
 
 def element_of(section: Tensor, ammo_table: Tensor) -> Tensor:
-    """Return one-hots (7, N) of the elements of wheel sections (N,)."""
+    """Return one-hots (7, N) of the elements of wheel sections (N,).
+
+    Args:
+        section: Wheel sections (N,) int64.
+        ammo_table: Table of the ammunition, one row per section.
+
+    Returns:
+        One-hots (7, N).
+    """
     return ammo_table[:, 11:].index_select(0, section).T
 
 
@@ -224,7 +255,12 @@ def _evade(s: State, pad: Pad, able: Tensor, timers: Tensor, forward: Tensor) ->
 
 
 def run_timers(s: State, intent: Intent) -> None:
-    """Advance the timers, reloading and regeneration by one frame."""
+    """Advance the timers, reloading and regeneration by one frame.
+
+    Args:
+        s: State, changed in place.
+        intent: What the players want; `loaded` is set when reloading ends.
+    """
     reloading = s.timers[RELOAD] > 0
     s.timers = (s.timers - 1.0).clamp(min=0.0)
     finished = reloading & (s.timers[RELOAD] <= 0)
@@ -235,7 +271,14 @@ def run_timers(s: State, intent: Intent) -> None:
 
 
 def move_player(s: State, intent: Intent, traits: Traits, site: Tensor) -> None:
-    """Advance walking, dodging or sliding by one frame; walls and bodies stop the player."""
+    """Advance walking, dodging or sliding by one frame; walls and bodies stop the player.
+
+    Args:
+        s: State, changed in place.
+        intent: What the players want.
+        traits: Traits of the machines.
+        site: Row of numbers of the arena's ground, with the grip and the radius of the wall.
+    """
     direction = from_stick(intent.move, facing(s.yaw))
     swinging, helpless = s.timers[MELEE] > 0, s.timers[HELPLESS].amax(0) > 0
     speed = intent.speed * torch.where(swinging, c.SWING_FACTOR, 1.0)
@@ -248,12 +291,29 @@ def move_player(s: State, intent: Intent, traits: Traits, site: Tensor) -> None:
 
 
 def inside_wall(position: Tensor, site: Tensor) -> Tensor:
-    """Return positions (2, ..., N) moved inside the site's wall."""
+    """Return positions (2, ..., N) moved inside the site's wall.
+
+    Args:
+        position: (2, ..., N) [m].
+        site: Numbers of the arena's ground, with the radius of the wall.
+
+    Returns:
+        (2, ..., N) [m].
+    """
     return position * (site[3] / position.square().sum(0).sqrt().clamp(min=1.0)).clamp(max=1.0)
 
 
 def keep_out(position: Tensor, s: State, traits: Traits) -> Tensor:
-    """Return player positions (2, N) moved out of the body of the nearest living enemy."""
+    """Return player positions (2, N) moved out of the body of the nearest living enemy.
+
+    Args:
+        position: (2, N) [m].
+        s: The state.
+        traits: Traits of the machines.
+
+    Returns:
+        (2, N) [m].
+    """
     second = nearest(s)
     centre, space = pick(s.enemy_position, second), pick(traits.radius, second) + c.BODY_RADIUS
     solid = pick(s.enemy_hp, second) > 0
@@ -284,5 +344,5 @@ def turn_camera(s: State, intent: Intent, cone: float, share: float, bearing: Te
 
 
 def wrap(angle: Tensor) -> Tensor:
-    """Wrap angles to [-pi, pi)."""
+    """Wrap angles (any shape) to [-pi, pi) [rad]."""
     return torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi

@@ -156,7 +156,12 @@ class State:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def replaced_where(self, mask: Tensor, other: State) -> State:
-        """Return `other` in the fights where `mask` (N,) holds, and this state elsewhere."""
+        """Return `other` in the fights where `mask` (N,) holds, and this state elsewhere.
+
+        Args:
+            mask: (N,) bool.
+            other: State of the fights where the mask holds.
+        """
         theirs = other.tensors()
         return State(**{name: torch.where(mask, theirs[name], mine) for name, mine in self.tensors().items()})
 
@@ -171,7 +176,15 @@ def nearest(state: State) -> Tensor:
 
 
 def pick(values: Tensor, second: Tensor) -> Tensor:
-    """Return the values (..., N) of the enemy that `nearest` chose from (..., E, N)."""
+    """Return the values of the enemy that `nearest` chose.
+
+    Args:
+        values: (..., E, N) with E of 1 or 2.
+        second: Whether the second enemy is the nearest one (N,) bool.
+
+    Returns:
+        (..., N).
+    """
     return values[..., 0, :] if values.shape[-2] == 1 else torch.where(second, values[..., 1, :], values[..., 0, :])
 
 

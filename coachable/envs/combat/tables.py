@@ -34,11 +34,20 @@ class Table:
     rows: Mapping[str, Mapping[str, str]]
 
     def fail(self, row: str, problem: str) -> ValueError:
-        """Return an error that names file and row."""
+        """Return an error that names file and row.
+
+        Args:
+            row: Name of the row.
+            problem: What is wrong.
+        """
         return ValueError(f"coachable/envs/combat/data/{self.file}, row {row!r}: {problem}")
 
     def number(self, row: str, column: str) -> float:
         """Return a finite or infinite number of the table.
+
+        Args:
+            row: Name of the row.
+            column: Name of the column.
 
         Raises:
             ValueError: If the cell is not a number.
@@ -58,6 +67,11 @@ class Table:
 
     def words(self, row: str, column: str, allowed: tuple[str, ...]) -> tuple[str, ...]:
         """Return the space-separated names of a cell.
+
+        Args:
+            row: Name of the row.
+            column: Name of the column.
+            allowed: Names that may occur.
 
         Raises:
             ValueError: If one is not allowed.

@@ -96,7 +96,12 @@ def machine_table(device: torch.device) -> Tensor:
 
 
 def look_up_traits(table: Tensor, machine: Tensor) -> Traits:
-    """Return the traits of machine numbers (E, N)."""
+    """Return the traits of machine numbers (E, N).
+
+    Args:
+        table: One row of traits per machine.
+        machine: Numbers of machines (E, N) int64.
+    """
     found = table[machine].permute(2, 0, 1).contiguous()  # (S, E, N)
     pieces = list(found[:_SCALARS])
     first = _SCALARS
@@ -116,7 +121,12 @@ def part_layout(machine: Machine) -> list[tuple[str, int]]:
 
 
 def unit_hp(machine: Machine, part: str) -> float:
-    """Return the health of one unit of a part [HP]."""
+    """Return the health of one unit of a part [HP].
+
+    Args:
+        machine: The machine.
+        part: Type of the part.
+    """
     return c.UNIT_HP[part] * 1.6 * machine.hp**0.85
 
 

@@ -47,6 +47,11 @@ class TrapNumbers:
 def spring_traps(s: State, traits: Traits, numbers: TrapNumbers) -> tuple[Tensor, Tensor, Tensor]:
     """Advance the traps by one frame; an armed trap fires when a machine is near, and disappears.
 
+    Args:
+        s: State, changed in place.
+        traits: Traits of the machines.
+        numbers: Numbers of the traps.
+
     Returns:
         Damage to the machines (E, N) [HP], build-up (7, E, N), and damage to the player (N,) [HP].
     """
@@ -90,6 +95,10 @@ def leave_zone(s: State, left: Tensor) -> None:
     """Start hazard zones under the machines where `left` (E, N) holds.
 
     A new zone replaces the one with the least time left.
+
+    Args:
+        s: State, changed in place.
+        left: (E, N) bool.
     """
     for enemy, leaves in enumerate(left):
         oldest = s.hazard_timer[0] > s.hazard_timer[1]  # (N,) the second slot

@@ -87,7 +87,12 @@ class GaitTracker:
 
     @classmethod
     def create(cls, num_envs: int, step_max: float) -> GaitTracker:
-        """Return a tracker of `num_envs` walkers that have not started."""
+        """Return a tracker of `num_envs` walkers that have not started.
+
+        Args:
+            num_envs: Number of walkers N.
+            step_max: Time after which a step times out [s].
+        """
         return cls(
             expected=np.zeros(num_envs, dtype=np.int64),
             clock=np.zeros(num_envs, dtype=np.int64),
@@ -194,7 +199,7 @@ class GaitTracker:
         self.knee_max = np.where(column, knees, self.knee_max)
 
     def observe(self) -> np.ndarray:
-        """Return what the policy observes of the step under way.
+        """Return what the policy observes of the current step.
 
         Returns:
             (N, 11): one-hot of the expected foot 2, smallest and largest angle of each knee since the step began 4

@@ -57,7 +57,15 @@ def rotate_to_course(vectors: np.ndarray, course: np.ndarray) -> np.ndarray:
 
 
 def orientation_to_course(quaternion: np.ndarray, course: np.ndarray) -> np.ndarray:
-    """Return the unit quaternion (N, 4) of an orientation relative to the course, with w >= 0 to make it unique."""
+    """Return orientations relative to the course.
+
+    Args:
+        quaternion: (N, 4) unit quaternions in the world's frame.
+        course: (N,) direction of the course [rad].
+
+    Returns:
+        (N, 4) unit quaternions with w >= 0, which makes them unique.
+    """
     half = 0.5 * course
     cosine, sine = np.cos(half), np.sin(half)
     w, x, y, z = quaternion.T
@@ -68,7 +76,15 @@ def orientation_to_course(quaternion: np.ndarray, course: np.ndarray) -> np.ndar
 
 
 def cosine_to_course(quaternion: np.ndarray, course: np.ndarray) -> np.ndarray:
-    """Return the cosine (N,) between the forward axis of bodies of the given orientations (N, 4) and the course."""
+    """Return the cosine between the forward axis of bodies and the course.
+
+    Args:
+        quaternion: (N, 4) unit quaternions in the world's frame.
+        course: (N,) direction of the course [rad].
+
+    Returns:
+        (N,) in [-1, 1].
+    """
     _, _, y, z = orientation_to_course(quaternion, course).T
     return 1.0 - 2.0 * (y * y + z * z)
 

@@ -57,9 +57,20 @@ def move_reward(
 def bearing_reward(
     head_height: np.ndarray, upright: np.ndarray, facing: np.ndarray, controls: np.ndarray
 ) -> np.ndarray:
-    """Return the factors of `move_reward` without that of the speed (N,), within [0, 1].
+    """Return the factors of `move_reward` without that of the speed.
 
     It is the task reward where the style sets the speed. The arguments are those of `move_reward`.
+
+    It is the task reward if the style sets the speed. The arguments are those of `move_reward`.
+
+    Args:
+        head_height: (N,) height of the head [m].
+        upright: (N,) z component of the torso's upward axis.
+        facing: (N,) cosine between the pelvis' forward axis and the course.
+        controls: (N, 21) actions in [-1, 1].
+
+    Returns:
+        (N,) in [0, 1].
     """
     standing, effortless = _bearing(head_height, upright, facing, controls)
     return standing * (1 + effortless) / 2
@@ -88,9 +99,10 @@ _DRIFT = 0.10  # [m] to either side over a stride that cost 1
 def walk_costs(
     power: np.ndarray, forces: np.ndarray, clearance: np.ndarray, report: StepReport
 ) -> dict[str, np.ndarray]:
-    """Return what a walk costs that is not soft, low, straight and economical: 0 at best, 1 where it looks wrong.
+    """Return the costs of an unnatural walk.
 
-    None of them is in the paper. Quantities of a step are paid once for each control step that it took.
+    A cost is 0 at best and 1 where the walk looks wrong. None of the costs is in the paper. A cost that is measured
+    once per step is multiplied by the number of control steps that the step took.
 
     Args:
         power: (N,) mechanical power of the motors [W].

@@ -60,7 +60,15 @@ class Kinematics:
 
 
 def read_kinematics(readings: np.ndarray, model: HumanoidModel) -> Kinematics:
-    """Return the geometry of M states from the sensors (M, S) of the kinematics model."""
+    """Return the geometry of M states from the sensors (M, S) of the kinematics model.
+
+    Args:
+        readings: (M, S) sensors of the kinematics model.
+        model: The model, which knows where each sensor is.
+
+    Returns:
+        Geometry of the M states.
+    """
 
     def read(name: str) -> np.ndarray:
         return readings[:, model.sensors[name]]
@@ -170,7 +178,14 @@ class HumanoidSimulation:
         return np.nan_to_num(np.abs(torques * speeds).sum(axis=-1).mean(axis=1))
 
     def kinematics(self, rows: np.ndarray | None = None) -> Kinematics:
-        """Return the geometry of the current states, or of `rows` of them."""
+        """Return the geometry of the current states, or of some rows of them.
+
+        Args:
+            rows: Numbers of M rows (M,) int; None for all N.
+
+        Returns:
+            Geometry of M or N states.
+        """
         states = self.state if rows is None else np.ascontiguousarray(self.state[rows])
         return self.kinematics_of(states)
 
@@ -180,7 +195,7 @@ class HumanoidSimulation:
         return read_kinematics(readings[:, 0], self.model)
 
     def count_contacts(self, state: np.ndarray) -> int:
-        """Return the number of contacts of one state, for the search for collision-free postures."""
+        """Return the number of contacts of one state (S,), for the search for collision-free postures."""
         data = self._dynamics_data[0]
         mujoco.mj_setState(self.model.dynamics, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         mujoco.mj_fwdPosition(self.model.dynamics, data)

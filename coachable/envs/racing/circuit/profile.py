@@ -40,18 +40,42 @@ class Envelope:
         return self.car.mass + FUEL_DENSITY * self.fuel
 
     def friction(self, speed: np.ndarray) -> np.ndarray:
-        """Return the largest acceleration in any direction along the road [m/s²]."""
+        """Return the largest acceleration in any direction along the road.
+
+        It is μ N / m with the load N of weight and downforce ½ ρ A v², and a friction coefficient μ that falls with the
+        load.
+
+        Args:
+            speed: (n,) [m/s].
+
+        Returns:
+            (n,) [m/s²].
+        """
         load = self.mass * GRAVITY + 0.5 * AIR_DENSITY * self.car.lift_area * speed**2
         coefficient = self.car.grip + self.car.grip_per_load * 1e-3 * (load / 4 - self.car.reference_load)
         return LOAD_TRANSFER * self.grip * coefficient * load / self.mass
 
     def drag(self, speed: np.ndarray) -> np.ndarray:
-        """Return the deceleration by air drag and rolling resistance [m/s²]."""
+        """Return the deceleration ½ ρ A v² / m + c g by air drag and rolling resistance.
+
+        Args:
+            speed: (n,) [m/s].
+
+        Returns:
+            (n,) [m/s²].
+        """
         air = 0.5 * AIR_DENSITY * self.car.drag_area * speed**2 / self.mass
         return air + self.car.rolling_resistance * GRAVITY
 
     def engine(self, speed: np.ndarray) -> np.ndarray:
-        """Return the acceleration at full throttle in the best gear, with the inertia of wheels and engine [m/s²]."""
+        """Return the acceleration at full throttle in the best gear, with the inertia of wheels and engine.
+
+        Args:
+            speed: (n,) [m/s].
+
+        Returns:
+            (n,) [m/s²].
+        """
         car = self.car
         wheel = np.maximum(speed, 3.0) / car.wheel_radius  # [rad/s]
         wheels = 2 * (car.wheel_inertia_front + car.wheel_inertia_rear)
@@ -67,7 +91,14 @@ class Envelope:
         return best
 
     def traction(self, speed: np.ndarray) -> np.ndarray:
-        """Return the largest acceleration that the tyres of the driven axle allow, after the load transfer [m/s²]."""
+        """Return the largest acceleration that the tyres of the driven axle allow, after the load transfer.
+
+        Args:
+            speed: (n,) [m/s].
+
+        Returns:
+            (n,) [m/s²].
+        """
         car = self.car
         share = car.front_axle / (car.front_axle + car.rear_axle)
         driven = (1 - car.drive_share_front) * share + car.drive_share_front * (1 - share)
@@ -76,7 +107,15 @@ class Envelope:
 
 
 def cornering_speed(envelope: Envelope, curvature: np.ndarray) -> np.ndarray:
-    """Return the highest steady speed [m/s] at each curvature [1/m], found by bisection."""
+    """Return the highest steady speed, where `v² |κ|` equals the acceleration by friction, found by bisection.
+
+    Args:
+        envelope: The car.
+        curvature: (n,) [1/m].
+
+    Returns:
+        (n,) [m/s], between 3 m/s and `SPEED_MAX`.
+    """
     low, high = np.full(curvature.shape, 3.0), np.full(curvature.shape, SPEED_MAX)
     for _ in range(40):
         middle = 0.5 * (low + high)
@@ -139,6 +178,14 @@ def _left(friction: np.ndarray, used: np.ndarray) -> np.ndarray:
 
 
 def lap_time(speed: np.ndarray, spacing: np.ndarray | float) -> float:
-    """Return the lap time [s] of a speed profile (n,) [m/s] with the distances `spacing` between its points [m]."""
+    """Return the time of a lap, with constant acceleration between two points.
+
+    Args:
+        speed: (n,) [m/s].
+        spacing: (n,) distance from each point to the next one [m], or one number for all.
+
+    Returns:
+        Time [s].
+    """
     following = np.roll(speed, -1)
     return float(np.sum(2 * np.asarray(spacing) / (speed + following)))

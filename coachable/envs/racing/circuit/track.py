@@ -182,7 +182,10 @@ class Track:
 
 
 def turn_pieces(angle: float, radius: float) -> list[tuple[float, float, float]]:
-    """Return ramp, arc and ramp of a turn as (length, curvature at the start, curvature at the end)."""
+    """Return ramp, arc and ramp of a turn as (length [m], curvature at the start, curvature at the end [1/m]).
+
+    The angle is positive to the left [deg]; the radius is that of the arc [m].
+    """
     arc = radius * math.radians(abs(angle))
     ramp = min(0.45 * arc, 45.0)
     curvature = math.copysign(1.0 / radius, angle)
@@ -327,11 +330,11 @@ class Course(torch.nn.Module):
         return self.length[: len(self.length) // cars] if isinstance(self.length, Tensor) else self.length
 
     def node(self, s: Tensor) -> Tensor:
-        """Return the node nearest to a distance along the track [m]."""
+        """Return the node (...,) nearest to distances along the track (...,) [m]."""
         return torch.remainder(torch.round(s / self.spacing).to(torch.int64), self.count) + self.first
 
     def distance(self, node: Tensor) -> Tensor:
-        """Return the distance of a node along its track [m]."""
+        """Return the distances of nodes (...,) along their track (...,) [m]."""
         return (node - self.first) * self.spacing
 
     def frame(self, node: Tensor) -> Tensor:
@@ -391,6 +394,6 @@ class Course(torch.nn.Module):
         return x + dx * tx - dy * ty, y + dx * ty + dy * tx, torch.atan2(ty, tx) + angle
 
     def past(self, node: Tensor, s: Tensor) -> Tensor:
-        """Return how far distances along the track are past nodes near them, negative before [m]."""
+        """Return how far (N,) [m] distances along the track (N,) [m] are past nodes (N,) near them, negative before."""
         half = self.length / 2
         return torch.remainder(s - self.distance(node) + half, self.length) - half

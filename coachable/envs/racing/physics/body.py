@@ -19,12 +19,33 @@ class PlanarForce(NamedTuple):
 
 
 def wheel_velocity(vx: Tensor, vy: Tensor, yaw_rate: Tensor, x: Any, y: Any) -> tuple[Tensor, Tensor]:
-    """Return the velocity of the point (x, y) of the body in the car's frame [m/s]."""
+    """Return the velocity of a point of the body in the car's frame.
+
+    Args:
+        vx: Velocity forward (N,) [m/s].
+        vy: Velocity to the left (N,) [m/s].
+        yaw_rate: (N,) [rad/s].
+        x: Place of the point, forward of the centre of gravity [m].
+        y: Place of the point, to the left [m].
+
+    Returns:
+        Velocity forward and to the left [m/s].
+    """
     return vx - yaw_rate * y, vy + yaw_rate * x
 
 
 def rotate(x: Tensor, y: Tensor, cos: Any, sin: Any) -> tuple[Tensor, Tensor]:
-    """Rotate a vector counter-clockwise by the angle whose cosine and sine are given."""
+    """Rotate a vector counter-clockwise by the angle whose cosine and sine are given.
+
+    Args:
+        x: First component, any shape.
+        y: Second component.
+        cos: Cosine of the angle.
+        sin: Sine of the angle.
+
+    Returns:
+        Both components of the rotated vector, in the same unit.
+    """
     return x * cos - y * sin, x * sin + y * cos
 
 

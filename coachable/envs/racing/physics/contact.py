@@ -55,12 +55,29 @@ class Overlap(NamedTuple):
 
 
 def partner(bodies: Bodies, k: int) -> Bodies:
-    """Return the k-th next car of each car, in the same race."""
+    """Return the k-th next car of each car, in the same race.
+
+    Args:
+        bodies: Cars (A, B), A cars in each of B races.
+        k: How many cars further.
+
+    Returns:
+        Cars (A, B).
+    """
     return Bodies(*(f.roll(-k, 0) if isinstance(f, Tensor) and f.ndim else f for f in bodies))
 
 
 def extent(nx: Tensor, ny: Tensor, body: Bodies) -> Tensor:
-    """Return half the length of a rectangle's projection on a unit vector [m]."""
+    """Return half the length of a rectangle's projection on a unit vector [m].
+
+    Args:
+        nx: Unit vector (A, B).
+        ny: Unit vector (A, B).
+        body: Rectangles (A, B).
+
+    Returns:
+        (A, B) [m].
+    """
     along, across = rotate(nx, ny, body.cos, -body.sin)
     return along.abs() * body.half_length + across.abs() * body.half_width
 
@@ -74,7 +91,12 @@ def _support(nx: Tensor, ny: Tensor, body: Bodies) -> tuple[Tensor, Tensor]:
 
 
 def overlap(a: Bodies, b: Bodies) -> Overlap:
-    """Return the overlap of two rectangles at the deepest vertex, along the axis of least depth (separating axes)."""
+    """Return the overlap of two rectangles, by the separating axis of least depth, at the deepest vertex.
+
+    Args:
+        a: First rectangles (A, B).
+        b: Second rectangles (A, B).
+    """
     dx, dy = a.x - b.x, a.y - b.y
     depth, nx, ny, ours = None, a.cos, a.sin, None
     for owner, (ex, ey) in ((0, (a.cos, a.sin)), (0, (-a.sin, a.cos)), (1, (b.cos, b.sin)), (1, (-b.sin, b.cos))):
@@ -170,7 +192,15 @@ def _pair(a: Bodies, b: Bodies, same: Tensor, share: float) -> tuple[Push, Push,
 
 
 def body_gaps(a: Bodies, b: Bodies) -> tuple[Tensor, Tensor]:
-    """Return the distances between two rectangles along and across the first one, 0 if the projections overlap [m]."""
+    """Return the distances between two rectangles along and across the first one.
+
+    Args:
+        a: First rectangles (A, B).
+        b: Second rectangles (A, B).
+
+    Returns:
+        Distance along and across (A, B) [m]; 0 where the projections overlap.
+    """
     dx, dy = b.x - a.x, b.y - a.y
     ahead, aside = rotate(dx, dy, a.cos, -a.sin)
     long = ahead.abs() - a.half_length - extent(a.cos, a.sin, b)

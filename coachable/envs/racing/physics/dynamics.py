@@ -109,7 +109,15 @@ class WheelSet:
 
 
 def total_mass(car: Car, fuel: Tensor) -> Tensor:
-    """Return the mass of the cars with their fuel (N,) [l] in kg."""
+    """Return the mass of the cars with their fuel (N,) [l] in kg.
+
+    Args:
+        car: Parameters.
+        fuel: Fuel on board (N,) [l].
+
+    Returns:
+        (N,) [kg].
+    """
     return car.mass + FUEL_DENSITY * fuel
 
 
@@ -135,7 +143,15 @@ def wheel_loads(car: Car, wheels: WheelSet, s: CarState, front_lift: Tensor | fl
 
 
 def steering(wheels: WheelSet, steer: Tensor) -> tuple[Tensor, Tensor]:
-    """Return cosine and sine of each wheel's angle, (4, N), for steering angles (N,) [rad]."""
+    """Return cosine and sine of each wheel's angle, (4, N), for steering angles (N,) [rad].
+
+    Args:
+        wheels: Wheels of the cars.
+        steer: Steering angles (N,) [rad].
+
+    Returns:
+        Cosine and sine (4, N).
+    """
     return 1.0 + wheels.front * (torch.cos(steer) - 1.0), wheels.front * torch.sin(steer)
 
 

@@ -33,7 +33,15 @@ class Drive(NamedTuple):
 
 
 def gear_ratio(car: Car, gear: Tensor) -> Tensor:
-    """Return the total ratio of engine speed to wheel speed in the gears (N,)."""
+    """Return the total ratio of engine speed to wheel speed in the gears (N,).
+
+    Args:
+        car: Parameters.
+        gear: Gears (N,), from 1.
+
+    Returns:
+        Ratio (N,), with the final drive.
+    """
     ratio = torch.zeros_like(gear) + car.gears[0] * car.final_drive
     for index in range(1, MAX_GEARS):
         ratio = torch.where(gear > index + 0.5, car.gears[index] * car.final_drive, ratio)
@@ -41,13 +49,30 @@ def gear_ratio(car: Car, gear: Tensor) -> Tensor:
 
 
 def engine_speed(car: Car, ratio: Tensor, wheel_speed: Tensor) -> Tensor:
-    """Return the engine speed [rpm], at least that at idle, from the mean speed of the driven wheels [rad/s]."""
+    """Return the engine speed [rpm], at least that at idle, from the mean speed of the driven wheels [rad/s].
+
+    Args:
+        car: Parameters.
+        ratio: Ratio of engine speed to wheel speed (N,).
+        wheel_speed: Mean speed of the driven wheels (N,) [rad/s].
+
+    Returns:
+        (N,) [rpm], at least the speed at idle.
+    """
     rpm = wheel_speed * ratio * _RPM
     return torch.maximum(rpm, torch.zeros_like(rpm) + car.rpm_idle)
 
 
 def full_torque(car: Car, omega: Tensor) -> Tensor:
-    """Return the torque at full throttle [N m] at engine speeds (N,) [rad/s]."""
+    """Return the torque at full throttle, the lesser of the largest torque and `power / omega`.
+
+    Args:
+        car: Parameters.
+        omega: Engine speeds (N,) [rad/s].
+
+    Returns:
+        (N,) [N m].
+    """
     return torch.minimum(torch.zeros_like(omega) + car.torque, car.power / omega)
 
 
@@ -109,7 +134,15 @@ def drive_wheels(
 
 
 def differential(left: Tensor, right: Tensor) -> Tensor:
-    """Return the torque that a viscous differential moves from a faster left wheel to the right one [N m]."""
+    """Return the torque that a viscous differential moves from a faster left wheel to the right one [N m].
+
+    Args:
+        left: Speed of the left wheel (N,) [rad/s].
+        right: Speed of the right wheel (N,) [rad/s].
+
+    Returns:
+        (N,) [N m], in proportion to the difference up to a limit.
+    """
     return torch.clamp(DIFFERENTIAL * (left - right), -DIFFERENTIAL_MAX, DIFFERENTIAL_MAX)
 
 

@@ -150,7 +150,16 @@ def _apart(car: Car) -> Car:
 
 
 def bodies_of(state: Tensor, car: Car, cars: int) -> Bodies:
-    """Return the cars of a state (29, A * B) as rectangles (A, B)."""
+    """Return the cars of a state (29, A * B) as rectangles (A, B).
+
+    Args:
+        state: State (29, A * B).
+        car: Parameters.
+        cars: Number of cars per race A.
+
+    Returns:
+        Rectangles (A, B).
+    """
     yaw, vx, vy = state[ROW["yaw"]], state[ROW["vx"]], state[ROW["vy"]]
     cos, sin = torch.cos(yaw), torch.sin(yaw)
     rectangle = (

@@ -52,18 +52,34 @@ def locate(x: Tensor, y: Tensor, node_x: Tensor, node_y: Tensor, tx: Tensor, ty:
 
 
 def beyond(offset: Tensor, left: Tensor, right: Tensor) -> Tensor:
-    """Return the distance of points beyond the edge of the track, negative on it [m]."""
+    """Return the distance of points beyond the edge of the track, negative on it [m].
+
+    Args:
+        offset: Distance to the left of the centre line (N,) [m].
+        left: Distance of the left edge (N,) [m].
+        right: Distance of the right edge (N,) [m].
+
+    Returns:
+        (N,) [m].
+    """
     return torch.maximum(offset - left, -offset - right)
 
 
 def surface_grip(outside: Tensor) -> Tensor:
-    """Return the grip factor of the surface at distances beyond the edge of the track [m]."""
+    """Return the grip factor (...,) of the surface at distances beyond the edge of the track (...,) [m]."""
     grip = torch.where(outside > 0.0, GRIP["kerb"], GRIP["track"])
     grip = torch.where(outside > KERB_WIDTH, GRIP["run_off"], grip)
     return torch.where(outside > RUN_OFF_WIDTH, GRIP["grass"], grip)
 
 
 def surface_rolling(outside: Tensor) -> Tensor:
-    """Return the rolling resistance that the surface adds to that of tarmac, at distances beyond the edge [m]."""
+    """Return the rolling resistance (...,) that the surface adds to that of tarmac.
+
+    Args:
+        outside: Distances beyond the edge of the track (...,) [m], negative on the track.
+
+    Returns:
+        Coefficient of the same shape, relative to the weight.
+    """
     drag = torch.where(outside > KERB_WIDTH, RUN_OFF_ROLLING, 0.0)
     return torch.where(outside > RUN_OFF_WIDTH, GRASS_ROLLING, drag)

@@ -25,7 +25,15 @@ def tangent(angle: Any) -> Any:
 
 
 def slip_curve(rho: Tensor, shape: Any) -> Tensor:
-    """Return the ratio of normalised force to normalised slip, sin(C atan(B ρ)) / ρ, where B puts the peak at ρ = 1."""
+    """Return the ratio of normalised force to normalised slip, sin(C atan(B ρ)) / ρ, where B puts the peak at ρ = 1.
+
+    Args:
+        rho: Normalised slip, any shape, not 0.
+        shape: Shape factor C of the magic formula, above 1.
+
+    Returns:
+        Ratio of the shape of `rho`.
+    """
     stiffness = tangent(math.pi / 2 / shape)
     return torch.sin(shape * torch.atan(stiffness * rho)) / rho
 
@@ -114,12 +122,19 @@ def heat_rate(slip_power: Tensor, load: Tensor, speed: Tensor, heat: Tensor) -> 
 
 
 def heat_factor(heat: Tensor) -> Tensor:
-    """Return the grip at temperatures [°C] relative to that at 90 °C."""
+    """Return the grip (...,) at temperatures (...,) [°C] relative to that at 90 °C."""
     return torch.clamp(1.0 - _off_best(heat), min=0.8)
 
 
 def heat_loss(heat: Tensor) -> Tensor:
-    """Return the share of the grip that is lost at temperatures above 90 °C, without the bound of `heat_factor`."""
+    """Return the share of the grip that is lost at temperatures above 90 °C, without the bound of `heat_factor`.
+
+    Args:
+        heat: Temperatures (...,) [°C].
+
+    Returns:
+        Share (...,), 0 up to 90 °C.
+    """
     return _off_best(torch.clamp(heat, min=BEST_HEAT))
 
 
@@ -130,10 +145,26 @@ def _off_best(heat: Tensor) -> Tensor:
 
 
 def wear_factor(wear: Tensor) -> Tensor:
-    """Return the grip of worn tyres relative to new ones, which falls faster beyond a wear of 0.75."""
+    """Return the grip (...,) of worn tyres relative to new ones.
+
+    It falls faster beyond a wear of 0.75.
+
+    Args:
+        wear: Wear (...,), 0 for a new tyre.
+    """
     return 1.0 - 0.10 * wear - 0.5 * torch.clamp(wear - 0.75, min=0.0)
 
 
 def friction(load: Tensor, grip: Any, grip_per_load: Any, reference_load: Any) -> Tensor:
-    """Return the friction coefficient at loads [N], before the factors of compound, heat, wear and surface."""
+    """Return the friction coefficient at loads [N], before the factors of compound, heat, wear and surface.
+
+    Args:
+        load: Loads on the wheels [N].
+        grip: Coefficient at the reference load.
+        grip_per_load: Its change per load [1/kN].
+        reference_load: Reference load [N].
+
+    Returns:
+        Coefficient of the shape of `load`.
+    """
     return grip + grip_per_load * 1e-3 * (load - reference_load)

@@ -42,5 +42,13 @@ def _finish(z: Tensor) -> Tensor:
 
 
 def normal(u1: Tensor, u2: Tensor) -> Tensor:
-    """Transform two uniform numbers in [0, 1) to a standard normal one (Box and Muller)."""
+    """Transform two uniform numbers to a standard normal one (Box and Muller 1958).
+
+    Args:
+        u1: Numbers in [0, 1), any shape.
+        u2: Numbers in [0, 1) of the same shape.
+
+    Returns:
+        Numbers of the same shape.
+    """
     return torch.sqrt(-2.0 * torch.log1p(-u1)) * torch.cos(2.0 * math.pi * u2)

@@ -35,7 +35,15 @@ def anyone_near(features: Tensor) -> Tensor:
 
 
 def anyone_beside(features: Tensor, *, within: float) -> Tensor:
-    """Return whether an opponent overlaps lengthwise and is less than `within` metres away sideways, (...) bool."""
+    """Return whether an opponent overlaps lengthwise and is less than `within` metres away sideways, (...) bool.
+
+    Args:
+        features: Style features (..., F).
+        within: Lateral distance [m].
+
+    Returns:
+        (...,) bool.
+    """
     long, lat, near = gap_columns(features)
     return ((near > 0.0) & (long == 0.0) & (lat < within)).any(-1)
 
@@ -77,5 +85,15 @@ def corner_drift(angle: Tensor, curvature: Tensor, pace: Tensor) -> Tensor:
 def pack_style_features(
     drift: Sequence[Tensor], resources: Sequence[Tensor], in_corner: Tensor, gaps: Sequence[Tensor]
 ) -> Tensor:
-    """Stack tensors (N,) to the columns of `style_features`, (N, F)."""
+    """Stack tensors (N,) to the columns of `style_features`, (N, F).
+
+    Args:
+        drift: Quantities of drifting, (N,) each.
+        resources: Quantities of tyres and fuel, (N,) each.
+        in_corner: (N,).
+        gaps: Distances to opponents, (N,) each [m].
+
+    Returns:
+        (N, F).
+    """
     return torch.stack([*drift, *resources, in_corner, *gaps], dim=-1)

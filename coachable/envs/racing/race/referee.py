@@ -212,7 +212,19 @@ class Referee:
         wheels: WheelSet,
         group: Tensor | None = None,
     ) -> Tensor:
-        """Return the observations (N, D); the arguments are those of `judge`."""
+        """Return the observations (N, D); the arguments are those of `judge`.
+
+        Args:
+            packed: State (29, N).
+            packed_run: Task state (25, N).
+            compound: Factors of grip and wear, then the compound as one-hot, (11, N).
+            car: Parameters.
+            wheels: Wheels of that car.
+            group: Groups (A, B), if there are several cars in a race.
+
+        Returns:
+            Observations (N, D).
+        """
         run = Run(*packed_run.unbind(0))
         tyres = tyre_view(car, wheels, packed, compound[0])
         length = None if self.curvature else self.course.length

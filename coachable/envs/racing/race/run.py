@@ -113,7 +113,15 @@ def tyre_view(car: Car, wheels: WheelSet, packed: Tensor, compound_grip: Tensor)
 
 
 def wrap(distance: Tensor, length: float | Tensor) -> Tensor:
-    """Return signed distances on a loop of the given length, in [-length / 2, length / 2) [m]."""
+    """Return signed distances on a loop of the given length, in [-length / 2, length / 2) [m].
+
+    Args:
+        distance: Signed distances [m], any shape.
+        length: Length of the loop [m].
+
+    Returns:
+        Distances of the same shape [m].
+    """
     return torch.remainder(distance + 0.5 * length, length) - 0.5 * length
 
 
@@ -145,7 +153,15 @@ def look_around(s: Tensor, offset: Tensor, group: Tensor, length: float | Tensor
 
 
 def slipstream(others: Others, car_length: Tensor | float) -> Tensor:
-    """Return the strength of the strongest slipstream that each car is in, (A, B), in [0, 1]."""
+    """Return the strength of the strongest slipstream that each car is in.
+
+    Args:
+        others: Other cars around each car, (A - 1, A, B) each.
+        car_length: Length of a car [m].
+
+    Returns:
+        (A, B) in [0, 1].
+    """
     clear = others.gap - car_length  # from nose to tail
     beside = torch.clamp(1.0 - others.aside.abs() / SLIPSTREAM_WIDTH, min=0.0)
     strength = torch.exp(-clear.clamp(min=0.0) / SLIPSTREAM_LENGTH) * beside

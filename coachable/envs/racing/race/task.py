@@ -94,7 +94,15 @@ def metres_gained(before: Others, after: Others) -> tuple[Tensor, Tensor]:
 
 
 def impacts_of(impact: Tensor, cars: int) -> Tensor:
-    """Return each car's contacts with the others, (A - 1, A, B), from those of the pairs, (A // 2, A, B) [m²/s²]."""
+    """Return each car's contacts with the others.
+
+    Args:
+        impact: Largest squared relative speed of each pair's contacts (A // 2, A, B) [m²/s²].
+        cars: Number of cars per race A.
+
+    Returns:
+        (A - 1, A, B) [m²/s²].
+    """
     rows: list[Tensor] = []
     for k in range(1, cars):
         rows.append(impact[k - 1] if k <= cars // 2 else impact[cars - k - 1].roll(-k, 0))
@@ -102,7 +110,17 @@ def impacts_of(impact: Tensor, cars: int) -> Tensor:
 
 
 def contacts(impact: Tensor, before: Others, cars: int) -> tuple[Tensor, Tensor]:
-    """Return whether a car was touched, and Σ squared relative speed of contacts with cars ahead, (A, B) each."""
+    """Return which cars were touched, and how hard those ahead were hit.
+
+    Args:
+        impact: Largest squared relative speed of each pair's contacts (A // 2, A, B) [m²/s²].
+        before: Other cars before the step.
+        cars: Number of cars per race A.
+
+    Returns:
+        Whether a car was touched (A, B), 0 or 1, and the sum of the squared relative speeds of contacts with cars ahead
+        (A, B) [m²/s²].
+    """
     each = impacts_of(impact, cars)
     touched = (each > 0.0).any(0).to(impact.dtype)
     return touched, torch.where(before.gap > 0.0, each, 0.0).sum(0)
