@@ -62,7 +62,7 @@ def fight(domain: Domain, agent: LoadedPolicy, way: str, fights: int) -> dict[st
     """Sums over each fight: outcome, damage taken, evasions, berries, and what the policy thinks of them."""
     cells, machines = single_styles(agent.space), list(agent.config["env"]["machines"])
     rows = list(product(cells, machines, range(fights)))
-    theta = torch.stack([agent.space.make(strict=True, **cell) for cell, _, _ in rows])
+    theta = agent.space.make_all(cell for cell, _, _ in rows)
     env = domain.styled_env(agent.space, len(rows), seed=0)
     simulation: Any = env.base_env
     simulation.assign([machine for _, machine, _ in rows], [SITES[number % 3] for _, _, number in rows])

@@ -326,24 +326,21 @@ def _at_least(lowest: int) -> Callable[[str], int]:
     return number
 
 
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value <= 3600.0:
-        raise argparse.ArgumentTypeError(f"{text!r}: expected a number of seconds above 0 and up to 3600")
-    return value
+def _number(accepted: Callable[[float], bool], expected: str) -> Callable[[str], float]:
+    def number(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not accepted(value):
+            raise argparse.ArgumentTypeError(f"{text!r}: expected a number of {expected}")
+        return value
+
+    return number
 
 
-def _fps(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 1.0 <= value <= 60.0:
-        raise argparse.ArgumentTypeError(f"{text!r}: expected a number of pictures per second from 1 to 60")
-    return value
+_seconds = _number(lambda value: 0.0 < value <= 3600.0, "seconds above 0 and up to 3600")
+_fps = _number(lambda value: 1.0 <= value <= 60.0, "pictures per second from 1 to 60")
 
 
 def _style(text: str) -> dict[str, Any]:

@@ -87,12 +87,12 @@ def export_recordings(
     cells = domain.recorded_cells()
     if not 0 < len(cells) <= MOST:
         raise ValueError(f"the domain {domain.name} has {len(cells)} styles to record: expected 1 to {MOST}")
-    thetas = [agent.space.make(strict=True, **cell) for cell in cells]
+    thetas = agent.space.make_all(cells)
     requests = [agent.space.describe(theta) | cell for theta, cell in zip(thetas, cells, strict=True)]
     steps = min(domain.episode_steps, max(1, round(domain.recorded.seconds / domain.control_step)))
     vendored = provide(assets, _NEEDED)
     recordings = record(
-        domain, agent.actor, torch.stack(thetas), requests, space=agent.space, steps=steps, seed=seed, progress=progress
+        domain, agent.actor, thetas, requests, space=agent.space, steps=steps, seed=seed, progress=progress
     )
     columns = domain.recorded.columns or published(domain, recordings[0].measured)
     shown = [_measure(domain, agent.space, *column) for column in columns.items()]

@@ -109,7 +109,7 @@ def log_fights(
         The record, and the film's frames.
     """
     high = dict(zip(agent.space.names, agent.space.high.tolist(), strict=True))
-    theta = torch.stack([agent.space.make(strict=True, **{name: high[name]}) for name in names])
+    theta = agent.space.make_all({name: high[name]} for name in names)
     env = domain.styled_env(agent.space, fights, seed=seed)
     simulation: Any = env.base_env
     simulation.assign([APEX] * fights, ["Arena"] * fights)

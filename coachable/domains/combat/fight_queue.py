@@ -149,7 +149,7 @@ def fight_grid(
     Returns:
         Results of `run_fights`, (styles, opponents, sites * fights, ...).
     """
-    theta = torch.stack([agent.space.make(strict=True, **cell) for cell in cells])
+    theta = agent.space.make_all(cells)
     grid = list(product(range(len(cells)), opponents, SITES, range(fights)))
     rows, faced, places = zip(*((i, machines, site) for i, machines, site, _ in grid), strict=True)
     found = run_fights(domain, agent, theta[list(rows)], faced, places, seed=seed, progress=progress)

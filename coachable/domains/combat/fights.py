@@ -143,7 +143,7 @@ def fight_matrix(
         Sum of each measure over each fight, (styles, opponents, episodes).
     """
     space, shape = agent.space, (len(cells), len(opponents), episodes)
-    theta = torch.stack([space.make(strict=True, **cell) for cell in cells])
+    theta = space.make_all(cells)
     theta = theta.repeat_interleave(len(opponents) * episodes, 0)
     env = domain.styled_env(space, len(theta), seed=seed, num_enemies=len(opponents[0]))
     sites = np.random.default_rng(seed).choice(SITES, len(opponents) * episodes)

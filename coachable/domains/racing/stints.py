@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from coachable.domains.racing.families import home_track
 from coachable.domains.racing.frontier import TANK, WORN, sweep
@@ -148,7 +147,7 @@ def _drive(
 ) -> list[list[Stint]]:
     """Drive the stints of each cell, each from its own place on a track of the given length [m]."""
     space, count = agent.space, len(cells) * episodes
-    theta = torch.stack([space.make(strict=True, **cell) for cell in cells]).repeat_interleave(episodes, 0)
+    theta = space.make_all(cells).repeat_interleave(episodes, 0)
     record = record_styles(
         domain,
         agent.actor,
