@@ -244,7 +244,7 @@ def _report(options: argparse.Namespace) -> int:
 def _export(options: argparse.Namespace) -> int:
     if options.web is not None:
         from coachable.evaluation.recorded_page import export_recordings
-        from coachable.export.web.page import export_page
+        from coachable.export.web.simulated_page import export_page
         from coachable.training.weights import domain_of, load_policy
 
         acts = domain_of(load_policy(options.source)).make_web is not None

@@ -17,7 +17,7 @@ FILES = {
 }
 
 # Small modules at the top level that know no room.
-BASE = {"code_version", "extras", "files", "finite", "gl", "keys", "offscreen", "ranges", "signals", "third_party"}
+BASE = {"code_version", "extras", "files", "finite", "gl", "keys", "object_state", "offscreen", "ranges", "signals"}
 
 # Of each room, the rooms below it that it may import; what these may import it may, too.
 ROOMS = {
@@ -144,6 +144,16 @@ def test_only_domains_know_a_domain():
     for module, other in arrows():
         if room_of(other) in ("domains", "envs"):
             assert room_of(module) in ("domains", "envs"), f"{module} imports {other}"
+
+
+def test_no_two_rooms_have_files_of_one_name():
+    """Except the parts that every domain and every simulator has, and `domain`: the type, and the declarations."""
+    rooms: dict[str, set[str]] = {}
+    for module, path in FILES.items():
+        if path.stem not in ("__init__", "domain"):
+            room = room_of(module)
+            rooms.setdefault(path.stem, set()).add("domains or simulators" if room in ("domains", "envs") else room)
+    assert {name: places for name, places in rooms.items() if len(places) > 1} == {}
 
 
 def test_imports_inside_functions_serve_start_up_or_extras():

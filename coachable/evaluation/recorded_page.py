@@ -19,8 +19,8 @@ from coachable.evaluation.outputs import complete_folder
 from coachable.evaluation.rollouts import Rollout
 from coachable.evaluation.style_grid import published
 from coachable.evaluation.wording import readable
-from coachable.export.web.page import about, copy_page, finish_page
-from coachable.export.web.third_party import provide
+from coachable.export.web.pinned_files import provide
+from coachable.export.web.simulated_page import about, copy_page, finish_page
 from coachable.keys import TASK_REWARD
 from coachable.scene.frame import Frame, Stage
 from coachable.scene.palette import css
@@ -65,7 +65,7 @@ def export_recordings(
     Args:
         source: Checkpoint, run folder, weights file, exported model, or the name of a domain that ships with weights.
         out: Folder to write into; files of the same names are replaced.
-        assets: Folder with the files of other projects, see `coachable.export.web.third_party.provide`.
+        assets: Folder with the files of other projects, see `coachable.export.web.pinned_files.provide`.
         seed: Seed of the start and of sampled actions.
         progress: Whether to show a progress bar.
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
 from coachable.contract.contract import Contract, Recorded
-from coachable.contract.model import OnnxRun
+from coachable.contract.exported_model import OnnxRun
 from coachable.domain import Domain
 from coachable.keys import STYLE
 from coachable.styles import StyleSpace

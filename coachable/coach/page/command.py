@@ -76,7 +76,7 @@ def _serve(
         if open_browser:
             webbrowser.open(address)
 
-        from coachable.coach.page.page import CoachPage
+        from coachable.coach.page.coach_page import CoachPage
         from coachable.coach.session.session import CoachSession
 
         session = CoachSession.open(source, seed=seed, track=track)

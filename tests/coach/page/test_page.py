@@ -20,7 +20,7 @@ import websockets.sync.client as websockets  # noqa: E402, viser brings it
 
 from coachable.coach.page import film as film_module  # noqa: E402
 from coachable.coach.page import scene_view, views  # noqa: E402
-from coachable.coach.page.page import CoachPage, verdict  # noqa: E402
+from coachable.coach.page.coach_page import CoachPage, verdict  # noqa: E402
 from coachable.coach.page.server import make_server  # noqa: E402
 from coachable.coach.session.readout import StyleReport  # noqa: E402
 from coachable.coach.session.session import CoachSession  # noqa: E402

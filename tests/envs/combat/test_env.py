@@ -9,10 +9,10 @@ from coachable.domains.combat import combat_style_reward, combat_style_space
 from coachable.envs.combat import CombatEnv
 from coachable.envs.combat.features import observation_groups, observation_size
 from coachable.envs.combat.fight import run_step
-from coachable.envs.combat.frame import Noise
 from coachable.envs.combat.gamepad import canonical_rows
 from coachable.envs.combat.rewards import COMPONENT_SLICES
 from coachable.envs.combat.state import State
+from coachable.envs.combat.step_frames import Noise
 from coachable.envs.combat.tables import MACHINES, STYLES
 from coachable.transforms import coachable_env
 from tests.envs.contract import assert_set_seed_restarts_the_stream, roll

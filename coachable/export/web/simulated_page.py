@@ -13,7 +13,7 @@ from coachable import __version__
 from coachable.export.graph import graph_of, import_onnx
 from coachable.export.onnx import TOLERANCE, export
 from coachable.export.web.part import WebPart
-from coachable.export.web.third_party import Package, packages, provide
+from coachable.export.web.pinned_files import Package, packages, provide
 from coachable.scene.look import ICON, stylesheet
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
@@ -37,7 +37,7 @@ def export_page(source: str | Path, out: Path, assets: Path | None = None) -> in
     Args:
         source: Checkpoint, run folder, weights file, or the name of a domain that ships with weights.
         out: Folder to write into; files of the same names are replaced.
-        assets: Folder with the files of other projects, see `coachable.export.web.third_party.provide`.
+        assets: Folder with the files of other projects, see `coachable.export.web.pinned_files.provide`.
 
     Returns:
         Size of all files of the page [byte].
@@ -70,7 +70,7 @@ def copy_page(out: Path, vendored: Mapping[str, Path]) -> None:
 
     Args:
         out: The page's folder.
-        vendored: Files of other projects, from `coachable.export.web.third_party.provide`.
+        vendored: Files of other projects, from `coachable.export.web.pinned_files.provide`.
     """
     with as_file(files("coachable.export.web") / "static") as own:
         shutil.copytree(own, out, dirs_exist_ok=True)
