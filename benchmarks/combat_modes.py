@@ -22,9 +22,9 @@ from coachable.domains.combat.styles import single_styles
 from coachable.envs.combat.gamepad import HEADS
 from coachable.envs.combat.state import BERRY, DODGE
 from coachable.envs.combat.tables import SITES
-from coachable.evaluation.rollouts import Rollout
 from coachable.evaluation.statistics import bootstrap_interval
 from coachable.evaluation.style_grid import markdown_table
+from coachable.training.rollout import Rollout
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
 SIZES = [len(values) for values in HEADS.values()]

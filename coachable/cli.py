@@ -154,7 +154,7 @@ def _add_number(parser: argparse.ArgumentParser, flag: str, default: int, what: 
 
 
 def _add_rollout(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `coachable.evaluation.rollouts.RolloutOptions`."""
+    """Add the arguments of `coachable.evaluation.episode_records.RolloutOptions`."""
     parser.add_argument("--steps", type=_at_least(1), help="length of an episode (default: the domain's)")
     parser.add_argument("--seed", type=_at_least(0), default=0)
     text = "physics threads (default: all free cores)"

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from coachable.evaluation.rollouts import RolloutOptions
+    from coachable.evaluation.episode_records import RolloutOptions
     from coachable.evaluation.sweep import WeightSweep
 
 

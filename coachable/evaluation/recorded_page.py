@@ -16,7 +16,6 @@ from tqdm import tqdm
 
 from coachable.domain import Domain
 from coachable.evaluation.outputs import complete_folder
-from coachable.evaluation.rollouts import Rollout
 from coachable.evaluation.style_grid import published
 from coachable.evaluation.wording import readable
 from coachable.export.web.pinned_files import provide
@@ -26,6 +25,7 @@ from coachable.scene.frame import Frame, Stage
 from coachable.scene.palette import css
 from coachable.scene.recorded import encode_backdrop, encode_frames
 from coachable.styles import Choice, StyleSpace
+from coachable.training.rollout import Rollout
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
 __all__ = ["Recording", "export_recordings", "record"]

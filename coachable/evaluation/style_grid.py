@@ -13,7 +13,7 @@ import numpy as np
 from tensordict.nn import InteractionType, TensorDictModuleBase
 
 from coachable.domain import Domain
-from coachable.evaluation.rollouts import RolloutOptions, record_styles
+from coachable.evaluation.episode_records import RolloutOptions, record_styles
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
 from coachable.styles import Setpoint, StyleSpace
 from coachable.training.weights import LoadedPolicy

@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from coachable.domain import Domain, StyleMeasures
-from coachable.evaluation.rollouts import RolloutOptions, record_styles
+from coachable.evaluation.episode_records import RolloutOptions, record_styles
 from coachable.keys import STYLE_FEATURES
 from coachable.styles import StyleReward, StyleSpace, Weight
 

@@ -9,9 +9,9 @@ import torch
 from tensordict.nn import TensorDictModule
 
 from coachable.domain import Domain, load_domain
+from coachable.evaluation.episode_records import record_episodes
 from coachable.evaluation.evaluate import evaluate_styles
 from coachable.evaluation.evaluation_settings import EvaluationSettings
-from coachable.evaluation.rollouts import record_episodes
 from coachable.evaluation.style_grid import evaluate_grid, markdown_table, write_csv
 from coachable.evaluation.switching import evaluate_switching
 from coachable.styles import Choice, Setpoint, StyleReward, StyleSpace

@@ -14,8 +14,8 @@ from coachable.envs.combat.constants import PLAYER_HP
 from coachable.envs.combat.env import COMPONENTS_KEY
 from coachable.envs.combat.rewards import COMPONENT_SLICES
 from coachable.envs.combat.tables import ELEMENTS
-from coachable.evaluation.rollouts import Rollout
 from coachable.evaluation.video import asked_line, caption
+from coachable.training.rollout import Rollout
 
 if TYPE_CHECKING:
     from coachable.domain import Domain

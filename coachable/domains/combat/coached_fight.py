@@ -15,10 +15,10 @@ from coachable.envs.combat.constants import PLAYER_HP
 from coachable.envs.combat.tables import ELEMENTS, STYLES
 from coachable.envs.combat.traits import MACHINE_NAMES
 from coachable.evaluation.figures import drawing
-from coachable.evaluation.rollouts import Rollout
 from coachable.evaluation.runs import SWITCH_PERIOD
 from coachable.evaluation.wording import readable
 from coachable.styles import StyleSpace
+from coachable.training.rollout import Rollout
 
 if TYPE_CHECKING:
     from coachable.domain import Domain

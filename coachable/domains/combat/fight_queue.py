@@ -16,7 +16,7 @@ from coachable.domains.combat.metrics import CombatMeasures
 from coachable.envs.combat.env import COMPONENTS_KEY
 from coachable.envs.combat.rewards import COMPONENT_SLICES, style_counts
 from coachable.envs.combat.tables import SITES
-from coachable.evaluation.rollouts import Rollout
+from coachable.training.rollout import Rollout
 
 if TYPE_CHECKING:
     from coachable.domain import Domain

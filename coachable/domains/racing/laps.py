@@ -15,8 +15,8 @@ from coachable.envs.racing.circuit.track import Track
 from coachable.envs.racing.physics.cars import Resources, load_car
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
 from coachable.envs.racing.race.scenarios import Conditions, Scenario
+from coachable.evaluation.episode_records import record_styles
 from coachable.evaluation.evaluation_settings import EvaluationSettings
-from coachable.evaluation.rollouts import record_styles
 from coachable.evaluation.style_grid import markdown_table, mean_of
 
 if TYPE_CHECKING:

@@ -17,9 +17,9 @@ from coachable.domains.racing.traffic import draw_traffic, race_in_traffic, traf
 from coachable.envs.racing.circuit.circuits import load_track
 from coachable.envs.racing.physics.cars import Resources
 from coachable.envs.racing.race.scenarios import Conditions
+from coachable.evaluation.episode_records import record_styles
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import drawing, shade
-from coachable.evaluation.rollouts import record_styles
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
 from coachable.evaluation.style_grid import markdown_table, mean_of, policy_sentence, write_results
 
