@@ -8,7 +8,6 @@ import sys
 import time
 import zipfile
 from collections.abc import Callable, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit status: 0 for success, 1 if a check failed, 2 for an error that you can fix, 130 after Ctrl-C.
     """
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    options, further = parser.parse_known_args(arguments)
+    if options.command in ("coach", "evaluate"):
+        options.env_options = _env_options(parser, further)
+    elif further:
+        parser.error(f"unrecognized arguments: {' '.join(further)}")
     run: Callable[[argparse.Namespace], int] = options.run
     try:
         return run(options)
@@ -54,7 +58,22 @@ def _sentence(error: Exception) -> str:
     return str(error)
 
 
+def _env_options(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> dict[str, str]:
+    """Return `--NAME VALUE` and `--NAME=VALUE` by name; the agent's domain knows which there are."""
+    options: dict[str, str] = {}
+    rest = iter(arguments)
+    for argument in rest:
+        name, equals, value = argument.removeprefix("--").partition("=")
+        value = value if equals else next(rest, "")
+        if not argument.startswith("--") or not name or not value or value.startswith("--"):
+            parser.error(f"unrecognized arguments: {' '.join(arguments)}")
+        options[name.replace("-", "_")] = value
+    return options
+
+
 def _parser() -> argparse.ArgumentParser:
+    from coachable.coach.page.command import ENV_OPTIONS, add_parser
+
     parser = argparse.ArgumentParser(prog="coachable", description="Train one agent, coach it while it acts.")
     parser.add_argument("--version", action="version", version=f"coachable {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -74,13 +93,12 @@ def _parser() -> argparse.ArgumentParser:
         "arguments", nargs=argparse.REMAINDER, help="KEY=VALUE ... seeds=0,1,2, or --help for all of them"
     )
 
-    evaluate = command("evaluate", _measure, "measure every style of an agent: tables and a figure", _SOURCE_HELP)
+    evaluate = command("evaluate", _evaluate, "measure every style of an agent: tables and a figure", _SOURCE_HELP)
     _add_out(evaluate, "evaluation", "folder")
     _add_number(evaluate, "--episodes", 20, "per style")
     _add_number(evaluate, "--switch-episodes", 60, "with switching styles, 0 for none", lowest=0)
     _add_rollout(evaluate)
-    text = "CSV file of a circuit to drive on beside the others, for racing agents"
-    evaluate.add_argument("--track", type=Path, metavar="FILE", help=text)
+    evaluate.epilog = ENV_OPTIONS
 
     render = command("render", _render, "film an agent whose style is switched while it acts", _SOURCE_HELP)
     _add_out(render, "coachable.mp4", ".mp4, .gif, .webp or .png")
@@ -118,7 +136,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_number(report, "--sweep-points", 5, "values of each weight", lowest=2)
     _add_rollout(report)
 
-    explain = command("explain", _measure, "rank the inputs of an agent, by SHAP and saliency", _SOURCE_HELP)
+    explain = command("explain", _explain, "rank the inputs of an agent, by SHAP and saliency", _SOURCE_HELP)
     _add_out(explain, "explanation", "folder")
     _add_number(explain, "--episodes", 100, "trajectories", lowest=2)
     _add_number(explain, "--states", 16, "of each trajectory")
@@ -136,8 +154,6 @@ def _parser() -> argparse.ArgumentParser:
     verify.add_argument("file", type=Path, help="a file of coachable export")
     text = "whose environment is compared with the recording (default: the model's own, if it is installed)"
     verify.add_argument("--domain", metavar="NAME", help=text)
-
-    from coachable.coach.page.command import add_parser
 
     add_parser(commands, _SOURCE_HELP, _coach)
 
@@ -195,13 +211,24 @@ def _train_seeds(file: Path, arguments: list[str], seeds: str) -> int:
     return 1 if failed else 0
 
 
-def _measure(options: argparse.Namespace) -> int:
-    """Run `coachable.evaluation.evaluate.evaluate` or `coachable.evaluation.explain.explain`."""
+def _evaluate(options: argparse.Namespace) -> int:
+    from coachable.evaluation.evaluate import evaluate
+
+    return _measure(evaluate, options)
+
+
+def _explain(options: argparse.Namespace) -> int:
+    from coachable.evaluation.explain import explain
+
+    return _measure(explain, options)
+
+
+def _measure(measure: Callable[..., str], options: argparse.Namespace) -> int:
+    """Write the results of a measurement into a folder that appears when they are complete, and print its text."""
     from coachable.evaluation.outputs import complete_folder
 
-    function = getattr(import_module(f"coachable.evaluation.{options.command}"), options.command)
     with complete_folder(options.out) as options.out:
-        text = function(**_arguments(options))
+        text = measure(**_arguments(options))
     print(text)
     return 0
 

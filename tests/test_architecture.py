@@ -159,6 +159,7 @@ def test_no_two_rooms_have_files_of_one_name():
 def test_imports_inside_functions_serve_start_up_or_extras():
     """Of this package; those of optional extras are of other packages."""
     lazy = {
+        "coachable",  # `import coachable` is light; its names are imported on first use
         "coachable.cli",  # a command loads what it needs only when it runs
         "coachable.doctor",  # tells of what cannot be imported
         "coachable.coach.page.command",  # the page is up before torch is loaded
@@ -180,6 +181,14 @@ def test_no_names_in_strings_point_up():
                 continue
             if name in FILES and name != "coachable" and (module, name) not in EXCEPTIONS:
                 assert not points_up(module, name), f"{module}, line {node.lineno}, names {node.value!r}"
+
+
+def test_no_module_is_imported_by_a_name_in_a_string():
+    """What is imported can be read from import statements."""
+    for module, path in FILES.items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = {getattr(node, "id", ""), getattr(node, "attr", ""), getattr(node, "name", "")}
+            assert not names & {"import_module", "__import__"}, f"{module} imports a module by its name"
 
 
 def test_modules_are_short():

@@ -151,7 +151,7 @@ def record(
     options = {**domain.coached, **(alike(len(requests)) if alike else {})}
     env = domain.styled_env(space, len(requests), seed=seed, **options)
     cameras = [_Camera(env, row, make_stage(), request) for row, request in enumerate(requests)]
-    alive, survived = torch.ones(2, len(requests), dtype=torch.bool)
+    survived = torch.ones(len(requests), dtype=torch.bool)
     task_return = torch.zeros(len(requests))
     rows: list[dict[str, Tensor]] = []
     lives: list[Tensor] = []
@@ -160,8 +160,8 @@ def record(
         rollout.begin(theta)
         for camera in cameras:
             camera.see()
-        for _ in tqdm(range(steps), "recording", disable=None if progress else True, leave=False):
-            transition = rollout.step(policy, theta)
+        run = rollout.episode(policy, steps, lambda _: theta)
+        for transition, alive in tqdm(run, "recording", steps, disable=None if progress else True, leave=False):
             after = transition.get("next")
             rows.append(domain.measures.step(transition))
             lives.append(alive)
@@ -169,9 +169,6 @@ def record(
             survived = survived & ~(alive & after.get("terminated").squeeze(-1))
             for row in alive.nonzero()[:, 0].tolist():
                 cameras[row].see()
-            alive = alive & ~after.get("done").squeeze(-1)
-            if not alive.any():
-                break
     finally:
         env.close()
     taken = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
