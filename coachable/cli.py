@@ -32,10 +32,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = _parser()
     options, further = parser.parse_known_args(arguments)
-    if options.command in ("coach", "evaluate"):
-        options.env_options = _env_options(parser, further)
-    elif further:
+    if further and options.command not in ("coach", "evaluate"):
         parser.error(f"unrecognized arguments: {' '.join(further)}")
+    if further:
+        from coachable.coach.page.command import read_env_options
+
+        options.env_options = read_env_options(parser, further)
     run: Callable[[argparse.Namespace], int] = options.run
     try:
         return run(options)
@@ -56,19 +58,6 @@ def _sentence(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror}"
     return str(error)
-
-
-def _env_options(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> dict[str, str]:
-    """Return `--NAME VALUE` and `--NAME=VALUE` by name; the agent's domain knows which there are."""
-    options: dict[str, str] = {}
-    rest = iter(arguments)
-    for argument in rest:
-        name, equals, value = argument.removeprefix("--").partition("=")
-        value = value if equals else next(rest, "")
-        if not argument.startswith("--") or not name or not value or value.startswith("--"):
-            parser.error(f"unrecognized arguments: {' '.join(arguments)}")
-        options[name.replace("-", "_")] = value
-    return options
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -6,7 +6,7 @@ import argparse
 import io
 import threading
 import webbrowser
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, redirect_stdout
 from typing import Any
 
@@ -31,6 +31,24 @@ def add_parser(commands: Any, source_help: str, run: Callable[[argparse.Namespac
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--open", action="store_true", dest="open_browser", help="open the page in the browser")
     parser.set_defaults(run=run)
+
+
+def read_env_options(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> dict[str, str]:
+    """Return options of a domain's environment by name, of which the domain knows whether there are such.
+
+    Args:
+        parser: Parser that does not know them; it ends the program if they are no pairs of a name and a value.
+        arguments: `--NAME VALUE` or `--NAME=VALUE`, any number of them.
+    """
+    options: dict[str, str] = {}
+    rest = iter(arguments)
+    for argument in rest:
+        name, equals, value = argument.removeprefix("--").partition("=")
+        value = value if equals else next(rest, "")
+        if not argument.startswith("--") or not name or not value or value.startswith("--"):
+            parser.error(f"unrecognized arguments: {' '.join(arguments)}")
+        options[name.replace("-", "_")] = value
+    return options
 
 
 def serve(source: str, *, say: Callable[[str], None], **settings: Any) -> None:
