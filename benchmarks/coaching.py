@@ -57,7 +57,7 @@ def open_page(source: str) -> None:
 
 def act(source: str, seconds: float) -> None:
     """Control steps per second and the delay of slider changes, while a browser shows the page and moves a slider."""
-    from coachable.coach.page.page import CoachPage
+    from coachable.coach.page.coach_page import CoachPage
     from coachable.coach.page.server import make_server
     from coachable.coach.session.session import CoachSession
 

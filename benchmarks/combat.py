@@ -23,24 +23,24 @@ import torch
 from combat_workers import DRAWN, FIGHTS, advance
 from contest import Worker, measure
 
-from coachable.envs.combat import CombatEnv, env, fight, frame
+from coachable.envs.combat import CombatEnv, env, fight, step_frames
 
 # Where the time of a step goes: module, function.
 PHASES: list[tuple[Any, str]] = [
     (env, "canonical_rows"),
     (fight, "command"),
-    (frame, "move_player"),
-    (frame, "turn_camera"),
-    (frame, "shoot"),
-    (frame, "damage_parts"),
-    (frame, "build_up"),
-    (frame, "swing"),
-    (frame, "spring_traps"),
-    (frame, "run_elements"),
-    (frame, "take_damage"),
-    (frame, "decide"),
-    (frame, "move_machines"),
-    (frame, "strike_player"),
+    (step_frames, "move_player"),
+    (step_frames, "turn_camera"),
+    (step_frames, "shoot"),
+    (step_frames, "damage_parts"),
+    (step_frames, "build_up"),
+    (step_frames, "swing"),
+    (step_frames, "spring_traps"),
+    (step_frames, "run_elements"),
+    (step_frames, "take_damage"),
+    (step_frames, "decide"),
+    (step_frames, "move_machines"),
+    (step_frames, "strike_player"),
     (env, "observe"),
     (env, "start_fights"),
     (env, "look_up_traits"),

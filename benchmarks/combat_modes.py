@@ -22,9 +22,9 @@ from coachable.domains.combat.styles import single_styles
 from coachable.envs.combat.gamepad import HEADS
 from coachable.envs.combat.state import BERRY, DODGE
 from coachable.envs.combat.tables import SITES
-from coachable.evaluation.rollouts import Rollout
 from coachable.evaluation.statistics import bootstrap_interval
 from coachable.evaluation.style_grid import markdown_table
+from coachable.training.rollout import Rollout
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
 SIZES = [len(values) for values in HEADS.values()]
@@ -62,7 +62,7 @@ def fight(domain: Domain, agent: LoadedPolicy, way: str, fights: int) -> dict[st
     """Sums over each fight: outcome, damage taken, evasions, berries, and what the policy thinks of them."""
     cells, machines = single_styles(agent.space), list(agent.config["env"]["machines"])
     rows = list(product(cells, machines, range(fights)))
-    theta = torch.stack([agent.space.make(strict=True, **cell) for cell, _, _ in rows])
+    theta = agent.space.make_all(cell for cell, _, _ in rows)
     env = domain.styled_env(agent.space, len(rows), seed=0)
     simulation: Any = env.base_env
     simulation.assign([machine for _, machine, _ in rows], [SITES[number % 3] for _, _, number in rows])

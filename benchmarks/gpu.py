@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from learner_workers import LAYERS, make_batch, sac_learner
+from learner_work import LAYERS, make_batch
+from our_learners import sac_learner
 
 from coachable.evaluation.evaluate import evaluate
 from coachable.training.hardware import detect

@@ -17,7 +17,8 @@ import sys
 from pathlib import Path
 
 from contest import Worker, measure
-from learner_workers import MATMUL_FLOPS, PEERS, WIDTH, WORKERS, flops_per_update
+from learner_work import WIDTH, flops_per_update
+from learner_workers import MATMUL_FLOPS, PEERS, WORKERS
 
 OURS, YARDSTICK = "coachable-bf16", "matmul-bf16"
 DEFAULT = (

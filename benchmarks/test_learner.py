@@ -8,7 +8,8 @@ import pytest
 import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
-from learner_workers import WORKERS, B, flops_per_update
+from learner_work import B, flops_per_update
+from learner_workers import WORKERS
 
 CONTESTANTS = [name for name in WORKERS if name.startswith(("coachable", "torchrl"))]
 

@@ -4,7 +4,7 @@ Names are imported on first use, so that `import coachable` loads neither torch 
 library.
 """
 
-from importlib import import_module
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 from coachable.gl import choose_gl_backend
@@ -19,14 +19,46 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0.dev0"
 
-# Public names by module, which `__getattr__` imports lazily (PEP 562).
-_NAMES = {
-    "coachable.styles": "Choice Setpoint StyleReward StyleSpace Weight",
-    "coachable.replay": "EventTableBuffer",
-    "coachable.coach.session.session": "CoachSession",
-    "coachable.transforms": "CoachableEnv StyleRewardTransform StyleSampler TaskImpersonation coachable_env",
+
+def _styles() -> ModuleType:
+    from coachable import styles
+
+    return styles
+
+
+def _replay() -> ModuleType:
+    from coachable import replay
+
+    return replay
+
+
+def _transforms() -> ModuleType:
+    from coachable import transforms
+
+    return transforms
+
+
+def _session() -> ModuleType:
+    from coachable.coach.session import session
+
+    return session
+
+
+# Functions that import the module of each public name, which `__getattr__` calls on first use (PEP 562).
+_IMPORTS = {
+    "Choice": _styles,
+    "CoachSession": _session,
+    "CoachableEnv": _transforms,
+    "EventTableBuffer": _replay,
+    "Setpoint": _styles,
+    "StyleReward": _styles,
+    "StyleRewardTransform": _transforms,
+    "StyleSampler": _transforms,
+    "StyleSpace": _styles,
+    "TaskImpersonation": _transforms,
+    "Weight": _styles,
+    "coachable_env": _transforms,
 }
-_MODULE_OF = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 __all__ = [
     "Choice",
@@ -46,8 +78,8 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
-    if name in _MODULE_OF:
-        return getattr(import_module(_MODULE_OF[name]), name)
+    if name in _IMPORTS:
+        return getattr(_IMPORTS[name](), name)
     raise AttributeError(f"module 'coachable' has no attribute {name!r}; it offers {', '.join(__all__)}")
 
 

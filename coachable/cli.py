@@ -8,7 +8,6 @@ import sys
 import time
 import zipfile
 from collections.abc import Callable, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit status: 0 for success, 1 if a check failed, 2 for an error that you can fix, 130 after Ctrl-C.
     """
-    options = _parser().parse_args(arguments)
+    parser = _parser()
+    options, further = parser.parse_known_args(arguments)
+    if further and options.command not in ("coach", "evaluate"):
+        parser.error(f"unrecognized arguments: {' '.join(further)}")
+    if further:
+        from coachable.coach.page.command import read_env_options
+
+        options.env_options = read_env_options(parser, further)
     run: Callable[[argparse.Namespace], int] = options.run
     try:
         return run(options)
@@ -55,6 +61,8 @@ def _sentence(error: Exception) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
+    from coachable.coach.page.command import ENV_OPTIONS, add_parser
+
     parser = argparse.ArgumentParser(prog="coachable", description="Train one agent, coach it while it acts.")
     parser.add_argument("--version", action="version", version=f"coachable {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -74,13 +82,12 @@ def _parser() -> argparse.ArgumentParser:
         "arguments", nargs=argparse.REMAINDER, help="KEY=VALUE ... seeds=0,1,2, or --help for all of them"
     )
 
-    evaluate = command("evaluate", _measure, "measure every style of an agent: tables and a figure", _SOURCE_HELP)
+    evaluate = command("evaluate", _evaluate, "measure every style of an agent: tables and a figure", _SOURCE_HELP)
     _add_out(evaluate, "evaluation", "folder")
     _add_number(evaluate, "--episodes", 20, "per style")
     _add_number(evaluate, "--switch-episodes", 60, "with switching styles, 0 for none", lowest=0)
     _add_rollout(evaluate)
-    text = "CSV file of a circuit to drive on beside the others, for racing agents"
-    evaluate.add_argument("--track", type=Path, metavar="FILE", help=text)
+    evaluate.epilog = ENV_OPTIONS
 
     render = command("render", _render, "film an agent whose style is switched while it acts", _SOURCE_HELP)
     _add_out(render, "coachable.mp4", ".mp4, .gif, .webp or .png")
@@ -118,7 +125,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_number(report, "--sweep-points", 5, "values of each weight", lowest=2)
     _add_rollout(report)
 
-    explain = command("explain", _measure, "rank the inputs of an agent, by SHAP and saliency", _SOURCE_HELP)
+    explain = command("explain", _explain, "rank the inputs of an agent, by SHAP and saliency", _SOURCE_HELP)
     _add_out(explain, "explanation", "folder")
     _add_number(explain, "--episodes", 100, "trajectories", lowest=2)
     _add_number(explain, "--states", 16, "of each trajectory")
@@ -137,8 +144,6 @@ def _parser() -> argparse.ArgumentParser:
     text = "whose environment is compared with the recording (default: the model's own, if it is installed)"
     verify.add_argument("--domain", metavar="NAME", help=text)
 
-    from coachable.coach.page.command import add_parser
-
     add_parser(commands, _SOURCE_HELP, _coach)
 
     command("doctor", _doctor, "check this installation")
@@ -154,7 +159,7 @@ def _add_number(parser: argparse.ArgumentParser, flag: str, default: int, what: 
 
 
 def _add_rollout(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `coachable.evaluation.rollouts.RolloutOptions`."""
+    """Add the arguments of `coachable.evaluation.episode_records.RolloutOptions`."""
     parser.add_argument("--steps", type=_at_least(1), help="length of an episode (default: the domain's)")
     parser.add_argument("--seed", type=_at_least(0), default=0)
     text = "physics threads (default: all free cores)"
@@ -195,13 +200,24 @@ def _train_seeds(file: Path, arguments: list[str], seeds: str) -> int:
     return 1 if failed else 0
 
 
-def _measure(options: argparse.Namespace) -> int:
-    """Run `coachable.evaluation.evaluate.evaluate` or `coachable.evaluation.explain.explain`."""
+def _evaluate(options: argparse.Namespace) -> int:
+    from coachable.evaluation.evaluate import evaluate
+
+    return _measure(evaluate, options)
+
+
+def _explain(options: argparse.Namespace) -> int:
+    from coachable.evaluation.explain import explain
+
+    return _measure(explain, options)
+
+
+def _measure(measure: Callable[..., str], options: argparse.Namespace) -> int:
+    """Write the results of a measurement into a folder that appears when they are complete, and print its text."""
     from coachable.evaluation.outputs import complete_folder
 
-    function = getattr(import_module(f"coachable.evaluation.{options.command}"), options.command)
     with complete_folder(options.out) as options.out:
-        text = function(**_arguments(options))
+        text = measure(**_arguments(options))
     print(text)
     return 0
 
@@ -244,7 +260,7 @@ def _report(options: argparse.Namespace) -> int:
 def _export(options: argparse.Namespace) -> int:
     if options.web is not None:
         from coachable.evaluation.recorded_page import export_recordings
-        from coachable.export.web.page import export_page
+        from coachable.export.web.simulated_page import export_page
         from coachable.training.weights import domain_of, load_policy
 
         acts = domain_of(load_policy(options.source)).make_web is not None
@@ -326,24 +342,21 @@ def _at_least(lowest: int) -> Callable[[str], int]:
     return number
 
 
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value <= 3600.0:
-        raise argparse.ArgumentTypeError(f"{text!r}: expected a number of seconds above 0 and up to 3600")
-    return value
+def _number(accepted: Callable[[float], bool], expected: str) -> Callable[[str], float]:
+    def number(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not accepted(value):
+            raise argparse.ArgumentTypeError(f"{text!r}: expected a number of {expected}")
+        return value
+
+    return number
 
 
-def _fps(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 1.0 <= value <= 60.0:
-        raise argparse.ArgumentTypeError(f"{text!r}: expected a number of pictures per second from 1 to 60")
-    return value
+_seconds = _number(lambda value: 0.0 < value <= 3600.0, "seconds above 0 and up to 3600")
+_fps = _number(lambda value: 1.0 <= value <= 60.0, "pictures per second from 1 to 60")
 
 
 def _style(text: str) -> dict[str, Any]:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.metadata import entry_points
 from inspect import signature
 from itertools import product
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -100,6 +99,22 @@ class Control:
         if self.circular and not low <= value <= high:
             return low + (value - low) % (high - low)
         return min(max(value, low), high)
+
+
+@dataclass(frozen=True)
+class EnvOption:
+    """Option of an environment that `coachable coach` and `coachable evaluate` offer, as `--NAME VALUE`.
+
+    Attributes:
+        name: Name of the argument of `make_env`, and of the option.
+        read: Function that makes the argument from the text on the command line. It raises a `ValueError` or an
+            `OSError` whose message says what is wrong with the text.
+        help: What the option is, for people.
+    """
+
+    name: str
+    read: Callable[[str], Any]
+    help: str
 
 
 @dataclass(frozen=True)
@@ -238,7 +253,7 @@ class Domain:
         words: Words for the domain, for phrases and presets.
         as_trained: Function from `env` of a training's configuration to this domain with these settings (such as the
             machines or cars); None if trainings do not differ.
-        on_track: Function from the file of a circuit to this domain on that circuit; None if it has no circuits.
+        env_options: Options of `make_env` on the command line.
         coached: Options of `make_env` for coaching and films, if they differ from those of evaluations.
         evaluation: Function that replaces the grid and the switching test of `coachable evaluate`: `(domain, policy,
             folder, settings) -> report`, with the loaded policy and `coachable.evaluation.evaluation_settings`.
@@ -264,7 +279,7 @@ class Domain:
     window: float = 2.0
     words: Words = field(default_factory=Words)
     as_trained: Callable[[Mapping[str, Any]], Domain] | None = None
-    on_track: Callable[[Path], Domain] | None = None
+    env_options: Sequence[EnvOption] = ()
     coached: Mapping[str, Any] = field(default_factory=dict)
     evaluation: Callable[..., str] | None = None
     make_stage: Callable[[], Stage] | None = None
@@ -299,15 +314,24 @@ class Domain:
         reward = self.make_reward(space) if reward is None else reward
         return coachable_env(simulation, space, reward, *transforms, seed=seed)
 
-    def moved_to(self, track: Path) -> Domain:
-        """Return this domain on the circuit of a file.
+    def read_options(self, texts: Mapping[str, str]) -> dict[str, Any]:
+        """Return arguments of `make_env` from texts, by the names of `env_options`.
 
         Raises:
-            ValueError: If the domain has no circuits, or if the file does not hold one.
+            ValueError: If there is no such option, or a text does not describe a value.
         """
-        if self.on_track is None:
-            raise ValueError(f"{self.name} has no circuits: --track {track} is for agents that race")
-        return self.on_track(track)
+        known = {option.name: option for option in self.env_options}
+        for name in texts:
+            if name not in known:
+                offered = [f"--{option.name} ({option.help})" for option in self.env_options]
+                raise ValueError(
+                    f"{self.name} has no option --{name}: expected {' or '.join(offered) or 'no options of its own'}"
+                )
+        return {name: known[name].read(text) for name, text in texts.items()}
+
+    def with_options(self, options: Mapping[str, Any]) -> Domain:
+        """Return this domain with arguments of `make_env`, such as those from `read_options`."""
+        return replace(self, make_env=partial(self.make_env, **options)) if options else self
 
     def cells(self) -> list[dict[str, Any]]:
         """Return the styles of the evaluation grid, by parameter name."""

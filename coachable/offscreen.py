@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib import import_module
 from typing import Any
 
 import mujoco
@@ -82,8 +81,21 @@ def _make_gl_context(width: int, height: int) -> Any:
     if backend == NO_BACKEND:
         raise RenderingError(INSTALL_HINT)
     try:
-        context = import_module(f"mujoco.{backend}").GLContext(width, height)
+        context = _gl_context_class(backend)(width, height)
         context.make_current()
     except (ImportError, AttributeError, RuntimeError, OSError) as error:
         raise RenderingError(f"MUJOCO_GL={backend} failed ({error}): {INSTALL_HINT}") from error
     return context
+
+
+def _gl_context_class(backend: str) -> Any:
+    """Return MuJoCo's class of OpenGL contexts of a backend, which can be imported only where the backend works."""
+    if backend == "egl":
+        from mujoco.egl import GLContext
+    elif backend == "osmesa":
+        from mujoco.osmesa import GLContext
+    elif backend == "glfw":
+        from mujoco.glfw import GLContext
+    else:
+        raise ImportError(f"there is no backend {backend}: expected egl, osmesa or glfw")
+    return GLContext

@@ -75,6 +75,16 @@ def make_echo_env() -> Callable[..., Any]:
     return make_echo_env
 
 
+@pytest.fixture(scope="session")
+def short_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a short training without a recipe, of a domain that is not registered. Do not write to it."""
+    from tests.echo import make_train
+
+    folder = tmp_path_factory.mktemp("short") / "run"
+    make_train(folder, total_frames=80).run()
+    return folder
+
+
 @pytest.fixture
 def make_train(tmp_path: Path) -> Callable[..., Any]:
     """Makes a small training in `tmp_path / "run"` or a given folder: `make_train(total_frames=400, width=16)`."""

@@ -17,7 +17,7 @@ FILES = {
 }
 
 # Small modules at the top level that know no room.
-BASE = {"code_version", "extras", "files", "finite", "gl", "keys", "offscreen", "ranges", "signals", "third_party"}
+BASE = {"code_version", "extras", "files", "finite", "gl", "keys", "object_state", "offscreen", "ranges", "signals"}
 
 # Of each room, the rooms below it that it may import; what these may import it may, too.
 ROOMS = {
@@ -146,9 +146,20 @@ def test_only_domains_know_a_domain():
             assert room_of(module) in ("domains", "envs"), f"{module} imports {other}"
 
 
+def test_no_two_rooms_have_files_of_one_name():
+    """Except the parts that every domain and every simulator has, and `domain`: the type, and the declarations."""
+    rooms: dict[str, set[str]] = {}
+    for module, path in FILES.items():
+        if path.stem not in ("__init__", "domain"):
+            room = room_of(module)
+            rooms.setdefault(path.stem, set()).add("domains or simulators" if room in ("domains", "envs") else room)
+    assert {name: places for name, places in rooms.items() if len(places) > 1} == {}
+
+
 def test_imports_inside_functions_serve_start_up_or_extras():
     """Of this package; those of optional extras are of other packages."""
     lazy = {
+        "coachable",  # `import coachable` is light; its names are imported on first use
         "coachable.cli",  # a command loads what it needs only when it runs
         "coachable.doctor",  # tells of what cannot be imported
         "coachable.coach.page.command",  # the page is up before torch is loaded
@@ -170,6 +181,14 @@ def test_no_names_in_strings_point_up():
                 continue
             if name in FILES and name != "coachable" and (module, name) not in EXCEPTIONS:
                 assert not points_up(module, name), f"{module}, line {node.lineno}, names {node.value!r}"
+
+
+def test_no_module_is_imported_by_a_name_in_a_string():
+    """What is imported can be read from import statements."""
+    for module, path in FILES.items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = {getattr(node, "id", ""), getattr(node, "attr", ""), getattr(node, "name", "")}
+            assert not names & {"import_module", "__import__"}, f"{module} imports a module by its name"
 
 
 def test_modules_are_short():

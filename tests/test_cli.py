@@ -32,6 +32,18 @@ def test_the_command_starts_without_loading_torch():
     subprocess.run([sys.executable, "-c", code], check=True, cwd=REPOSITORY)
 
 
+@pytest.mark.parametrize("further", ["--track", "own.csv", "--track --other"])
+def test_an_option_of_a_domain_has_a_value(further, capsys):
+    with pytest.raises(SystemExit):
+        main(["evaluate", "racing_resources", *further.split()])
+    assert "unrecognized arguments" in capsys.readouterr().err
+
+
+def test_an_option_that_the_domain_lacks_is_named(capsys, tmp_path):
+    assert main(["evaluate", "humanoid", "--out", str(tmp_path / "out"), "--track=own.csv"]) == 2
+    assert "humanoid has no option --track: expected no options of its own" in capsys.readouterr().err
+
+
 def test_a_bad_circuit_is_one_sentence(capsys, tmp_path):
     (tmp_path / "own.csv").write_text("1, 2, 3, 4\n1, 2, x, 4\n")
     arguments = ["evaluate", "racing_resources", "--out", str(tmp_path / "out"), "--track", str(tmp_path / "own.csv")]

@@ -14,6 +14,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from coachable.cli import _parser
+from coachable.domain import domain_names, load_domain
 
 ROOT = Path(__file__).resolve().parents[1]
 CONFIGS = ROOT / "recipes" / "configs"
@@ -127,11 +128,13 @@ def mistake_in(command: list[str]) -> str | None:
 
 
 def mistake_in_options(words: list[str]) -> str | None:
-    """Of `coachable`: a sub-command or an option that it does not have."""
+    """Of `coachable`: a sub-command or an option that neither it nor the domain has."""
     (subcommands,) = (a for a in _parser()._actions if isinstance(a, argparse._SubParsersAction))
     if words[0] not in subcommands.choices:
         return f"there is no sub-command {words[0]}"
-    known = subcommands.choices[words[0]]._option_string_actions
+    known = {*subcommands.choices[words[0]]._option_string_actions}
+    for domain in {*words[1:2]} & {*domain_names()} if words[0] in ("coach", "evaluate") else ():
+        known |= {f"--{option.name}" for option in load_domain(domain).env_options}
     options = [word.partition("=")[0] for word in words if word.startswith("--")]
     return next((f"{words[0]} has no option {option}" for option in options if option not in known), None)
 

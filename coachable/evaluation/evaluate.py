@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,30 +27,30 @@ from coachable.evaluation.switching import SwitchReport, evaluate_switching
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
 
-def evaluate(source: str | Path, out: Path, **settings: Any) -> str:
+def evaluate(source: str | Path, out: Path, *, env_options: Mapping[str, str] | None = None, **settings: Any) -> str:
     """Evaluate an agent and write the results into a folder, by default those of `evaluate_styles`.
 
     Args:
         source: Checkpoint, run folder, weights file, or the name of a domain that ships with weights.
         out: Folder for the results, created if missing.
-        **settings: Arguments of `EvaluationSettings`; styles switch every 100 steps.
+        env_options: Options of the domain's environment as texts, see `Domain.env_options`.
+        **settings: Further arguments of `EvaluationSettings`; styles switch every 100 steps.
 
     Returns:
         The report as Markdown.
 
     Raises:
-        ValueError: If `episodes` is below 1, or if `track` is given and is no circuit, or the domain has none.
+        ValueError: If `episodes` is below 1, or if the domain has no such option, or not with such a value.
         CheckpointError: If the source does not hold a usable policy of its domain.
     """
     asked = EvaluationSettings(**settings)
     agent = load_policy(source)
     domain = domain_of(agent)
-    if asked.track is not None:
-        domain.moved_to(asked.track)  # raises an error if it cannot be driven on
+    asked = replace(asked, env_options=domain.read_options(env_options or {}))
     out.mkdir(parents=True, exist_ok=True)
     if domain.evaluation is not None:
         return domain.evaluation(domain, agent, out, asked)
-    return evaluate_styles(domain, agent, out, asked)[0]
+    return evaluate_styles(domain.with_options(asked.env_options), agent, out, asked)[0]
 
 
 def evaluate_styles(

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from coachable.evaluation.rollouts import RolloutOptions
+    from coachable.evaluation.episode_records import RolloutOptions
     from coachable.evaluation.sweep import WeightSweep
 
 
@@ -23,7 +22,8 @@ class EvaluationSettings:
         seed: Seed of initial states, styles and sampled actions. The same seed gives the same files.
         num_threads: Number of physics threads, if the simulator has its own.
         progress: Whether to show progress bars.
-        track: File of a circuit to drive on beside the domain's own, for domains with circuits (`Domain.on_track`).
+        env_options: Arguments of `make_env` by name, from `Domain.read_options`. A domain's own evaluation decides
+            what they change; the general one measures the agent under them.
         sweeps: Episodes along each weight, if a report has already recorded them (`sweep_weights`); otherwise None.
 
     Raises:
@@ -36,7 +36,7 @@ class EvaluationSettings:
     seed: int = 0
     num_threads: int | None = None
     progress: bool = True
-    track: Path | None = None
+    env_options: Mapping[str, Any] = field(default_factory=dict)
     sweeps: Sequence[WeightSweep] | None = None
 
     def __post_init__(self) -> None:

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from coachable.domain import Domain
 from coachable.evaluation.attribution import Ranking, import_captum, input_groups, rank_groups
+from coachable.evaluation.episode_records import RolloutOptions, record_styles
 from coachable.evaluation.figures import drawing
-from coachable.evaluation.rollouts import RolloutOptions, record_styles
 from coachable.evaluation.style_grid import markdown_table, write_csv
 from coachable.evaluation.wording import readable
 from coachable.networks.plain import ActionOutputs

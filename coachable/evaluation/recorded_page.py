@@ -16,16 +16,16 @@ from tqdm import tqdm
 
 from coachable.domain import Domain
 from coachable.evaluation.outputs import complete_folder
-from coachable.evaluation.rollouts import Rollout
 from coachable.evaluation.style_grid import published
 from coachable.evaluation.wording import readable
-from coachable.export.web.page import about, copy_page, finish_page
-from coachable.export.web.third_party import provide
+from coachable.export.web.pinned_files import provide
+from coachable.export.web.simulated_page import about, copy_page, finish_page
 from coachable.keys import TASK_REWARD
 from coachable.scene.frame import Frame, Stage
 from coachable.scene.palette import css
 from coachable.scene.recorded import encode_backdrop, encode_frames
 from coachable.styles import Choice, StyleSpace
+from coachable.training.rollout import Rollout
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
 __all__ = ["Recording", "export_recordings", "record"]
@@ -65,7 +65,7 @@ def export_recordings(
     Args:
         source: Checkpoint, run folder, weights file, exported model, or the name of a domain that ships with weights.
         out: Folder to write into; files of the same names are replaced.
-        assets: Folder with the files of other projects, see `coachable.export.web.third_party.provide`.
+        assets: Folder with the files of other projects, see `coachable.export.web.pinned_files.provide`.
         seed: Seed of the start and of sampled actions.
         progress: Whether to show a progress bar.
 
@@ -87,12 +87,12 @@ def export_recordings(
     cells = domain.recorded_cells()
     if not 0 < len(cells) <= MOST:
         raise ValueError(f"the domain {domain.name} has {len(cells)} styles to record: expected 1 to {MOST}")
-    thetas = [agent.space.make(strict=True, **cell) for cell in cells]
+    thetas = agent.space.make_all(cells)
     requests = [agent.space.describe(theta) | cell for theta, cell in zip(thetas, cells, strict=True)]
     steps = min(domain.episode_steps, max(1, round(domain.recorded.seconds / domain.control_step)))
     vendored = provide(assets, _NEEDED)
     recordings = record(
-        domain, agent.actor, torch.stack(thetas), requests, space=agent.space, steps=steps, seed=seed, progress=progress
+        domain, agent.actor, thetas, requests, space=agent.space, steps=steps, seed=seed, progress=progress
     )
     columns = domain.recorded.columns or published(domain, recordings[0].measured)
     shown = [_measure(domain, agent.space, *column) for column in columns.items()]
@@ -151,7 +151,7 @@ def record(
     options = {**domain.coached, **(alike(len(requests)) if alike else {})}
     env = domain.styled_env(space, len(requests), seed=seed, **options)
     cameras = [_Camera(env, row, make_stage(), request) for row, request in enumerate(requests)]
-    alive, survived = torch.ones(2, len(requests), dtype=torch.bool)
+    survived = torch.ones(len(requests), dtype=torch.bool)
     task_return = torch.zeros(len(requests))
     rows: list[dict[str, Tensor]] = []
     lives: list[Tensor] = []
@@ -160,8 +160,8 @@ def record(
         rollout.begin(theta)
         for camera in cameras:
             camera.see()
-        for _ in tqdm(range(steps), "recording", disable=None if progress else True, leave=False):
-            transition = rollout.step(policy, theta)
+        run = rollout.episode(policy, steps, lambda _: theta)
+        for transition, alive in tqdm(run, "recording", steps, disable=None if progress else True, leave=False):
             after = transition.get("next")
             rows.append(domain.measures.step(transition))
             lives.append(alive)
@@ -169,9 +169,6 @@ def record(
             survived = survived & ~(alive & after.get("terminated").squeeze(-1))
             for row in alive.nonzero()[:, 0].tolist():
                 cameras[row].see()
-            alive = alive & ~after.get("done").squeeze(-1)
-            if not alive.any():
-                break
     finally:
         env.close()
     taken = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}

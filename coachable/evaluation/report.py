@@ -12,11 +12,11 @@ from tqdm import tqdm
 
 from coachable import __version__
 from coachable.domain import Domain
+from coachable.evaluation.episode_records import RolloutOptions
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.outputs import complete_folder
 from coachable.evaluation.report_figures import draw_metrics, draw_requests, draw_switches, draw_tradeoffs
 from coachable.evaluation.report_page import Page, paragraph, picture, shown, table
-from coachable.evaluation.rollouts import RolloutOptions
 from coachable.evaluation.runs import (
     SWITCH_PERIOD,
     Run,

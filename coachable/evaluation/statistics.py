@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import cast
 
 import numpy as np
+from scipy import stats
 
 
 def interquartile_mean(values: np.ndarray, axis: int = -1) -> np.ndarray:
@@ -75,12 +77,11 @@ def bootstrap_interval(
         Lower and upper bound; NaN if there are no values.
     """
     values = values[~np.isnan(values)]
-    if len(values) == 0:
-        return float("nan"), float("nan")
-    draws = np.random.default_rng(seed).integers(0, len(values), (resamples, len(values)))
-    spread = statistic(values[draws], axis=-1)
-    tail = 50 * (1 - confidence)
-    low, high = np.percentile(spread, [tail, 100 - tail])
+    if len(values) < 2:  # nothing to draw from
+        only = float(statistic(values, axis=-1)) if len(values) else float("nan")
+        return only, only
+    options = {"n_resamples": resamples, "confidence_level": confidence, "method": "percentile", "vectorized": True}
+    low, high = stats.bootstrap((values,), statistic, rng=np.random.default_rng(seed), **options).confidence_interval
     return float(low), float(high)
 
 
@@ -92,23 +93,14 @@ def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     """
     if not 0 <= successes <= trials or trials < 1:
         raise ValueError(f"{successes} successes in {trials} trials: expected 0 to trials, and at least one trial")
-    z, share = 1.959964, successes / trials
-    middle = share + z * z / (2 * trials)
-    spread = z * np.sqrt(share * (1.0 - share) / trials + z * z / (4 * trials * trials))
-    scale = 1.0 + z * z / trials
-    return float((middle - spread) / scale), float((middle + spread) / scale)
+    low, high = stats.binomtest(successes, trials).proportion_ci(method="wilson")
+    return float(low), float(high)
 
 
 def rank_correlation(x: np.ndarray, y: np.ndarray) -> float:
     """Compute Spearman's rank correlation of two arrays (n,); ties share their mean rank, NaN pairs are left out."""
     keep = ~(np.isnan(x) | np.isnan(y))
-    ranks = [_ranks(values[keep]) for values in (x, y)]
-    if len(ranks[0]) < 2 or min(np.ptp(r) for r in ranks) == 0:
+    if keep.sum() < 2 or min(np.ptp(values[keep]) for values in (x, y)) == 0:
         return float("nan")
-    return float(np.corrcoef(ranks[0], ranks[1])[0, 1])
-
-
-def _ranks(values: np.ndarray) -> np.ndarray:
-    _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
-    ends = np.cumsum(counts)
-    return (ends - (counts - 1) / 2)[inverse]
+    correlation, _ = stats.spearmanr(x[keep], y[keep])
+    return float(cast(float, correlation))

@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any, Unpack
 
 import numpy as np
-import torch
 from tensordict.nn import InteractionType, TensorDictModuleBase
 
 from coachable.domain import Domain
-from coachable.evaluation.rollouts import RolloutOptions, record_styles
+from coachable.evaluation.episode_records import RolloutOptions, record_styles
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
 from coachable.styles import Setpoint, StyleSpace
 from coachable.training.weights import LoadedPolicy
@@ -99,7 +98,7 @@ def evaluate_grid(
     if episodes < 1:
         raise ValueError(f"episodes per cell must be at least 1, got {episodes}")
     cells = domain.cells() if cells is None else [dict(cell) for cell in cells]
-    theta = torch.stack([space.make(strict=True, **cell) for cell in cells]).repeat_interleave(episodes, 0)
+    theta = space.make_all(cells).repeat_interleave(episodes, 0)
     label = f"{len(cells)} styles x {episodes} episodes"
     record = record_styles(domain, policy, space, theta, label, **options, **(env_options or {}))
     values = {"survived": record.survived.float(), "steps": record.alive.sum(0).float()}

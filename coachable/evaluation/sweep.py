@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from coachable.domain import Domain, StyleMeasures
-from coachable.evaluation.rollouts import RolloutOptions, record_styles
+from coachable.evaluation.episode_records import RolloutOptions, record_styles
 from coachable.keys import STYLE_FEATURES
 from coachable.styles import StyleReward, StyleSpace, Weight
 
@@ -72,7 +72,7 @@ def sweep_weights(
     ends = [weight.evaluation_range for weight in weights]
     requests = [np.linspace(0.0, high if high > 0 else low, points) for low, high in ends]
     rows = [(weight.name, value) for weight, values in zip(weights, requests, strict=True) for value in values]
-    theta = torch.stack([space.make(strict=True, **{name: value}) for name, value in rows])
+    theta = space.make_all({name: value} for name, value in rows)
     theta = theta.repeat_interleave(episodes, 0)
     reward = domain.make_reward(space)
     unit = space.default.repeat(len(rows), 1)

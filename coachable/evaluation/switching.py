@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from coachable.domain import Domain
-from coachable.evaluation.rollouts import RolloutOptions, record_styles
+from coachable.evaluation.episode_records import RolloutOptions, record_styles
 from coachable.styles import StyleSpace
 
 

@@ -18,12 +18,12 @@ from tqdm import tqdm
 
 from coachable.domain import Domain
 from coachable.evaluation.outputs import complete_file
-from coachable.evaluation.rollouts import Rollout
 from coachable.evaluation.wording import measures_by_parameter, readable, readable_number
 from coachable.extras import how_to_install
 from coachable.scene.look import DARK
 from coachable.scene.renderer import SceneRenderer
 from coachable.styles import Choice, StyleRangeWarning, StyleSpace, Weight
+from coachable.training.rollout import Rollout
 from coachable.training.weights import domain_of, load_policy
 
 VIDEO_SUFFIXES = (".mp4", ".gif", ".webp", ".png")

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from coachable.contract import model
+from coachable.contract import exported_model
 from coachable.extras import how_to_install
 
 __all__ = ["graph_of", "import_onnx", "quietly"]
@@ -114,4 +114,4 @@ def import_onnx() -> Any:
         import onnxscript  # noqa: F401
     except ImportError as error:
         raise ImportError(f"{error.name} is missing: {how_to_install('export')}") from error
-    return model.import_onnx()
+    return exported_model.import_onnx()

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from coachable import __version__
 from coachable.contract.contract import Contract
-from coachable.contract.model import OnnxRun
+from coachable.contract.exported_model import OnnxRun
 from coachable.domain import Domain, domain_names
 from coachable.export.graph import import_onnx, quietly
 from coachable.export.recorder import Rig, record

@@ -6,15 +6,15 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs.utils import step_mdp
 
 from coachable.contract.contract import Contract, Recorded
-from coachable.contract.model import OnnxRun
+from coachable.contract.exported_model import OnnxRun
 from coachable.domain import Domain
 from coachable.keys import STYLE
 from coachable.styles import StyleSpace
+from coachable.training.rollout import Rollout
 
 __all__ = ["Rig", "neutral_action", "record"]
 
@@ -39,9 +39,9 @@ class Rig:
     def __init__(self, domain: Domain, space: StyleSpace) -> None:
         self.space = space
         self.env = domain.styled_env(space, 1, num_threads=1, **domain.coached)
+        self._rollout = Rollout(self.env)
         self.widths = (self.env.observation_spec["observation"].shape[-1], self.env.action_spec.shape[-1])
 
-    @torch.no_grad()
     def run(self, seed: int, steps: int, act: Callable[[int, np.ndarray], tuple[Tensor, np.ndarray]]) -> np.ndarray:
         """Run an episode until its end, or for some steps.
 
@@ -53,17 +53,16 @@ class Rig:
         Returns:
             Observations (T + 1, D) before the first step and after each.
         """
-        self.env.set_seed(seed)
-        now: TensorDictBase = self.env.reset(TensorDict({STYLE: self.space.default[None]}, self.env.batch_size))
-        seen: list[np.ndarray] = [_observed(now)]
-        for step in range(steps):
-            style, action = act(step, seen[-1])
-            now = now.set(STYLE, style[None]).set("action", torch.from_numpy(action)[None])
-            transition = self.env.step(now)
-            seen.append(_observed(transition.get("next")))
-            if transition["next", "done"].any():
-                break
-            now = step_mdp(transition)
+        self._rollout.seed(seed)
+        self._rollout.begin(self.space.default[None])
+        seen: list[np.ndarray] = [self._observed()]
+
+        def asked(now: TensorDictBase) -> TensorDictBase:
+            style, action = act(len(seen) - 1, seen[-1])
+            return now.set(STYLE, style[None]).set("action", torch.from_numpy(action)[None])
+
+        for _ in self._rollout.episode(asked, steps):
+            seen.append(self._observed())
         return np.stack(seen)
 
     def repeat(self, seed: int, action: np.ndarray, style: np.ndarray | None = None) -> np.ndarray:
@@ -85,9 +84,8 @@ class Rig:
         """Release the environment."""
         self.env.close()
 
-
-def _observed(tensordict: TensorDictBase) -> np.ndarray:
-    return tensordict.get("observation")[0].numpy().copy()
+    def _observed(self) -> np.ndarray:
+        return self._rollout.observation[0].numpy().copy()
 
 
 def neutral_action(contract: Contract) -> np.ndarray:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from coachable.contract.contract import Contract, Recorded
-from coachable.contract.model import OnnxRun, read_model
+from coachable.contract.exported_model import OnnxRun, read_model
 from coachable.domain import Domain, domain_names, load_domain
 from coachable.export.diagnosis import diagnose
 from coachable.export.recorder import Rig

@@ -8,7 +8,7 @@ if find_spec("gymnasium") is None:
     raise ImportError(f"coachable.gym needs Gymnasium: {how_to_install('gym')}")
 
 from coachable.gym.checked_features import Features
-from coachable.gym.env import GymnasiumEnv
+from coachable.gym.gymnasium_env import GymnasiumEnv
 from coachable.gym.wrapper import StyleWrapper
 
 __all__ = ["Features", "GymnasiumEnv", "StyleWrapper"]

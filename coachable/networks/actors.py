@@ -67,6 +67,10 @@ class StyleNetwork(nn.Module):
         self.space = space
         self.trunk = ResidualMLP(inputs + (0 if space is None else space.dim), outputs, widths, **trunk)
 
+    def in_keys(self, *inputs: str) -> list[Any]:
+        """Return the keys of the arguments of `forward`: those of the inputs, and `style` if there is a style space."""
+        return [*inputs] if self.space is None else [*inputs, STYLE]
+
     def head(self, observation: Tensor, style: Tensor | None, *further: Tensor) -> Tensor:
         """Return the output of the head.
 
@@ -161,8 +165,8 @@ def make_gaussian_actor(
         A `ProbabilisticActor` that reads `observation` and `style` and writes `loc`, `scale` and `action`.
     """
     policy = GaussianPolicy(obs_dim, action_dim, space, widths, log_scale_range=log_scale_range, **trunk)
-    in_keys: list[Any] = ["observation"] if space is None else ["observation", STYLE]
-    module = TensorModule(policy, in_keys=in_keys, out_keys=["loc", "scale"])  # pyright: ignore[reportArgumentType]
+    out_keys: list[Any] = ["loc", "scale"]
+    module = TensorModule(policy, in_keys=policy.in_keys("observation"), out_keys=out_keys)
     return ProbabilisticActor(
         module,
         in_keys=["loc", "scale"],

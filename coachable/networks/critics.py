@@ -8,7 +8,6 @@ from typing import Any
 from torch import Tensor
 from torchrl.modules import ValueOperator
 
-from coachable.keys import STYLE
 from coachable.networks.actors import StyleEncoding, StyleNetwork, TensorModule
 
 
@@ -85,5 +84,4 @@ def make_critic(
         A `ValueOperator` that reads `observation`, `action` and `style` and writes `state_action_value`.
     """
     critic = StyleCritic(obs_dim, action_dim, space, widths, num_outputs=num_outputs, **trunk)
-    in_keys = ["observation", "action"] if space is None else ["observation", "action", STYLE]
-    return CriticModule(critic, in_keys=in_keys, out_keys=["state_action_value"])
+    return CriticModule(critic, in_keys=critic.in_keys("observation", "action"), out_keys=["state_action_value"])

@@ -14,7 +14,6 @@ from coachable.distributions.action_heads import ActionHeads
 from coachable.distributions.categorical import regret_matching_probabilities
 from coachable.distributions.mixed_action import MixedAction
 from coachable.distributions.tanh_gaussian import at_least_float32
-from coachable.keys import STYLE
 from coachable.networks.actors import StyleEncoding, StyleNetwork, TensorModule
 
 
@@ -96,9 +95,9 @@ def make_mixed_actor(
     """
     heads = heads if isinstance(heads, ActionHeads) else ActionHeads(**heads)
     names: list[Any] = (["probs"] if heads.categorical else []) + (["loc", "scale"] if heads.axes else [])
-    in_keys: list[Any] = ["observation"] if space is None else ["observation", STYLE]
+    policy = MixedPolicy(obs_dim, heads, space, widths, **trunk)
     return ProbabilisticActor(
-        TensorModule(MixedPolicy(obs_dim, heads, space, widths, **trunk), in_keys=in_keys, out_keys=names),
+        TensorModule(policy, in_keys=policy.in_keys("observation"), out_keys=names),
         in_keys=names,
         spec=heads.spec(),
         distribution_class=MixedAction,

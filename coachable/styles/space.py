@@ -5,7 +5,7 @@ Samplers, networks, sliders, export metadata, checkpoints and reports all read t
 
 import json
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -181,6 +181,20 @@ class StyleSpace:
                         f"{name} = {value!r} is no number: expected one in [{parameter.low}, {parameter.high}]."
                     ) from None
         return self.clamp(theta, strict=strict)
+
+    def make_all(self, styles: Iterable[Mapping[str, Any]]) -> Tensor:
+        """Return several styles from named values.
+
+        Args:
+            styles: Values by parameter name of each style, as in `make`.
+
+        Returns:
+            Theta `(number of styles, dim)`, float32.
+
+        Raises:
+            ValueError: If a name or option is unknown, or a value is no number or out of range.
+        """
+        return torch.stack([self.make(strict=True, **style) for style in styles])
 
     def clamp(self, theta: Tensor, strict: bool = False) -> Tensor:
         """Clamp theta to the trained range, with a `StyleRangeWarning` that names the changed parameters.

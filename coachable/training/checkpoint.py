@@ -47,16 +47,6 @@ SCHEMA_VERSION = 1
 _LATEST = "LATEST"
 _STATE = "state.pt"
 _WEIGHTS = ("actor", "critics", "learner")  # parts of a state that must be finite
-_FORMER_OPTIONS = {  # options of earlier versions, each with the only value that is still supported
-    "entropy_in_target": "inside",
-    "event_admission": "nonzero",
-    "hl_gauss_support": "edges",
-    "mean_bound": "post_tanh",
-    "narrowing": "padded_side",
-    "quantile_reduction": "mean",
-    "regret_gradient": "dpi",
-    "target_min": "vector",
-}
 
 
 class CheckpointStore:
@@ -219,8 +209,8 @@ def read_state(path: Path | str, device: torch.device | str = "cpu") -> dict[str
         device: Device of the tensors.
 
     Raises:
-        CheckpointError: If the file is damaged, has another schema, would need pickle, contains weights that are not
-            finite, or was trained with an option value that no longer exists.
+        CheckpointError: If the file is damaged, has another schema, would need pickle, or contains weights that are not
+            finite.
     """
     path = Path(path)
     file = path / _STATE if path.is_dir() else path
@@ -230,22 +220,7 @@ def read_state(path: Path | str, device: torch.device | str = "cpu") -> dict[str
             f"{file} has schema {state.get('schema')!r}, this version of coachable reads schema {SCHEMA_VERSION}"
         )
     check_finite({name: state[name] for name in _WEIGHTS if name in state}, file)
-    return {k: _without_former_options(v, file) if k in ("config", "network") else v for k, v in state.items()}
-
-
-def _without_former_options(config: Any, file: Path) -> Any:
-    """Return a saved configuration without the options in `_FORMER_OPTIONS`; raise if one has another value."""
-    if isinstance(config, list):
-        return [_without_former_options(entry, file) for entry in config]
-    if not isinstance(config, dict):
-        return config
-    for name in config.keys() & _FORMER_OPTIONS:
-        if config[name] != _FORMER_OPTIONS[name]:
-            raise CheckpointError(
-                f"{file} was trained with {name}={config[name]}, which this version of coachable no longer has: "
-                f"expected {_FORMER_OPTIONS[name]}"
-            )
-    return {k: _without_former_options(v, file) for k, v in config.items() if k not in _FORMER_OPTIONS}
+    return state
 
 
 def check_fits(saved: Mapping[str, Tensor], present: Mapping[str, Tensor], what: str, source: Path | str) -> None:

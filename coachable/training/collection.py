@@ -16,6 +16,7 @@ from torchrl.envs.utils import ExplorationType
 
 from coachable.training.async_collector import AsyncCollector
 from coachable.training.rng import preserved_rng
+from coachable.training.rollout import Rollout
 from coachable.training.simulators import ResumableEnv, UnsavableError, load_simulator, save_simulator
 from coachable.training.worker_errors import ReportingCollector
 
@@ -209,28 +210,24 @@ def evaluate_policy(
     """
     wanted = dict.fromkeys(["reward", "task_reward", *keys])
     with preserved_rng(), torch.no_grad():
-        td = env.reset()
-        running = torch.ones(env.batch_size, dtype=torch.bool, device=td["done"].device)
-        fell = torch.zeros_like(running)
-        length = torch.zeros_like(running, dtype=torch.float32)
+        rollout = Rollout(env)
+        rollout.begin()
+        fell = torch.zeros(env.batch_size, dtype=torch.bool, device=env.device)
+        length = torch.zeros_like(fell, dtype=torch.float32)
         sums = {key: torch.zeros_like(length) for key in wanted}
         measured, alive = [], []
-        for _ in range(max_steps):
-            acted = policy(td.to(device)).to(env.device)
-            stepped, td = env.step_and_maybe_reset(acted)
-            after = stepped["next"]
+        for stepped, running in rollout.episode(lambda td: policy(td.to(device)).to(env.device), max_steps):
+            rollout.begin_ended()
+            after: Any = stepped.get("next")
             if measures is not None:
                 measured.append(measures.step(stepped))
-                alive.append(running.clone())
+                alive.append(running)
             length += running
             for key, total in sums.items():
                 value = after.get(key, None)
                 if value is not None:
                     total += torch.where(running, value.reshape(running.shape), 0.0)
             fell |= running & after["terminated"].reshape(running.shape)
-            running &= ~after["done"].reshape(running.shape)
-            if not running.any():
-                break
     result = {
         "return": sums["reward"].mean().item(),
         "task_return": sums["task_reward"].mean().item(),

@@ -4,7 +4,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
 
-from coachable.third_party import UnsavableError, load_object, save_object
+from coachable.object_state import UnsavableError, load_object, save_object
 
 __all__ = ["ResumableEnv", "UnsavableError", "load_simulator", "save_simulator"]
 

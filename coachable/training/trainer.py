@@ -108,7 +108,7 @@ class Trainer:
         self.evaluate = evaluate
         self.replay_keys = replay_keys
         self.frames = 0
-        self.owed = 0.0  # updates that utd_ratio asks for and that have not been made yet
+        self.pending_updates = 0.0  # updates that utd_ratio asks for and that have not been made yet
         parts = ("collect", "store", "update", "evaluate", "log", "checkpoint", "wait")
         self.seconds: dict[str, float] = dict.fromkeys(parts, 0.0)
         self._device = next(learner.loss_module.parameters()).device
@@ -189,10 +189,10 @@ class Trainer:
                 while (self._throttle.remaining() > 0 or self._waits_for_workers()) and not stop.is_set():
                     self._update_once()
             else:
-                self.owed += new_frames * self.settings.utd_ratio
-                while self.owed >= 1.0:
+                self.pending_updates += new_frames * self.settings.utd_ratio
+                while self.pending_updates >= 1.0:
                     self._update_once()
-                    self.owed -= 1.0
+                    self.pending_updates -= 1.0
             # A single-process collector shares the learner's weights, and an `AsyncCollector` hears of every update.
             if not isinstance(self.collector, Collector | AsyncCollector):
                 update_workers(self.collector)
@@ -283,7 +283,7 @@ class Trainer:
             "learner": self.learner.state_dict(),
             "loop": {
                 "frames": self.frames,
-                "owed": self.owed,
+                "pending_updates": self.pending_updates,
                 "evaluations": self._evaluations,
                 "evaluated_frames": self._evaluated_frames,
                 "filled_from": self._filled_from,
@@ -318,7 +318,7 @@ class Trainer:
         """Restore what `state_dict` returned; warn and leave the replay buffer empty if none was saved."""
         self.learner.load_state_dict(state["learner"])
         self.frames = int(state["loop"]["frames"])
-        self.owed = float(state["loop"]["owed"])
+        self.pending_updates = float(state["loop"]["pending_updates"])
         self._evaluations = int(state["loop"]["evaluations"])
         self._evaluated_frames = int(state["loop"].get("evaluated_frames", -1))
         self._filled_from = int(state["loop"]["filled_from"])

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from coachable.contract.model import OnnxPolicy, read_model
+from coachable.contract.exported_model import OnnxPolicy, read_model
 from coachable.domain import Domain, load_domain
 from coachable.files import check_finite, refusing, save_state, space_named, tensor_bytes
 from coachable.networks import make_gaussian_actor, make_mixed_actor

@@ -13,7 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coachable.cli import main
 from coachable.contract.contract import Contract, ContractError, Recorded
-from coachable.contract.model import OnnxPolicy, OnnxRun, read_model
+from coachable.contract.exported_model import OnnxPolicy, OnnxRun, read_model
 from coachable.distributions.action_heads import ActionHeads
 from coachable.export.onnx import write_onnx
 from coachable.files import CheckpointError

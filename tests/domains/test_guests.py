@@ -98,7 +98,7 @@ def test_render(run, guest, tmp_path, capsys):
 
 def test_coach(run, guest):
     pytest.importorskip("viser")
-    from coachable.coach.page.page import CoachPage
+    from coachable.coach.page.coach_page import CoachPage
     from coachable.coach.page.server import make_server
 
     parameter = GUESTS[guest]

@@ -10,8 +10,8 @@ import torch
 from coachable.cli import main
 from coachable.domain import Recorded
 from coachable.evaluation import recorded_page
+from coachable.evaluation.episode_records import record_styles
 from coachable.evaluation.recorded_page import MOST, export_recordings
-from coachable.evaluation.rollouts import record_styles
 from coachable.training.weights import domain_of, load_policy
 
 NAME, STEPS = "racing_resources", 6

@@ -7,10 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase
 
 from coachable.cli import main
 from coachable.domain import Domain
@@ -22,62 +19,17 @@ from coachable.evaluation.style_grid import StyleGrid
 from coachable.evaluation.sweep import sweep_weights
 from coachable.evaluation.switching import SwitchReport
 from coachable.scene.look import TITLE, icon_link, stylesheet
-from coachable.styles import Choice, Setpoint, StyleReward, StyleSpace, Term, Weight, WeightedFeature
+from coachable.styles import Choice, Setpoint, StyleReward, StyleSpace, Weight, WeightedFeature
 from coachable.training.weights import LoadedPolicy, load_policy
+from tests.evaluation.toy import IGNORED, ToyEnv, ToyMeasures
 
 SPACE = StyleSpace(
     [Choice("hat", ("red", "blue")), Setpoint("speed", 0.0, 2.0, unit="m/s"), Weight("bold", -1.0, 4.0)], name="toy"
 )
 
 
-class ToyEnv(EnvBase):
-    """`style_features` is the action. Ends after 5 steps where the action exceeds 1.6."""
-
-    def __init__(self, num_envs, num_threads=None):
-        super().__init__(batch_size=[num_envs])
-        n = num_envs
-        one = Unbounded(shape=(n, 1))
-        self.observation_spec = Composite(observation=one, task_reward=one, style_features=one, shape=(n,))
-        self.action_spec = Bounded(0, 4, shape=(n, 1))
-        self.reward_spec = one.clone()
-        flags = {name: Binary(n=1, shape=(n, 1), dtype=torch.bool) for name in ("done", "terminated", "truncated")}
-        self.done_spec = Composite(flags, shape=(n,))
-        self.steps = 0
-
-    def _set_seed(self, seed):
-        pass
-
-    def _outputs(self, value, terminated):
-        names = ("observation", "task_reward", "style_features", "reward")
-        flags = {"done": terminated, "terminated": terminated.clone(), "truncated": torch.zeros_like(terminated)}
-        return TensorDict({**{name: value.clone() for name in names}, **flags}, self.batch_size)
-
-    def _reset(self, tensordict=None, **_):
-        self.steps = 0
-        zero = torch.zeros(*self.batch_size, 1)
-        return self._outputs(zero, zero.bool()).exclude("reward")
-
-    def _step(self, tensordict):
-        self.steps += 1
-        action = tensordict["action"]
-        return self._outputs(action, (action > 1.6) & (self.steps >= 5))
-
-
-class ToyMeasures:
-    def step(self, transition):
-        value = transition["next", "style_features"].squeeze(-1)
-        return {"speed": value, "error": (value - transition["style"][:, 2]).abs()}
-
-    def summarise(self, record, alive):
-        return {name: torch.where(alive, values, torch.nan).nanmean(0) for name, values in record.items()}
-
-    def complies(self, record):
-        return record["error"] < 0.01
-
-
 def toy_reward(space):
-    ignored = Term(lambda f, s: 0 * s["speed"] + 0 * s["hat"][..., 0], parameters=("speed", "hat"))
-    return StyleReward(space, {"ignored": ignored, "bold": WeightedFeature("bold", 0)}, {"bold": 2.0})
+    return StyleReward(space, {"ignored": IGNORED, "bold": WeightedFeature("bold", 0)}, {"bold": 2.0})
 
 
 DOMAIN = Domain(

@@ -6,86 +6,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase
 
 from coachable.domain import Domain, load_domain
+from coachable.evaluation.episode_records import record_episodes
 from coachable.evaluation.evaluate import evaluate_styles
 from coachable.evaluation.evaluation_settings import EvaluationSettings
-from coachable.evaluation.rollouts import record_episodes
 from coachable.evaluation.style_grid import evaluate_grid, markdown_table, write_csv
 from coachable.evaluation.switching import evaluate_switching
-from coachable.styles import Choice, Setpoint, StyleReward, StyleSpace, Term
+from coachable.styles import Choice, Setpoint, StyleReward, StyleSpace
 from coachable.training.weights import LoadedPolicy
 from coachable.transforms import coachable_env
+from tests.evaluation.toy import IGNORED, ToyEnv, ToyMeasures
 
 SPACE = StyleSpace([Choice("hat", ("red", "blue")), Setpoint("speed", 0.0, 2.0, unit="m/s")], name="toy")
-
-
-class ToyEnv(EnvBase):
-    """`style_features` is the action. Ends after 5 steps where the action exceeds a limit."""
-
-    def __init__(self, num_envs, num_threads=None, limit=1.5):
-        super().__init__(batch_size=[num_envs])
-        self.limit = torch.as_tensor(limit).expand(num_envs).unsqueeze(-1)
-        n = num_envs
-        one = Unbounded(shape=(n, 1))
-        self.observation_spec = Composite(observation=one, task_reward=one, style_features=one, shape=(n,))
-        self.action_spec = Bounded(0, 2, shape=(n, 1))
-        self.reward_spec = one.clone()
-        flags = {name: Binary(n=1, shape=(n, 1), dtype=torch.bool) for name in ("done", "terminated", "truncated")}
-        self.done_spec = Composite(flags, shape=(n,))
-        self.steps = 0
-
-    def _set_seed(self, seed):
-        pass
-
-    def _outputs(self, value, terminated):
-        return TensorDict(
-            {
-                "observation": value,
-                "task_reward": torch.ones_like(value),
-                "style_features": value,
-                "reward": torch.ones_like(value),
-                "done": terminated,
-                "terminated": terminated.clone(),
-                "truncated": torch.zeros_like(terminated),
-            },
-            self.batch_size,
-        )
-
-    def _reset(self, tensordict=None, **_):
-        self.steps = 0
-        out = self._outputs(torch.zeros(*self.batch_size, 1), torch.zeros(*self.batch_size, 1, dtype=torch.bool))
-        return out.exclude("reward")
-
-    def _step(self, tensordict):
-        self.steps += 1
-        action = tensordict["action"]
-        return self._outputs(action.clone(), (action > self.limit) & (self.steps >= 5))
-
-
-class ToyMeasures:
-    def step(self, transition):
-        value = transition["next", "style_features"].squeeze(-1)
-        return {"speed": value, "error": (value - transition["style"][:, 2]).abs()}
-
-    def summarise(self, record, alive):
-        return {name: torch.where(alive, values, torch.nan).nanmean(0) for name, values in record.items()}
-
-    def complies(self, record):
-        return record["error"] < 0.01
 
 
 DOMAIN = Domain(
     name="toy",
     make_env=ToyEnv,
     make_space=lambda: SPACE,
-    make_reward=lambda space: StyleReward(
-        space, {"all": Term(lambda f, s: 0 * s["speed"] + 0 * s["hat"][..., 0], parameters=("speed", "hat"))}
-    ),
+    make_reward=lambda space: StyleReward(space, {"all": IGNORED}),
     measures=ToyMeasures(),
     make_renderer=lambda width, height: None,
     grid={"hat": ("red", "blue"), "speed": (0.0, 1.0, 2.0)},

@@ -22,7 +22,7 @@ from coachable.networks.mixed import make_mixed_actor
 from coachable.networks.plain import DeterministicAction, policy_network
 from coachable.styles import Choice, Setpoint, StyleSpace, Weight
 from coachable.training.weights import load_policy
-from tests.echo import echo_space, make_train
+from tests.echo import echo_space
 
 pytest.importorskip("onnx")
 pytest.importorskip("onnxscript")
@@ -133,17 +133,9 @@ def test_only_the_components_that_exist(tmp_path, heads):
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """Folder of a short training of a domain that is not built in."""
-    folder = tmp_path_factory.mktemp("trained")
-    make_train(folder / "run", total_frames=4).run()
-    return folder / "run"
-
-
-@pytest.fixture(scope="module")
-def traced(trained):
-    """Its small policy, and the policy's graph."""
-    actor = load_policy(trained).actor.eval()
+def traced(short_run):
+    """A small policy, and its graph."""
+    actor = load_policy(short_run).actor.eval()
     return actor, _trace(DeterministicAction(actor))
 
 
@@ -160,7 +152,7 @@ def test_a_file_that_disagrees_is_noticed(traced, tmp_path):
         assert largest_difference(out, plain, echo_space()) == float("inf"), "NaN is no agreement"
 
 
-def test_a_full_disk_is_one_sentence_with_the_space_needed(trained, traced, tmp_path, monkeypatch):
+def test_a_full_disk_is_one_sentence_with_the_space_needed(short_run, traced, tmp_path, monkeypatch):
     monkeypatch.setattr("coachable.export.onnx._trace", lambda _: traced[1])
 
     def full(*_):
@@ -170,7 +162,7 @@ def test_a_full_disk_is_one_sentence_with_the_space_needed(trained, traced, tmp_
     with pytest.raises(
         OSError, match=r"^cannot write \S+: it needs about \d+\.\d MB, .* MB are free \(No space left on"
     ):
-        export(trained, tmp_path / "out" / "policy.onnx")
+        export(short_run, tmp_path / "out" / "policy.onnx")
     assert list((tmp_path / "out").iterdir()) == []
 
 
@@ -179,11 +171,11 @@ def test_a_policy_without_style_is_refused():
         DeterministicAction(make_gaussian_actor(3, 2, None, widths=(8,)))
 
 
-def test_the_command(trained, traced, tmp_path, capsys, monkeypatch):
+def test_the_command(short_run, traced, tmp_path, capsys, monkeypatch):
     """An agent of a domain that is not built in: everything but the control step."""
     monkeypatch.setattr("coachable.export.onnx._trace", lambda _: traced[1])  # takes seconds
     out = tmp_path / "echo.onnx"
-    assert main(["export", str(trained), "--out", str(out)]) == 0
+    assert main(["export", str(short_run), "--out", str(out)]) == 0
     assert re.search(r"wrote .*echo\.onnx .* from torch", capsys.readouterr().out)
     metadata = onnxruntime.InferenceSession(str(out)).get_modelmeta().custom_metadata_map
     assert metadata["domain"] == "echo" and "control_step" not in metadata

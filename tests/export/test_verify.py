@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from coachable.cli import main
-from coachable.contract.model import read_model
+from coachable.contract.exported_model import read_model
 from coachable.domain import Domain, load_domain
 from coachable.envs.humanoid.env import HumanoidEnv
 from coachable.envs.humanoid.observation import OBSERVATION_GROUPS

@@ -56,15 +56,19 @@ def parameters_after(learner, updates=5):
     return {name: value.clone() for name, value in state.items() if "network" in name}
 
 
+def fast_and_plain(build, **options):
+    """A learner with hand-written passes and one in plain torch, of equal losses."""
+    for fast in (True, False):
+        torch.manual_seed(0)
+        yield make_learner(build(), fast, **options)
+
+
 @pytest.mark.parametrize("order", ["simultaneous", "policy_first"])
 @pytest.mark.parametrize("build", LOSSES)
 def test_a_few_updates_end_where_those_in_plain_torch_end(build, order, kernels):
     """Parameters and targets of all losses, with the compiled kernels and without a C compiler."""
-    ends = []
-    for fast in (True, False):
-        torch.manual_seed(0)
-        ends.append(parameters_after(make_learner(build(), fast, precision="fp32", update_order=order, actor_lr=1e-3)))
-    ours, theirs = ends
+    learners = fast_and_plain(build, precision="fp32", update_order=order, actor_lr=1e-3)
+    ours, theirs = map(parameters_after, learners)
     for name, expected in theirs.items():
         # Adam's first step is the sign of the gradient, so that a gradient of rounding errors may go either way.
         differs = (ours[name] - expected).abs() > 2e-4
@@ -75,11 +79,9 @@ def test_a_few_updates_end_where_those_in_plain_torch_end(build, order, kernels)
 def test_bf16_stays_close_to_plain_torch(build):
     """The passes round where autocast does not, so that directions agree rather than digits."""
     ends = []
-    for fast in (True, False):
-        torch.manual_seed(0)
-        loss = build()
-        start = {name: value.clone() for name, value in loss.state_dict().items()}
-        end = parameters_after(make_learner(loss, fast, precision="bf16"))
+    for learner in fast_and_plain(build, precision="bf16"):
+        start = {name: value.clone() for name, value in learner.loss_module.state_dict().items()}
+        end = parameters_after(learner)
         ends.append(torch.cat([(end[name] - start[name]).flatten() for name in end if not name.startswith("target")]))
     assert torch.cosine_similarity(*ends, dim=0) > 0.95
 
@@ -89,9 +91,7 @@ def test_bf16_stays_close_to_plain_torch(build):
 @pytest.mark.parametrize("build", LOSSES)
 def test_every_loss_gives_the_same_metrics(build, order, shape):
     results = []
-    for fast in (True, False):
-        torch.manual_seed(0)
-        learner = make_learner(build(), fast, precision="fp32", update_order=order)
+    for learner in fast_and_plain(build, precision="fp32", update_order=order):
         torch.manual_seed(3)
         results.append(learner.update(make_batch(*shape)))
     ours, theirs = results

@@ -21,6 +21,14 @@ SHAPES = {
 KERNELS = bool(native.load_kernels())
 
 
+@pytest.fixture(params=[False, pytest.param(True, marks=pytest.mark.skipif(not KERNELS, reason="no cc"))])
+def compiled(request, monkeypatch):
+    """Whether the passes use the compiled kernels."""
+    if not request.param:
+        monkeypatch.setattr(fused, "load_kernels", dict)
+    return request.param
+
+
 def build(kind, members, low=None, trained=True):
     """Networks, their stacked parameters by name, buffers and plan."""
     in_features, widths, options = SHAPES[kind]
@@ -62,12 +70,9 @@ def inputs_of(kind, rows=40, **options):
     return [torch.randn(rows, width - 7), torch.randn(rows, 7, **options)]
 
 
-@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=pytest.mark.skipif(not KERNELS, reason="no cc"))])
 @pytest.mark.parametrize("members", [0, 2])
 @pytest.mark.parametrize("kind", SHAPES)
-def test_forward_and_all_gradients_equal_autograd(kind, members, compiled, monkeypatch):
-    if not compiled:
-        monkeypatch.setattr(fused, "load_kernels", dict)
+def test_forward_and_all_gradients_equal_autograd(kind, members, compiled):
     nets, buffers, plan = build(kind, members)
     x, y = inputs_of(kind, requires_grad=True)
     y_reference = y.detach().clone().requires_grad_()
@@ -85,12 +90,9 @@ def test_forward_and_all_gradients_equal_autograd(kind, members, compiled, monke
         torch.testing.assert_close(got, want, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=pytest.mark.skipif(not KERNELS, reason="no cc"))])
 @pytest.mark.parametrize("members", [0, 2])
 @pytest.mark.parametrize("kind", SHAPES)
-def test_bfloat16_is_close_to_float32(kind, members, compiled, monkeypatch):
-    if not compiled:
-        monkeypatch.setattr(fused, "load_kernels", dict)
+def test_bfloat16_is_close_to_float32(kind, members, compiled):
     _, exact, plan = build(kind, members)
     _, rounded, low_plan = build(kind, members, torch.bfloat16)
     assert isinstance(low_plan.acquire([1], 4, False), Workspace) is (compiled and kind != "no_norm")

@@ -138,19 +138,6 @@ def test_other_schemas_and_missing_files_are_named(tmp_path):
         find_checkpoint(tmp_path / "nowhere")
 
 
-def test_options_that_are_gone_are_dropped_where_they_were_at_their_default(tmp_path):
-    store = CheckpointStore(tmp_path)
-    loss = {"_target_": "coachable.losses.QRSACLoss", "target_min": "vector", "kappa": 1.0}
-    network = {"actor": {"narrowing": "padded_side", "widths": [8]}}
-    path = store.save({"config": {"stages": [{"loss": loss}]}, "network": network}, {"frames": 1})
-    state = read_state(path)
-    assert state["config"] == {"stages": [{"loss": {"_target_": "coachable.losses.QRSACLoss", "kappa": 1.0}}]}
-    assert state["network"] == {"actor": {"widths": [8]}}
-    path = store.save({"config": {"loss": {"target_min": "elementwise"}}}, {"frames": 2})
-    with pytest.raises(CheckpointError, match=r"trained with target_min=elementwise.*expected vector"):
-        read_state(path)
-
-
 def test_replay_files_restore_a_wrapped_ring_buffer(tmp_path):
     replay = _buffer(10)
     replay.extend(_records(0, 8))

@@ -67,14 +67,6 @@ PARTS = (*IGNORED, "state.pt", "replay/state.pt", "replay/index.json", "replay/a
 
 
 @pytest.fixture(scope="module")
-def small_run(tmp_path_factory):
-    """A run of the library, without a recipe."""
-    folder = tmp_path_factory.mktemp("small")
-    make_train(folder / "run", total_frames=80).run()
-    return folder / "run"
-
-
-@pytest.fixture(scope="module")
 def small_train(tmp_path_factory):
     """A training that resumes again and again."""
     return make_train(tmp_path_factory.mktemp("resumed"), total_frames=100)
@@ -82,8 +74,8 @@ def small_train(tmp_path_factory):
 
 @pytest.mark.parametrize("damage", DAMAGE)
 @pytest.mark.parametrize("part", PARTS)
-def test_every_damaged_file_of_a_run_is_named_when_it_is_resumed(small_run, small_train, tmp_path, part, damage):
-    run = Path(shutil.copytree(small_run, tmp_path / "run"))
+def test_every_damaged_file_of_a_run_is_named_when_it_is_resumed(short_run, small_train, tmp_path, part, damage):
+    run = Path(shutil.copytree(short_run, tmp_path / "run"))
     file = run / part if part == "checkpoints/LATEST" else find_checkpoint(run) / part
     DAMAGE[damage](file)
     if part in IGNORED:
@@ -94,8 +86,8 @@ def test_every_damaged_file_of_a_run_is_named_when_it_is_resumed(small_run, smal
     _assert_one_sentence(refusal.value, run if damage == "missing" else file)
 
 
-def test_a_run_resumes_without_its_replay_buffer(small_run, small_train, tmp_path):
-    run = Path(shutil.copytree(small_run, tmp_path / "run"))
+def test_a_run_resumes_without_its_replay_buffer(short_run, small_train, tmp_path):
+    run = Path(shutil.copytree(short_run, tmp_path / "run"))
     shutil.rmtree(find_checkpoint(run) / "replay")
     with pytest.warns(UserWarning, match="the checkpoint has no replay buffer"):
         small_train.resume(run)
@@ -177,8 +169,8 @@ LOOP = [
 
 
 @pytest.mark.parametrize("place", LOOP)
-def test_a_state_of_another_kind_is_refused(small_run, small_train, tmp_path, place):
-    run = Path(shutil.copytree(small_run, tmp_path / "run"))
+def test_a_state_of_another_kind_is_refused(short_run, small_train, tmp_path, place):
+    run = Path(shutil.copytree(short_run, tmp_path / "run"))
     whole = read_state(find_checkpoint(run))
     first, _, second = place.partition(".")
     for value in ("x", None, [1], {}):

@@ -6,10 +6,11 @@ import argparse
 import io
 import threading
 import webbrowser
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, redirect_stdout
-from pathlib import Path
 from typing import Any
+
+ENV_OPTIONS = "Further options, after the source, are those of its domain; of an unknown one the error lists them."
 
 
 def add_parser(commands: Any, source_help: str, run: Callable[[argparse.Namespace], int]) -> None:
@@ -20,16 +21,34 @@ def add_parser(commands: Any, source_help: str, run: Callable[[argparse.Namespac
         source_help: Help text of the argument that names the agent.
         run: Function that runs the sub-command and returns its exit status.
     """
-    parser = commands.add_parser("coach", help="coach an agent while it acts, on a page in the browser")
+    text = "coach an agent while it acts, on a page in the browser"
+    parser = commands.add_parser("coach", help=text, epilog=ENV_OPTIONS)
     parser.add_argument("source", help=source_help)
     parser.add_argument("--port", type=_port, default=8080, help="first port to try (default: %(default)s)")
     parser.add_argument(
         "--host", default="127.0.0.1", help="address to listen on; whoever reaches it can steer (default: %(default)s)"
     )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--track", type=Path, metavar="FILE", help="CSV file of a circuit, for racing agents")
     parser.add_argument("--open", action="store_true", dest="open_browser", help="open the page in the browser")
     parser.set_defaults(run=run)
+
+
+def read_env_options(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> dict[str, str]:
+    """Return options of a domain's environment by name, of which the domain knows whether there are such.
+
+    Args:
+        parser: Parser that does not know them; it ends the program if they are no pairs of a name and a value.
+        arguments: `--NAME VALUE` or `--NAME=VALUE`, any number of them.
+    """
+    options: dict[str, str] = {}
+    rest = iter(arguments)
+    for argument in rest:
+        name, equals, value = argument.removeprefix("--").partition("=")
+        value = value if equals else next(rest, "")
+        if not argument.startswith("--") or not name or not value or value.startswith("--"):
+            parser.error(f"unrecognized arguments: {' '.join(arguments)}")
+        options[name.replace("-", "_")] = value
+    return options
 
 
 def serve(source: str, *, say: Callable[[str], None], **settings: Any) -> None:
@@ -39,11 +58,12 @@ def serve(source: str, *, say: Callable[[str], None], **settings: Any) -> None:
         source: The agent, see `CoachSession.open`.
         say: Called with the address of the page.
         **settings: `port`, the first port to try; `host`, the address to listen on; `seed`, the seed of the session;
-            `track`, the file of a circuit to drive on; `open_browser`, whether to open the page in your browser.
+            `env_options`, the options of the domain's environment as texts; `open_browser`, whether to open the page in
+            your browser.
 
     Raises:
         CheckpointError: If there is no such agent.
-        ValueError: If the track is no circuit, or the agent does not race.
+        ValueError: If the agent's domain has no such option, or not with such a value.
         ImportError: If the extra `ui` is not installed.
         OSError: If the server cannot listen at that address.
     """
@@ -60,7 +80,7 @@ def _serve(
     host: str = "127.0.0.1",
     seed: int = 0,
     open_browser: bool = False,
-    track: Path | None = None,
+    env_options: Mapping[str, str] | None = None,
 ) -> None:
     from coachable.coach.page.server import make_server, page_address
 
@@ -76,10 +96,10 @@ def _serve(
         if open_browser:
             webbrowser.open(address)
 
-        from coachable.coach.page.page import CoachPage
+        from coachable.coach.page.coach_page import CoachPage
         from coachable.coach.session.session import CoachSession
 
-        session = CoachSession.open(source, seed=seed, track=track)
+        session = CoachSession.open(source, seed=seed, env_options=env_options)
         closing.callback(session.close)
         page = CoachPage(server, session)
         closing.callback(page.stop)

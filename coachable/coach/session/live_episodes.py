@@ -10,8 +10,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 
 from coachable.domain import Domain
-from coachable.evaluation.rollouts import Rollout
 from coachable.styles import StyleSpace
+from coachable.training.rollout import Rollout
 
 TIME_IS_UP = "time is up"
 
@@ -38,7 +38,7 @@ class LiveEpisodes(Rollout):
         self.ended: str | None = None
         self.number = self.steps = 0
         self.endings: Counter[str] = Counter()
-        super().__init__(domain.styled_env(space, 1, num_threads=1, **domain.coached))
+        super().__init__(domain.styled_env(space, 1, num_threads=1, **domain.coached), seed=0)
 
     @property
     def base_env(self) -> EnvBase:

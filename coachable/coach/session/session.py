@@ -88,20 +88,21 @@ class CoachSession:
         self.reset(seed)
 
     @classmethod
-    def open(cls, source: str | Path, *, track: Path | None = None, **settings: Any) -> CoachSession:
+    def open(cls, source: str | Path, *, env_options: Mapping[str, str] | None = None, **settings: Any) -> CoachSession:
         """Open a session with a trained agent.
 
         Args:
             source: Name of a domain that ships with weights, a run's folder, a checkpoint or a weights file.
-            track: File of the circuit to drive on, for domains with circuits; by default the domain's own.
+            env_options: Options of the domain's environment as texts, see `Domain.env_options`.
             **settings: Further arguments of the constructor.
 
         Raises:
             CheckpointError: If there is no such agent, or it is of another version.
-            ValueError: If `track` is given and is no circuit, or the domain has none.
+            ValueError: If the domain has no such option, or not with such a value.
         """
         agent = load_policy(source)
-        domain = domain_of(agent) if track is None else domain_of(agent).moved_to(track)
+        domain = domain_of(agent)
+        domain = domain.with_options(domain.read_options(env_options or {}))
         return cls(agent.actor, agent.space, domain, source=str(source), **settings)
 
     @property

@@ -14,8 +14,8 @@ from coachable.envs.combat.constants import PLAYER_HP
 from coachable.envs.combat.env import COMPONENTS_KEY
 from coachable.envs.combat.rewards import COMPONENT_SLICES
 from coachable.envs.combat.tables import ELEMENTS
-from coachable.evaluation.rollouts import Rollout
 from coachable.evaluation.video import asked_line, caption
+from coachable.training.rollout import Rollout
 
 if TYPE_CHECKING:
     from coachable.domain import Domain
@@ -109,7 +109,7 @@ def log_fights(
         The record, and the film's frames.
     """
     high = dict(zip(agent.space.names, agent.space.high.tolist(), strict=True))
-    theta = torch.stack([agent.space.make(strict=True, **{name: high[name]}) for name in names])
+    theta = agent.space.make_all({name: high[name]} for name in names)
     env = domain.styled_env(agent.space, fights, seed=seed)
     simulation: Any = env.base_env
     simulation.assign([APEX] * fights, ["Arena"] * fights)

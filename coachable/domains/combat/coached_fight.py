@@ -15,10 +15,10 @@ from coachable.envs.combat.constants import PLAYER_HP
 from coachable.envs.combat.tables import ELEMENTS, STYLES
 from coachable.envs.combat.traits import MACHINE_NAMES
 from coachable.evaluation.figures import drawing
-from coachable.evaluation.rollouts import Rollout
 from coachable.evaluation.runs import SWITCH_PERIOD
 from coachable.evaluation.wording import readable
 from coachable.styles import StyleSpace
+from coachable.training.rollout import Rollout
 
 if TYPE_CHECKING:
     from coachable.domain import Domain
@@ -145,7 +145,7 @@ def fight_coached(
     if len(names) < 2 or sequences < 1:
         raise ValueError(f"{sequences} sequences with the styles {list(names)}: expected at least 1 and 2 styles")
     high = dict(zip(agent.space.names, agent.space.high.tolist(), strict=True))
-    theta = torch.stack([agent.space.make(strict=True, **{name: high[name]}) for name in names])
+    theta = agent.space.make_all({name: high[name]} for name in names)
     period = max(1, min(SWITCH_PERIOD, steps // len(names)))
     requests = _draw_requests(len(names), -(-steps // period), sequences, seed).repeat_interleave(period, 0)[:steps]
 

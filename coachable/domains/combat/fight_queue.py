@@ -16,7 +16,7 @@ from coachable.domains.combat.metrics import CombatMeasures
 from coachable.envs.combat.env import COMPONENTS_KEY
 from coachable.envs.combat.rewards import COMPONENT_SLICES, style_counts
 from coachable.envs.combat.tables import SITES
-from coachable.evaluation.rollouts import Rollout
+from coachable.training.rollout import Rollout
 
 if TYPE_CHECKING:
     from coachable.domain import Domain
@@ -149,7 +149,7 @@ def fight_grid(
     Returns:
         Results of `run_fights`, (styles, opponents, sites * fights, ...).
     """
-    theta = torch.stack([agent.space.make(strict=True, **cell) for cell in cells])
+    theta = agent.space.make_all(cells)
     grid = list(product(range(len(cells)), opponents, SITES, range(fights)))
     rows, faced, places = zip(*((i, machines, site) for i, machines, site, _ in grid), strict=True)
     found = run_fights(domain, agent, theta[list(rows)], faced, places, seed=seed, progress=progress)

@@ -19,9 +19,9 @@ from coachable.domains.combat.coached_fight import (
 )
 from coachable.domains.combat.styles import single_styles
 from coachable.envs.combat.tables import MACHINES, SITES, STYLES, UNSEEN_MACHINES
+from coachable.evaluation.episode_records import record_episodes
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import drawing
-from coachable.evaluation.rollouts import record_episodes
 from coachable.evaluation.statistics import rank_correlation
 from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_results
 from coachable.evaluation.sweep import WeightSweep, sweep_weights
@@ -143,7 +143,7 @@ def fight_matrix(
         Sum of each measure over each fight, (styles, opponents, episodes).
     """
     space, shape = agent.space, (len(cells), len(opponents), episodes)
-    theta = torch.stack([space.make(strict=True, **cell) for cell in cells])
+    theta = space.make_all(cells)
     theta = theta.repeat_interleave(len(opponents) * episodes, 0)
     env = domain.styled_env(space, len(theta), seed=seed, num_enemies=len(opponents[0]))
     sites = np.random.default_rng(seed).choice(SITES, len(opponents) * episodes)

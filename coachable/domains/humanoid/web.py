@@ -160,6 +160,8 @@ def humanoid_web(
         push={"force": PUSH_FORCE, "duration": PUSH_DURATION},
         followed="torso",
         terminated="fell",
+        picture="The walker, seen from the side",
+        licence="The humanoid's model is from dm_control, Copyright The dm_control Authors, Apache-2.0.",
     )
 
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
-from coachable.domain import Domain, Recorded
+from coachable.domain import Domain, EnvOption, Recorded
 from coachable.domains.racing.families import home_track, racing_family
 from coachable.domains.racing.metrics import RacingMeasures
 from coachable.domains.racing.stage import RacingStage
@@ -58,7 +57,7 @@ def racing_domain(
         if cars == 1 and (met := chosen.pop("cars", 1)) > 1:  # agents trained in traffic are measured alone, too
             coached = {"cars": met, "scenarios": rolling_start(met)}
         pool, points = chosen.get("car") == "pool", chosen.get("course_points", COURSE_POINTS)
-        return _with_circuits(
+        return replace(
             domain,
             make_env=partial(make_env, **chosen),
             coached=coached,
@@ -89,19 +88,10 @@ def racing_domain(
         as_trained=as_trained,
         evaluation=evaluation,
         recorded=replace(recorded, alike=_alike),
+        env_options=(EnvOption("track", Track.from_csv, "CSV file of a circuit"),),
     )
-    return _with_circuits(domain)
+    return domain
 
 
 def _alike(races: int) -> dict[str, int]:
     return {"copies": races, "controlled": 1}
-
-
-def _with_circuits(domain: Domain, **changes: Any) -> Domain:
-    """Return a domain with changed fields that can move to the circuit of a file."""
-
-    def on_track(file: Path) -> Domain:
-        return replace(moved, make_env=partial(moved.make_env, track=Track.from_csv(file)))
-
-    moved = replace(domain, **changes, on_track=on_track)
-    return moved

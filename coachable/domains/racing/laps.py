@@ -11,12 +11,11 @@ from coachable.domains.racing.families import training_tracks, typical_car
 from coachable.domains.racing.frontier import TANK, LapProgramme
 from coachable.domains.racing.metrics import TelemetryMeasures
 from coachable.envs.racing.circuit.circuits import HELD_OUT, SHIPPED, load_tracks
-from coachable.envs.racing.circuit.track import Track
 from coachable.envs.racing.physics.cars import Resources, load_car
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
 from coachable.envs.racing.race.scenarios import Conditions, Scenario
+from coachable.evaluation.episode_records import record_styles
 from coachable.evaluation.evaluation_settings import EvaluationSettings
-from coachable.evaluation.rollouts import record_styles
 from coachable.evaluation.style_grid import markdown_table, mean_of
 
 if TYPE_CHECKING:
@@ -59,7 +58,7 @@ def drive_circuits(domain: Domain, agent: LoadedPolicy, settings: EvaluationSett
         domain: Racing domain, as the agent was trained in.
         agent: Policy, which acts deterministically.
         settings: `episodes` is the number of cars on each circuit, each from its own place; `steps` is the length of
-            their drives, 3600 (six minutes) at most and by default; `track` is the file of a further circuit.
+            their drives, 3600 (six minutes) at most and by default; the option `track` is a further circuit.
 
     Returns:
         A row per circuit: whether the agent was trained on it, completed laps, share of them that never left the track,
@@ -67,8 +66,8 @@ def drive_circuits(domain: Domain, agent: LoadedPolicy, settings: EvaluationSett
         retired.
     """
     tracks = load_tracks(DRIVEN)
-    if settings.track is not None:
-        tracks += (Track.from_csv(settings.track),)
+    if "track" in settings.env_options:
+        tracks += (settings.env_options["track"],)
     steps = min(settings.steps or TRIAL_STEPS, TRIAL_STEPS)
     count = len(tracks) * settings.episodes
     record = record_styles(

@@ -22,9 +22,9 @@ from coachable.envs.racing.physics.simulation import CONTROL_STEP
 from coachable.envs.racing.race.features import anyone_beside
 from coachable.envs.racing.race.run import Run
 from coachable.envs.racing.race.scenarios import rolling_start
+from coachable.evaluation.episode_records import record_episodes
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import drawing, shade
-from coachable.evaluation.rollouts import record_episodes
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation, wilson_interval
 from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_results
 from coachable.keys import STYLE_FEATURES

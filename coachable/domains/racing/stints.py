@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from coachable.domains.racing.families import home_track
 from coachable.domains.racing.frontier import TANK, WORN, sweep
@@ -18,9 +17,9 @@ from coachable.domains.racing.traffic import draw_traffic, race_in_traffic, traf
 from coachable.envs.racing.circuit.circuits import load_track
 from coachable.envs.racing.physics.cars import Resources
 from coachable.envs.racing.race.scenarios import Conditions
+from coachable.evaluation.episode_records import record_styles
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import drawing, shade
-from coachable.evaluation.rollouts import record_styles
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
 from coachable.evaluation.style_grid import markdown_table, mean_of, policy_sentence, write_results
 
@@ -148,7 +147,7 @@ def _drive(
 ) -> list[list[Stint]]:
     """Drive the stints of each cell, each from its own place on a track of the given length [m]."""
     space, count = agent.space, len(cells) * episodes
-    theta = torch.stack([space.make(strict=True, **cell) for cell in cells]).repeat_interleave(episodes, 0)
+    theta = space.make_all(cells).repeat_interleave(episodes, 0)
     record = record_styles(
         domain,
         agent.actor,

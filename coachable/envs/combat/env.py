@@ -15,7 +15,6 @@ from coachable.envs.combat import constants as c
 from coachable.envs.combat.damage import ElementNumbers
 from coachable.envs.combat.features import observation_size, observe
 from coachable.envs.combat.fight import run_step
-from coachable.envs.combat.frame import Noise, Rules
 from coachable.envs.combat.gamepad import GAMEPAD, canonical_rows
 from coachable.envs.combat.rewards import (
     COMPONENT_SLICES,
@@ -25,6 +24,7 @@ from coachable.envs.combat.rewards import (
     task_weights,
 )
 from coachable.envs.combat.state import State, start_fights
+from coachable.envs.combat.step_frames import Noise, Rules
 from coachable.envs.combat.tables import MACHINES, SITES, STYLES, check_styles
 from coachable.envs.combat.traits import (
     AMMO_SLOTS,

@@ -9,11 +9,11 @@ from coachable.envs.combat import constants as c
 from coachable.envs.combat.damage import ACID, BURNING, BY_ACID, BY_FIRE, BY_PLASMA, BY_SHOT, BY_SPEAR, BY_TRAP, PLASMA
 from coachable.envs.combat.damage import Totals as Totals
 from coachable.envs.combat.features import kept_features, one_hot_rows
-from coachable.envs.combat.frame import Noise, Rules, run_frames
 from coachable.envs.combat.gamepad import read_pad
 from coachable.envs.combat.player import command, element_of, wrap
 from coachable.envs.combat.rewards import pack_components
 from coachable.envs.combat.state import FEATURES_KEPT, FROM_MELEE, FROM_TRAP, NUM_SOURCES, State, nearest, pick
+from coachable.envs.combat.step_frames import Noise, Rules, run_frames
 from coachable.envs.combat.tables import WEAPONS
 from coachable.envs.combat.traits import AMMO_SLOTS, Traits
 from coachable.envs.combat.traps import closeness

@@ -56,6 +56,8 @@ class WebPart:
             whatever else is worth telling.
         push: Force [N] and `duration` [s] of the page's push, which acts on the first three velocities.
         followed: Body that the camera follows.
+        picture: What the picture shows, for those who do not see it.
+        licence: Notice that the licence of the model asks for, or "" for none.
         terminated: Verb for a terminated episode in the past tense.
     """
 
@@ -71,3 +73,5 @@ class WebPart:
     push: Mapping[str, float]
     followed: str
     terminated: str
+    picture: str = "The agent"
+    licence: str = ""

@@ -18,7 +18,7 @@ import websockets.sync.client as websockets  # noqa: E402, viser brings it
 from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
 
 from coachable.coach.page.api import PROTOCOL  # noqa: E402
-from coachable.coach.page.page import CoachPage  # noqa: E402
+from coachable.coach.page.coach_page import CoachPage  # noqa: E402
 from coachable.coach.page.server import make_server  # noqa: E402
 from coachable.coach.session.session import CoachSession  # noqa: E402
 from tests.coach.echo_domain import echo_session  # noqa: E402

@@ -9,7 +9,7 @@ import pytest
 viser = pytest.importorskip("viser")
 sync_api = pytest.importorskip("playwright.sync_api")
 
-from coachable.coach.page.page import CoachPage  # noqa: E402
+from coachable.coach.page.coach_page import CoachPage  # noqa: E402
 from coachable.coach.page.scene_view import camera_of  # noqa: E402
 from coachable.coach.page.server import make_server  # noqa: E402
 from coachable.coach.session.session import CoachSession  # noqa: E402

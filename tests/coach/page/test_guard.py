@@ -17,8 +17,8 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
 from websockets.http11 import Request  # noqa: E402
 
 from coachable.coach.page import guard  # noqa: E402
+from coachable.coach.page.coach_page import CoachPage  # noqa: E402
 from coachable.coach.page.guard import Guard  # noqa: E402
-from coachable.coach.page.page import CoachPage  # noqa: E402
 from coachable.coach.page.server import make_server  # noqa: E402
 from tests.coach.echo_domain import echo_session  # noqa: E402
 

@@ -12,7 +12,7 @@ viser = pytest.importorskip("viser")
 
 import websockets.sync.client as websockets  # noqa: E402, viser brings it
 
-from coachable.coach.page.page import CoachPage  # noqa: E402
+from coachable.coach.page.coach_page import CoachPage  # noqa: E402
 from coachable.coach.page.server import make_server  # noqa: E402
 from tests.coach.echo_domain import echo_session  # noqa: E402
 

@@ -1,7 +1,6 @@
 """The three declarations: they make environments, measure and draw."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -73,11 +72,13 @@ def test_drivers_of_many_circuits_are_shown_on_their_familys_or_on_the_users(tmp
     assert training_tracks("resources", settings["env"]) == SETS["training"]
     points = [(150 * math.cos(a / 20), 150 * math.sin(a / 20), 6, 6) for a in range(126)]
     (tmp_path / "own.csv").write_text("\n".join(",".join(map(str, point)) for point in points))
-    moved = domain.moved_to(tmp_path / "own.csv")
+    moved = domain.with_options(domain.read_options({"track": str(tmp_path / "own.csv")}))
     own = moved.make_env(num_envs=2, seed=0)
     assert [track.name for track in own.tracks] == ["own"] and own.observation_size == env.observation_size
-    with pytest.raises(ValueError, match=r"humanoid has no circuits: --track own\.csv is for agents that race"):
-        load_domain("humanoid").moved_to(Path("own.csv"))
+    with pytest.raises(ValueError, match=r"has no option --car: expected --track \(CSV file of a circuit\)"):
+        domain.read_options({"car": "gt3"})
+    with pytest.raises(ValueError, match=r"humanoid has no option --track: expected no options of its own"):
+        load_domain("humanoid").read_options({"track": "own.csv"})
 
 
 def test_an_agent_of_tyres_and_fuel_races_agents_or_scripted_drivers():

@@ -172,7 +172,7 @@ def test_laps_on_shipped_held_out_and_own_circuits(tmp_path, monkeypatch):
     monkeypatch.setattr(laps, "DRIVEN", ("ring", "oval"))
     tracks = [load_track("ring"), load_track("oval"), Track.from_csv(tmp_path / "own.csv")]
     domain, agent = scripted("resources", "gt3", drives=tracks)
-    settings = EvaluationSettings(episodes=2, steps=1100, progress=False, track=tmp_path / "own.csv")
+    settings = EvaluationSettings(episodes=2, steps=1100, progress=False, env_options={"track": tracks[-1]})
     rows = drive_circuits(domain, agent, settings)
     assert [(row["circuit"], row["trained"]) for row in rows] == [("ring", "yes"), ("oval", "no"), ("own", "no")]
     for row, track in zip(rows, tracks, strict=True):

@@ -9,12 +9,13 @@ from coachable.domains.combat import combat_style_reward, combat_style_space
 from coachable.envs.combat import CombatEnv
 from coachable.envs.combat.features import observation_groups, observation_size
 from coachable.envs.combat.fight import run_step
-from coachable.envs.combat.frame import Noise
 from coachable.envs.combat.gamepad import canonical_rows
 from coachable.envs.combat.rewards import COMPONENT_SLICES
 from coachable.envs.combat.state import State
+from coachable.envs.combat.step_frames import Noise
 from coachable.envs.combat.tables import MACHINES, STYLES
 from coachable.transforms import coachable_env
+from tests.envs.contract import assert_set_seed_restarts_the_stream, roll
 
 
 def make_env(num_envs=3, seed=0, **options):
@@ -25,15 +26,6 @@ def actions(env, steps, seed=0):
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         return env.action_spec.rand((steps,))
-
-
-def roll(env, sequence):
-    """Observations of a rollout without resets in between."""
-    current, seen = env.reset(), []
-    for action in sequence:
-        current = env.step(current.set("action", action))["next"]
-        seen.append(current["observation"].clone())
-    return torch.stack(seen)
 
 
 @pytest.mark.parametrize(
@@ -59,18 +51,13 @@ def test_observation_sizes_are_the_designs():
 
 def test_the_same_seed_gives_the_same_fights_and_another_does_not():
     sequence = actions(make_env(), 12)
-    runs = [roll(make_env(seed=seed), sequence[:steps]) for seed, steps in ((1, 12), (1, 12), (2, 1))]
+    runs = [roll(make_env(seed=seed), sequence[:steps])["observation"] for seed, steps in ((1, 12), (1, 12), (2, 1))]
     assert torch.equal(runs[0], runs[1])
     assert not torch.equal(runs[0][0], runs[2][0])
 
 
 def test_set_seed_restarts_the_stream():
-    env = make_env()
-    env.set_seed(5)
-    first = env.reset()["observation"]
-    env.set_seed(5)
-    assert torch.equal(env.reset()["observation"], first)
-    assert not torch.equal(env.reset()["observation"], first)
+    assert_set_seed_restarts_the_stream(make_env)
 
 
 def test_batched_step_equals_stepping_alone():

@@ -12,6 +12,7 @@ from coachable.envs.humanoid.features import BEARING, SPEED
 from coachable.envs.humanoid.model import CONTROL_STEP, JOINTS, MOTORS, build_model
 from coachable.envs.humanoid.observation import OBSERVATION_GROUPS, suite_observation
 from coachable.transforms import TaskImpersonation, coachable_env
+from tests.envs.contract import assert_set_seed_restarts_the_stream, roll
 
 
 def make_env(num_envs=3, seed=0, **options):
@@ -23,15 +24,6 @@ def actions(env, steps, seed=0):
     return torch.rand(steps, env.num_envs, 21, generator=generator) * 2 - 1
 
 
-def roll(env, sequence):
-    """Observations of a rollout without resets in between."""
-    current, seen = env.reset(), []
-    for action in sequence:
-        current = env.step(current.set("action", action))["next"]
-        seen.append(current["observation"].clone())
-    return torch.stack(seen)
-
-
 @pytest.mark.parametrize("styled_speed", [False, True])
 def test_specs_hold(styled_speed):
     check_env_specs(make_env(styled_speed=styled_speed), seed=0)
@@ -39,30 +31,25 @@ def test_specs_hold(styled_speed):
 
 def test_observations_are_finite_and_none_is_constant():
     env = make_env(num_envs=8)
-    seen = roll(env, actions(env, 60)).reshape(-1, 82)
+    seen = roll(env, actions(env, 60))["observation"].reshape(-1, 82)
     assert torch.isfinite(seen).all()
     assert (seen.std(0) > 0).all()
     assert seen.abs().max() < 30  # scaled: joint speeds reach tens of rad/s
 
 
 def test_the_same_seed_gives_the_same_episodes_and_another_does_not():
-    runs = [roll(make_env(seed=seed), actions(make_env(), 20)) for seed in (1, 1, 2)]
+    runs = [roll(make_env(seed=seed), actions(make_env(), 20))["observation"] for seed in (1, 1, 2)]
     assert torch.equal(runs[0], runs[1])
     assert not torch.equal(runs[0][0], runs[2][0])
 
 
 def test_set_seed_restarts_the_stream():
-    env = make_env()
-    env.set_seed(5)
-    first = env.reset()["observation"]
-    env.set_seed(5)
-    assert torch.equal(env.reset()["observation"], first)
-    assert not torch.equal(env.reset()["observation"], first)
+    assert_set_seed_restarts_the_stream(make_env)
 
 
 def test_batched_step_equals_stepping_alone():
     env = make_env(num_envs=4)
-    together = roll(env, actions(env, 30))
+    together = roll(env, actions(env, 30))["observation"]
     start = make_env(num_envs=4)
     start.reset()
     states = start.simulator_state()
@@ -278,7 +265,7 @@ def test_another_speed_is_relabelled_without_the_simulator():
 def test_only_speeds_of_joints_are_scaled():
     """The suite's 67 numbers, of which the last 27 are speeds in tenths, the pelvis and the gait."""
     env = make_env(num_envs=2)
-    seen = roll(env, actions(env, 3))[-1].numpy()
+    seen = roll(env, actions(env, 3))["observation"][-1].numpy()
     simulation, kinematics = env.simulation, env.simulation.kinematics()
     suite = suite_observation(simulation.positions, simulation.velocities, kinematics, env.course)
     np.testing.assert_allclose(seen[:, :40], suite[:, :40], atol=1e-6)
@@ -299,7 +286,7 @@ def test_threads_share_the_physics_and_change_no_number():
     """One thread is the caller's own, so that there is no pool to wake."""
     one, two = (HumanoidEnv(num_envs=3, num_threads=n, seed=0) for n in (1, 2))
     assert (one.simulation.num_threads, two.simulation.num_threads) == (0, 2)
-    assert torch.equal(roll(one, actions(one, 3)), roll(two, actions(two, 3)))
+    assert torch.equal(*(roll(env, actions(env, 3))["observation"] for env in (one, two)))
     two.close()
 
 

@@ -25,21 +25,13 @@ from coachable.envs.racing.race.run import Others, Run
 from coachable.envs.racing.race.scenarios import Conditions, Scenario, drift_scenarios, race_scenarios, rolling_start
 from coachable.envs.racing.race.task import TaskWeights, metres_gained
 from coachable.transforms import coachable_env
+from tests.envs.contract import roll
 
 T = {name: column for column, name in enumerate(TELEMETRY)}
 
 
 def actions(rows, steps, seed=0):
     return 2 * torch.rand(steps, rows, 2, generator=torch.Generator().manual_seed(seed)) - 1
-
-
-def roll(env, sequence):
-    """Steps without resets in between: all of `next`, stacked (steps, N)."""
-    current, seen = env.reset(), []
-    for action in sequence:
-        current = env.step(current.set("action", action))["next"]
-        seen.append(current.clone())
-    return torch.stack(seen)
 
 
 @pytest.mark.parametrize("options", [{}, {"cars": 5, "car": "pool"}, {"cars": 2, "car": "x2019"}], ids=["1", "5", "2"])

@@ -17,8 +17,8 @@ HERE = Path(__file__).parent
 def site(tmp_path_factory):
     pytest.importorskip("onnxruntime")
     pytest.importorskip("onnxscript")
-    from coachable.export.web.page import export_page
-    from coachable.export.web.third_party import provide
+    from coachable.export.web.pinned_files import provide
+    from coachable.export.web.simulated_page import export_page
 
     try:
         provide()
@@ -33,7 +33,7 @@ def site(tmp_path_factory):
 def recorded_site(tmp_path_factory):
     """A page with three short recordings."""
     from coachable.evaluation import recorded_page
-    from coachable.export.web.third_party import provide
+    from coachable.export.web.pinned_files import provide
 
     try:
         provide(None, "three")

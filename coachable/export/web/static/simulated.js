@@ -15,7 +15,7 @@ const AFTER_FALL = 1200; // [ms] before the next episode
 const ANNOUNCE = 4; // [s] after a request, what was measured is read out
 
 class SimulatedPage extends Page {
-  resting = "Walk on";
+  resting = "Go on";
 
   async load() {
     const { manifest } = this;
@@ -50,6 +50,7 @@ class SimulatedPage extends Page {
   start() {
     const { manifest } = this;
     this.entries = entriesOf(manifest);
+    at("scene").setAttribute("aria-label", manifest.picture);
     this.readout = new Readout(manifest.measures);
     this.panel = new Panel(at("requests"), at("others"), this.entries, manifest.measures, (name, value) =>
       this.ask({ ...this.request, [name]: value }),

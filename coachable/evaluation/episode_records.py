@@ -1,25 +1,20 @@
-"""Rollouts with given styles, recorded step by step."""
+"""Episodes with given styles, recorded step by step."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypedDict
 
 import torch
-from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
 from coachable.domain import Domain, StyleMeasures
 from coachable.keys import STYLE, TASK_REWARD
 from coachable.styles import StyleSpace
-from coachable.training.rng import RandomStream
-
-StyleSchedule = Callable[[int], Tensor]
+from coachable.training.rollout import Rollout, StyleSchedule
 
 
 class RolloutOptions(TypedDict, total=False):
@@ -37,59 +32,6 @@ class RolloutOptions(TypedDict, total=False):
     seed: int
     num_threads: int | None
     progress: bool
-
-
-class Rollout:
-    """Step-by-step rollout of a policy in a batch of environments, with styles that may change at any step.
-
-    All evaluations, films and sessions use this class, so that a seed has the same meaning everywhere.
-
-    Args:
-        env: N environments with style transforms.
-        seed: Seed of the initial states and of sampled actions.
-    """
-
-    def __init__(self, env: EnvBase, seed: int = 0) -> None:
-        self.env = env
-        self.seed(seed)
-
-    def seed(self, seed: int) -> None:
-        """Seed initial states and actions; call `begin` afterwards."""
-        self.env.set_seed(seed)
-        self._chance = RandomStream(seed)
-
-    def begin(self, style: Tensor) -> None:
-        """Begin new episodes in all environments, with styles (N, d)."""
-        self._current: TensorDictBase = self.env.reset(TensorDict({STYLE: style}, self.env.batch_size))
-
-    @property
-    def observation(self) -> Tensor:
-        """Next observation of the policy (N, F)."""
-        return self._current.get("observation")
-
-    @torch.no_grad()
-    def step(self, policy: TensorDictModuleBase, style: Tensor) -> TensorDictBase:
-        """Make one step.
-
-        Args:
-            policy: Policy that writes `action`.
-            style: Raw styles (N, d) to act under.
-
-        Returns:
-            Transition, batch shape (N,).
-        """
-        with self._chance.drawn():
-            transition = self.env.step(policy(self._current.set(STYLE, style)))
-        self._current = step_mdp(transition)
-        return transition
-
-    def begin_ended(self) -> None:
-        """Begin new episodes where the last step ended one."""
-        self._current = self.env.maybe_reset(self._current)
-
-    def begin_rows(self, rows: Tensor) -> None:
-        """Begin new episodes in some environments, rows (N,) bool, at least one of them."""
-        self._current = self.env.reset(self._current.set("_reset", rows.unsqueeze(-1)))
 
 
 @dataclass(frozen=True)
@@ -135,22 +77,18 @@ def record_episodes(
     schedule: StyleSchedule = style if callable(style) else lambda _: style
     rollout = Rollout(env, seed)
     rollout.begin(schedule(0))
-    alive = torch.ones(env.batch_size, dtype=torch.bool)
-    survived, task_return = alive.clone(), torch.zeros(env.batch_size)
+    survived = torch.ones(env.batch_size, dtype=torch.bool)
+    task_return = torch.zeros(env.batch_size)
     rows: list[dict[str, Tensor]] = []
     styles, lives = [], []
-    for step in tqdm(range(steps), desc=progress, disable=True if progress is None else None, leave=False):
-        theta = schedule(step)
-        transition = rollout.step(policy, theta)
+    run = rollout.episode(policy, steps, schedule)
+    for transition, alive in tqdm(run, progress, steps, disable=True if progress is None else None, leave=False):
         after = transition.get("next")
         rows.append(measures.step(transition))
-        styles.append(theta)
+        styles.append(transition.get(STYLE))
         lives.append(alive)
         task_return += torch.where(alive, after.get(TASK_REWARD).squeeze(-1), 0.0)
         survived &= ~(alive & after.get("terminated").squeeze(-1))
-        alive = alive & ~after.get("done").squeeze(-1)
-        if not alive.any():
-            break
     env.close()
     return EpisodeRecord(
         measures={name: torch.stack([row[name] for row in rows]) for name in rows[0]},

@@ -13,7 +13,7 @@ from coachable import __version__
 from coachable.export.graph import graph_of, import_onnx
 from coachable.export.onnx import TOLERANCE, export
 from coachable.export.web.part import WebPart
-from coachable.export.web.third_party import Package, packages, provide
+from coachable.export.web.pinned_files import Package, packages, provide
 from coachable.scene.look import ICON, stylesheet
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
@@ -37,7 +37,7 @@ def export_page(source: str | Path, out: Path, assets: Path | None = None) -> in
     Args:
         source: Checkpoint, run folder, weights file, or the name of a domain that ships with weights.
         out: Folder to write into; files of the same names are replaced.
-        assets: Folder with the files of other projects, see `coachable.export.web.third_party.provide`.
+        assets: Folder with the files of other projects, see `coachable.export.web.pinned_files.provide`.
 
     Returns:
         Size of all files of the page [byte].
@@ -57,7 +57,7 @@ def export_page(source: str | Path, out: Path, assets: Path | None = None) -> in
     features = graph_of(part.features, part.example, _OUTPUTS)
     onnx.checker.check_model(features)
     out.mkdir(parents=True, exist_ok=True)
-    copy_page(out, vendored)
+    copy_page(out, vendored, part.licence)
     export(source, out / _GRAPHS["policy"])
     (out / _GRAPHS["features"]).write_bytes(features.SerializeToString())
     for name, text in (("dynamics", part.dynamics), ("kinematics", part.kinematics)):
@@ -65,12 +65,13 @@ def export_page(source: str | Path, out: Path, assets: Path | None = None) -> in
     return finish_page(out, manifest_of(agent, part), [*_MODELS.values(), *_GRAPHS.values()], vendored)
 
 
-def copy_page(out: Path, vendored: Mapping[str, Path]) -> None:
+def copy_page(out: Path, vendored: Mapping[str, Path], licence: str = "") -> None:
     """Write the page's own files, and the files of other projects with their licences.
 
     Args:
         out: The page's folder.
-        vendored: Files of other projects, from `coachable.export.web.third_party.provide`.
+        vendored: Files of other projects, from `coachable.export.web.pinned_files.provide`.
+        licence: Notice of the domain's own model, see `WebPart.licence`.
     """
     with as_file(files("coachable.export.web") / "static") as own:
         shutil.copytree(own, out, dirs_exist_ok=True)
@@ -81,7 +82,7 @@ def copy_page(out: Path, vendored: Mapping[str, Path]) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(file, target)
     used = _used(vendored)
-    (out / _VENDORED / "LICENSES.txt").write_text(_licenses(used), encoding="utf-8")
+    (out / _VENDORED / "LICENSES.txt").write_text(_licenses(used, licence), encoding="utf-8")
 
 
 def finish_page(out: Path, manifest: dict[str, Any], data: Sequence[str], vendored: Mapping[str, Path]) -> int:
@@ -150,6 +151,7 @@ def manifest_of(agent: LoadedPolicy, part: WebPart) -> dict[str, Any]:
         "physics": dict(part.physics),
         "push": dict(part.push),
         "followed": part.followed,
+        "picture": part.picture,
         "terminated": part.terminated,
         "starts": [dict(start) for start in part.starts],
         "largest_difference": TOLERANCE,
@@ -167,11 +169,12 @@ def _used(vendored: Mapping[str, Path]) -> list[Package]:
     return [p for p in packages() if any(name.startswith(f"{p.name}/") for name in vendored)]
 
 
-def _licenses(used: Sequence[Package]) -> str:
+def _licenses(used: Sequence[Package], licence: str) -> str:
     """Return the notices that the licences of the vendored files ask for."""
     blocks = [f"{p.name} {p.version}\n{p.copyright}\nLicence: {p.license}\n{p.home}\n" for p in used]
     mit = (files("coachable.export.web") / "MIT.txt").read_text(encoding="utf-8")
     apache = "The Apache License 2.0 is at https://www.apache.org/licenses/LICENSE-2.0\n"
-    model = "The humanoid's model is from dm_control, Copyright The dm_control Authors, Apache-2.0.\n"
-    others = [model, apache] if any(p.license == "Apache-2.0" for p in used) else []
+    others = [f"{licence}\n"] if licence else []
+    if "Apache-2.0" in licence or any(p.license == "Apache-2.0" for p in used):
+        others.append(apache)
     return "\n".join([*blocks, *others, "MIT License\n", mit])

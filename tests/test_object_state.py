@@ -9,7 +9,7 @@ import torch
 gymnasium = pytest.importorskip("gymnasium")
 from gymnasium import spaces  # noqa: E402
 
-from coachable.third_party import UnsavableError, load_object, save_object  # noqa: E402
+from coachable.object_state import UnsavableError, load_object, save_object  # noqa: E402
 
 # Humanoid's reward reads the centres of mass before a step, which MuJoCo leaves as of the step before the last.
 MUJOCO = ["HalfCheetah-v5", "Humanoid-v5"]

@@ -18,7 +18,7 @@ from coachable.finite import require_finite_action
 from coachable.gym.actions import action_components, native_action
 from coachable.gym.checked_features import Features, checked_features, flat_observation
 from coachable.keys import STYLE_FEATURES, TASK_REWARD
-from coachable.third_party import load_object, save_object
+from coachable.object_state import load_object, save_object
 
 __all__ = ["GymnasiumEnv"]
 

@@ -12,7 +12,7 @@ import pytest
 
 from coachable.cli import main
 from coachable.domain import load_domain
-from coachable.export.web import third_party
+from coachable.export.web import pinned_files
 from coachable.scene.frame import Frame, Gauge
 from coachable.scene.parts import Parts
 from coachable.scene.recorded import encode_frames
@@ -49,24 +49,24 @@ def test_assets_belong_to_the_page(capsys, tmp_path):
 
 def test_changed_files_of_other_projects_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"mujoco\.js is missing or is not the file of @mujoco/mujoco 3\.14\.0"):
-        third_party.provide(tmp_path)
+        pinned_files.provide(tmp_path)
     file = tmp_path / "@mujoco/mujoco/mujoco.js"
     file.parent.mkdir(parents=True)
     file.write_text("something else")
     with pytest.raises(ValueError, match="is not the file of"):
-        third_party.provide(tmp_path)
+        pinned_files.provide(tmp_path)
 
 
 def test_without_npm_one_sentence_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setenv("PATH", "")
     with pytest.raises(FileNotFoundError, match=r"install Node\.js 20, or name a folder with the files by --assets"):
-        third_party.provide()
+        pinned_files.provide()
 
 
 def test_an_archive_with_another_hash_is_refused():
     with pytest.raises(OSError, match="has another hash"):
-        list(third_party._unpack(third_party.packages()[0], b"something else"))
+        list(pinned_files._unpack(pinned_files.packages()[0], b"something else"))
 
 
 SCRIPT = """

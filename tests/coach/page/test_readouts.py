@@ -1,0 +1,128 @@
+"""What the page shows of the measured style: charts, read-outs and the verdict."""
+
+import warnings
+
+import pytest
+
+viser = pytest.importorskip("viser")
+
+
+from coachable.coach.page.coach_page import verdict  # noqa: E402
+from coachable.coach.session.readout import StyleReport  # noqa: E402
+from tests.coach.page.driving import do, say, wait_for  # noqa: E402
+
+
+def test_the_chart_follows_what_was_asked_for_last(page):
+    page._press("Step")
+    do(page)
+    page.widgets["fire"].handle.value = 1.0
+    wait_for(lambda: page.chart.shown == "fire" and page.chart.choice.value == "fire")
+    page.widgets["mood"].handle.value = "wild card"
+    wait_for(lambda: page.chart.shown == "mood")
+    say(page, "target 0.4 m")
+    assert page.chart.shown == "target"
+    page.chart.choice.value = "fire"
+    wait_for(lambda: page.chart.shown == "fire")
+    page.widgets["target"].handle.value = 0.5
+    wait_for(lambda: page.chart.shown == "target")
+
+
+def test_the_chart_has_a_fixed_axis_of_time_and_says_when_nothing_was_measured(page):
+    for _ in range(2):
+        page._press("Step")
+        do(page)
+    assert page.chart.plot.scales["x"]["range"] == (-30.0, 0.0)
+    ago, asked, measured = page.chart.plot.data
+    assert ago == pytest.approx([-0.05, 0.0]) and measured == pytest.approx(asked)
+    assert not page.chart.note.visible
+    page.chart.choice.value = "mood"
+    wait_for(lambda: "mood: nothing was measured" in page.chart.note.content and page.chart.note.visible)
+    assert len(page.chart.plot.data) == 2, "what was asked for only"
+
+
+def test_what_is_shown_is_measured_or_says_that_it_is_not(page):
+    page.widgets["target"].handle.value = 0.5
+    do(page)
+    texts = {name: text.handle.content for name, text in page.measured.items()}
+    assert texts["target"] == "not measured yet · trained -0.8 to 0.8 m"
+    page._press("Step")
+    do(page)
+    texts = {name: text.handle.content for name, text in page.measured.items()}
+    assert texts["target"] == "measured **0.5 m** in 0.1 s · trained -0.8 to 0.8 m"
+    assert texts["mood"] == "no measure of its own"
+    assert "pace **0.5 m/step**" in page.others.content, "the domain declares the unit"
+    do(page, lambda session: session.set(target=-0.5))
+    assert "not measured yet" in page.measured["target"].handle.content, "0.5 m belongs to the request before"
+
+
+def report(**changes):
+    """Of a request that was met, with changes."""
+    values = {
+        "requested": {"target": 0.5},
+        "measured": {"target": 0.5},
+        "unmeasured": (),
+        "seconds": 2.0,
+        "outside": {},
+        "asks": True,
+        "complying": 1.0,
+        "needs": "a footstep",
+        "complied_after": 0.5,
+        "since_request": 9.0,
+        "episode": 1,
+        "episode_time": 9.0,
+        "ended": None,
+        "endings": {},
+    }
+    return StyleReport(**values | changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({}, "**Request met**, first after 0.5 s: 100% of what was judged in the last 2.0 s."),
+        ({"complying": 0.25}, "Request met first after 0.5 s, but only 25% of what was judged in the last 2.0 s."),
+        ({"complying": None}, "Request met first after 0.5 s; nothing to judge in the last 2.0 s."),
+        ({"complying": 0.0, "complied_after": None}, "Request not yet met, after 9.0 s."),
+        (
+            {"complying": None, "complied_after": None},
+            "Request not judged yet, after 9.0 s: that takes a footstep.",
+        ),
+        ({"asks": False, "complied_after": None}, "Nothing is asked for: every weight is 0."),
+    ],
+)
+def test_the_verdict_says_what_it_rests_on(changes, text):
+    assert verdict(report(**changes)) == text
+
+
+def test_outside_the_trained_range_is_flagged(page):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        say(page, "target 2 m")
+    assert page.widgets["target"].handle.value == pytest.approx(0.8)
+    assert "**Outside the trained range:** 2 m was asked for, 0.8 m is used" in page.measured["target"].handle.content
+    page.widgets["target"].handle.value = 0.1
+    do(page)
+    assert "Outside" not in page.measured["target"].handle.content
+
+
+def test_a_failing_view_leaves_the_read_outs(page, monkeypatch):
+    def torn(share):
+        raise RuntimeError("the canvas is torn")
+
+    do(page)
+    monkeypatch.setattr(page._view, "update", torn)
+    page._press("Resume")
+    wait_for(lambda: "the canvas is torn" in page.status.content)
+    count = page.session.step_count
+    wait_for(lambda: page.session.step_count > count)
+
+
+def test_a_weight_and_what_it_brings_about_have_an_axis_each(page):
+    page._press("Step")
+    do(page)
+    assert page.chart.choice.value == "target" and len(page.chart.plot.axes) == 2
+    page.chart.choice.value = "fire"
+    wait_for(lambda: len(page.chart.plot.axes) == 3)
+    assert page.chart.plot.series[2]["label"] == "measured (right)"
+    page.chart.choice.value = "target"
+    wait_for(lambda: len(page.chart.plot.axes) == 2)
