@@ -17,6 +17,8 @@ from coachable.gl import RenderingError, choose_gl_backend
 __all__ = ["main"]
 
 _LARGEST = 2**31 - 1
+_PRETRAINED = Path(__file__).parent / "pretrained"
+_OF_RUNS = ("state.pt", "frames_*", "checkpoints", "stages")  # in the folder of a run or a checkpoint
 _PICTURES = (".png", ".svg", ".pdf")
 _SOURCE_HELP = "a run's folder, a checkpoint, a weights file, an exported model, or a domain that ships with weights"
 
@@ -73,7 +75,7 @@ def _parser() -> argparse.ArgumentParser:
         parser = commands.add_parser(name, help=text)
         parser.set_defaults(run=run)
         if source:
-            parser.add_argument("source", help=source)
+            parser.add_argument("source", type=_agent, help=source)
         return parser
 
     train = command("train", _train, "train an agent with a recipe, as python recipes/RECIPE.py does")
@@ -117,7 +119,8 @@ def _parser() -> argparse.ArgumentParser:
     weights.add_argument("out", type=Path, help="the file, such as weights.pt")
 
     report = command("report", _report, "write all measurements of an agent on one page")
-    report.add_argument("sources", nargs="+", metavar="source", help=f"{_SOURCE_HELP}; several: one per training seed")
+    text = f"{_SOURCE_HELP}; several: one per training seed"
+    report.add_argument("sources", nargs="+", type=_agent, metavar="source", help=text)
     _add_out(report, "report", "folder")
     _add_number(report, "--seeds", 5, "runs of a single agent")
     _add_number(report, "--episodes", 4, "per run and style")
@@ -291,6 +294,7 @@ def _verify(options: argparse.Namespace) -> int:
 
 
 def _coach(options: argparse.Namespace) -> int:
+    options.source = _agent(options.source)
     _require_agent(options.source)  # before the page's address is announced
     from coachable.coach.page.command import serve
 
@@ -311,16 +315,29 @@ def _arguments(options: argparse.Namespace) -> dict[str, Any]:
     return {name: value for name, value in vars(options).items() if name not in ("run", "command")}
 
 
+def _shipped() -> list[str]:
+    """Return the names of the agents that ship with weights."""
+    return sorted(path.parent.name for path in _PRETRAINED.glob("*/weights.pt"))
+
+
+def _agent(source: str) -> str:
+    """Return where an agent is: a shipped agent's weights if a folder of the same name is in the way and holds no run."""
+    folder = Path(source)
+    if source in _shipped() and folder.is_dir() and not any(any(folder.glob(name)) for name in _OF_RUNS):
+        return str(_PRETRAINED / source / "weights.pt")
+    return source
+
+
 def _require_agent(source: str) -> None:
     """Check that a source can be an agent, without importing torch, which takes seconds.
 
     Raises:
         ValueError: If it cannot; the message lists the agents that ship with weights.
     """
-    shipped = Path(__file__).parent / "pretrained"
-    if source and ((shipped / source / "weights.pt").is_file() or Path(source).is_dir()):
+    shipped = _shipped()
+    if source in shipped or (source and Path(source).is_dir()):
         return
-    names = ", ".join(sorted(path.parent.name for path in shipped.glob("*/weights.pt")))
+    names = ", ".join(shipped)
     if not source or not Path(source).exists():
         raise ValueError(f"there is no agent {source!r}: expected {_SOURCE_HELP} ({names})")
     if not source.endswith(".onnx") and not zipfile.is_zipfile(source):

@@ -1,6 +1,6 @@
 """Names and numbers as text for people, and which measures tell about which parameter."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from coachable.styles import StyleSpace
@@ -22,7 +22,9 @@ def readable_number(value: float, unit: str = "") -> str:
     return f"{number} {unit}".rstrip()
 
 
-def measures_by_parameter(space: StyleSpace, names: Iterable[str]) -> dict[str, list[str]]:
+def measures_by_parameter(
+    space: StyleSpace, names: Iterable[str], beside: Mapping[str, str] | None = None
+) -> dict[str, list[str]]:
     """Group measures by the parameter that they belong to; those of no parameter are listed under "".
 
     A measure belongs to the parameter whose name is part of its own, word by word: `pose_held` to `pose`,
@@ -31,6 +33,7 @@ def measures_by_parameter(space: StyleSpace, names: Iterable[str]) -> dict[str, 
     Args:
         space: The style space.
         names: Names of the measures.
+        beside: Parameters by measure where the names do not tell, as `Domain.beside`. These measures come first.
 
     Example:
         >>> from coachable.styles import Setpoint
@@ -38,8 +41,8 @@ def measures_by_parameter(space: StyleSpace, names: Iterable[str]) -> dict[str, 
         {'gap': ['gap', 'gap_error'], '': ['speed']}
     """
     groups: dict[str, list[str]] = {name: [] for name in space.names} | {"": []}
-    by_length = sorted(space.names, key=len, reverse=True)
-    for measure in names:
+    by_length, known = sorted(space.names, key=len, reverse=True), beside or {}
+    for measure in sorted(names, key=lambda name: name not in known):  # stable, so otherwise in the given order
         owner = next((name for name in by_length if f"_{name}_" in f"_{measure}_"), "")
-        groups[owner].append(measure)
+        groups[known.get(measure, owner)].append(measure)
     return groups

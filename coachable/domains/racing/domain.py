@@ -30,6 +30,7 @@ def racing_domain(
     columns: Mapping[str, str],
     evaluation: Callable[..., str],
     recorded: Recorded,
+    beside: Mapping[str, str] | None = None,
     **options: Any,
 ) -> Domain:
     """Return the domain of a family of styles.
@@ -41,6 +42,7 @@ def racing_domain(
         columns: Published columns beside survival, pace, time off course and changes of the steering command.
         evaluation: Function that `coachable evaluate` calls.
         recorded: What the exported page plays.
+        beside: Parameters by the measure that tells about them, as in `Domain`.
         **options: Options of the environment that differ from training when an agent is shown and measured.
     """
     make_env, make_space, make_reward = racing_family(family)
@@ -82,6 +84,7 @@ def racing_domain(
         episode_steps=EPISODE_STEPS,
         columns={"survived": ".0%", "pace": ".1f", "off": ".1%", "steering_change": ".2f"} | dict(columns),
         units=units,
+        beside=beside or {},
         observation_groups=observation_groups(cars > 1, pool=False),
         action_groups=ACTION_GROUPS,
         words=WORDS[family],
