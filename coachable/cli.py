@@ -6,21 +6,18 @@ import math
 import runpy
 import sys
 import time
-import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from coachable import __version__
+from coachable.coach.sources import SOURCE_HELP, located, require_agent
 from coachable.gl import RenderingError, choose_gl_backend
 
 __all__ = ["main"]
 
 _LARGEST = 2**31 - 1
-_PRETRAINED = Path(__file__).parent / "pretrained"
-_OF_RUNS = ("state.pt", "frames_*", "checkpoints", "stages")  # in the folder of a run or a checkpoint
 _PICTURES = (".png", ".svg", ".pdf")
-_SOURCE_HELP = "a run's folder, a checkpoint, a weights file, an exported model, or a domain that ships with weights"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -75,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
         parser = commands.add_parser(name, help=text)
         parser.set_defaults(run=run)
         if source:
-            parser.add_argument("source", type=_agent, help=source)
+            parser.add_argument("source", type=located, help=source)
         return parser
 
     train = command("train", _train, "train an agent with a recipe, as python recipes/RECIPE.py does")
@@ -84,14 +81,14 @@ def _parser() -> argparse.ArgumentParser:
         "arguments", nargs=argparse.REMAINDER, help="KEY=VALUE ... seeds=0,1,2, or --help for all of them"
     )
 
-    evaluate = command("evaluate", _evaluate, "measure every style of an agent: tables and a figure", _SOURCE_HELP)
+    evaluate = command("evaluate", _evaluate, "measure every style of an agent: tables and a figure", SOURCE_HELP)
     _add_out(evaluate, "evaluation", "folder")
     _add_number(evaluate, "--episodes", 20, "per style")
     _add_number(evaluate, "--switch-episodes", 60, "with switching styles, 0 for none", lowest=0)
     _add_rollout(evaluate)
     evaluate.epilog = ENV_OPTIONS
 
-    render = command("render", _render, "film an agent whose style is switched while it acts", _SOURCE_HELP)
+    render = command("render", _render, "film an agent whose style is switched while it acts", SOURCE_HELP)
     _add_out(render, "coachable.mp4", ".mp4, .gif, .webp or .png")
     text = "one request, NAME=VALUE,NAME=VALUE; repeat it to switch (default: a tour of the styles)"
     render.add_argument("--style", action="append", type=_style, dest="styles", metavar="NAME=VALUE,...", help=text)
@@ -119,8 +116,8 @@ def _parser() -> argparse.ArgumentParser:
     weights.add_argument("out", type=Path, help="the file, such as weights.pt")
 
     report = command("report", _report, "write all measurements of an agent on one page")
-    text = f"{_SOURCE_HELP}; several: one per training seed"
-    report.add_argument("sources", nargs="+", type=_agent, metavar="source", help=text)
+    text = f"{SOURCE_HELP}; several: one per training seed"
+    report.add_argument("sources", nargs="+", type=located, metavar="source", help=text)
     _add_out(report, "report", "folder")
     _add_number(report, "--seeds", 5, "runs of a single agent")
     _add_number(report, "--episodes", 4, "per run and style")
@@ -128,13 +125,13 @@ def _parser() -> argparse.ArgumentParser:
     _add_number(report, "--sweep-points", 5, "values of each weight", lowest=2)
     _add_rollout(report)
 
-    explain = command("explain", _explain, "rank the inputs of an agent, by SHAP and saliency", _SOURCE_HELP)
+    explain = command("explain", _explain, "rank the inputs of an agent, by SHAP and saliency", SOURCE_HELP)
     _add_out(explain, "explanation", "folder")
     _add_number(explain, "--episodes", 100, "trajectories", lowest=2)
     _add_number(explain, "--states", 16, "of each trajectory")
     _add_rollout(explain)
 
-    export = command("export", _export, "write the policy as one ONNX file, to run it without torch", _SOURCE_HELP)
+    export = command("export", _export, "write the policy as one ONNX file, to run it without torch", SOURCE_HELP)
     target = export.add_mutually_exclusive_group()
     target.add_argument("--out", type=Path, default=Path("policy.onnx"), help="(default: %(default)s)")
     text = "write a page instead, on which the agent acts in the visitor's browser, or plays recordings"
@@ -147,7 +144,7 @@ def _parser() -> argparse.ArgumentParser:
     text = "whose environment is compared with the recording (default: the model's own, if it is installed)"
     verify.add_argument("--domain", metavar="NAME", help=text)
 
-    add_parser(commands, _SOURCE_HELP, _coach)
+    add_parser(commands, SOURCE_HELP, _coach)
 
     command("doctor", _doctor, "check this installation")
     return parser
@@ -294,8 +291,8 @@ def _verify(options: argparse.Namespace) -> int:
 
 
 def _coach(options: argparse.Namespace) -> int:
-    options.source = _agent(options.source)
-    _require_agent(options.source)  # before the page's address is announced
+    options.source = located(options.source)
+    require_agent(options.source)  # before the page's address is announced
     from coachable.coach.page.command import serve
 
     serve(say=lambda text: print(text, flush=True), **_arguments(options))
@@ -313,35 +310,6 @@ def _doctor(_options: argparse.Namespace) -> int:
 
 def _arguments(options: argparse.Namespace) -> dict[str, Any]:
     return {name: value for name, value in vars(options).items() if name not in ("run", "command")}
-
-
-def _shipped() -> list[str]:
-    """Return the names of the agents that ship with weights."""
-    return sorted(path.parent.name for path in _PRETRAINED.glob("*/weights.pt"))
-
-
-def _agent(source: str) -> str:
-    """Return where an agent is: a shipped agent's weights if a folder of the same name is in the way and holds no run."""
-    folder = Path(source)
-    if source in _shipped() and folder.is_dir() and not any(any(folder.glob(name)) for name in _OF_RUNS):
-        return str(_PRETRAINED / source / "weights.pt")
-    return source
-
-
-def _require_agent(source: str) -> None:
-    """Check that a source can be an agent, without importing torch, which takes seconds.
-
-    Raises:
-        ValueError: If it cannot; the message lists the agents that ship with weights.
-    """
-    shipped = _shipped()
-    if source in shipped or (source and Path(source).is_dir()):
-        return
-    names = ", ".join(shipped)
-    if not source or not Path(source).exists():
-        raise ValueError(f"there is no agent {source!r}: expected {_SOURCE_HELP} ({names})")
-    if not source.endswith(".onnx") and not zipfile.is_zipfile(source):
-        raise ValueError(f"{source} is no weights file: expected {_SOURCE_HELP} ({names})")
 
 
 def _at_least(lowest: int) -> Callable[[str], int]:
