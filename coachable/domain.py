@@ -81,11 +81,13 @@ class Control:
         parameter: Name, range, unit and neutral value.
         apply: Function that writes a value into the base environment.
         circular: Whether values wrap around at the ends of the range, as angles do.
+        rate: Largest change per second while a new value is approached, in the parameter's unit; None for at once.
     """
 
     parameter: Setpoint
     apply: Callable[[EnvBase, float], None]
     circular: bool = False
+    rate: float | None = None
 
     def fit(self, value: float) -> float:
         """Wrap a value around or clamp it to the control's range.
@@ -161,7 +163,7 @@ class Recorded:
         alike: Function from a number of episodes to options of `make_env` with which that many episodes begin alike, so
             that styles can be compared; by default they begin differently.
         columns: Measures that the page shows, with the format of their values; None for the domain's `columns`.
-        opens: Style that the page shows at first, by parameter name; None for the first of the grid.
+        opens: Number of the style that the page shows at first; by default the last one, which asks for most.
         title: Title of the page; "" for one from the domain's name.
         summary: One sentence for the visitor.
     """
@@ -170,7 +172,7 @@ class Recorded:
     seconds: float = 30.0
     alike: Callable[[int], Mapping[str, Any]] | None = None
     columns: Mapping[str, str] | None = None
-    opens: Mapping[str, Any] | None = None
+    opens: int = -1
     title: str = ""
     summary: str = "Ask for a style, and see what the agent does and what is measured."
 
@@ -249,8 +251,7 @@ class Domain:
         targets: Largest value of a metric that is wanted as its median over the styles, by name.
         columns: Metrics of the published table, in order, with the format of their values; by default all.
         units: Units of measured quantities by name, for the axes of figures and the page of `coachable coach`.
-        beside: Style parameter that a measure tells about, by the measure's name; a measure whose name contains that of
-            a parameter needs no entry.
+        beside: Style parameter that a measure tells about, by the measure's name, where its name does not contain it.
         observation_groups: Blocks of the observation, in order, for explanations and exported models; by default every
             entry is explained on its own.
         action_groups: Blocks of the action, in order, for exported models.

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from coachable.domain import Domain
 from coachable.styles import StyleSpace
 
 
@@ -46,3 +47,31 @@ def measures_by_parameter(
         owner = next((name for name in by_length if f"_{name}_" in f"_{measure}_"), "")
         groups[known.get(measure, owner)].append(measure)
     return groups
+
+
+def unit_of(domain: Domain, space: StyleSpace, name: str) -> str:
+    """Return the unit of a measure: the domain's, or that of the parameter that the measure or its error belongs to.
+
+    Args:
+        domain: The domain.
+        space: The style space.
+        name: Name of the measure.
+    """
+    parameter = name.removesuffix("_error")
+    return domain.units.get(name) or (getattr(space[parameter], "unit", "") if parameter in space else "")
+
+
+def measured_text(domain: Domain, space: StyleSpace, name: str, value: float) -> str:
+    """Return a measured value with its unit, in the format in which the domain publishes it or else with three digits.
+
+    Args:
+        domain: The domain.
+        space: The style space.
+        name: Name of the measure.
+        value: Its value.
+    """
+    form = domain.columns.get(name, domain.columns.get(f"measured_{name}", ""))
+    if form.endswith("%"):
+        return format(value, form)
+    unit = unit_of(domain, space, name)
+    return f"{format(value, form)} {unit}".rstrip() if form else readable_number(value, unit)

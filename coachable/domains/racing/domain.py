@@ -68,8 +68,10 @@ def racing_domain(
         )
 
     angles = ("sideslip", "sideslip_corners", "sideslip_straights") if family == "drift" else ()
-    units = {"pace": "m/s", "speed": "m/s", "fuel_per_km": "l", "wear_per_km": "tyres"}
+    units = {"pace": "m/s", "speed": "m/s", "fuel_per_km": "l"}
     units |= dict.fromkeys(("slip_angle_front", "slip_angle_rear", *angles), "deg")
+    units |= dict.fromkeys(("overtake", "defend"), "m/s") if family == "resources" else {}
+    units |= dict.fromkeys(("longitudinal_least", "lateral_least"), "m") if family == "aggressiveness" else {}
     domain = Domain(
         name=f"racing_{family}",
         make_env=partial(make_env, **options),
