@@ -40,6 +40,7 @@ LAMPS: dict[int, Colour] = {
 }
 _PLAIN = palette.SILVER  # ammunition without an element
 _BAR = (2.4, 0.26)  # [m], health bar
+_HIGHEST = 4.6  # [m], of a health bar, so that it is in the picture
 _SHOWN = 0.05  # build-up of an element from which it is shown
 _BOUND_POSTS = 48
 _AHEAD = 4.0  # [m], from the player to what the camera looks at
@@ -174,8 +175,11 @@ class CombatStage:
                 part = removable(int(kinds.argmax()), size, offset)
                 shown = part if s["count"][slot, enemy] > 0 else _vanished(part)
                 parts.figure(shown, above(ground, radius), turn)
-        top = above(ground, 2.6 * radius + 0.8)
-        _health_bar(parts, top, hp / full, math.radians(self.viewpoint.azimuth) + (self._heading or 0.0))
+        azimuth, height = math.radians(self.viewpoint.azimuth) + (self._heading or 0.0), 2.6 * radius + 0.8
+        top = above(ground, min(height, _HIGHEST))
+        if height > _HIGHEST:  # the bar of a tall machine is in front of it
+            top += 1.6 * radius * np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
+        _health_bar(parts, top, hp / full, azimuth)
         active = [e for i, e in enumerate(ELEMENTS) if s["state_timer"][i, enemy] > 0]
         for index, element in enumerate(active):
             ring = 2 * radius + 1.0 + 0.7 * index
