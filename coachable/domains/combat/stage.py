@@ -45,8 +45,6 @@ _SHOWN = 0.05  # build-up of an element from which it is shown
 _BOUND_POSTS = 48
 _AHEAD = 4.0  # [m], from the player to what the camera looks at
 _LAG = 0.3  # share by which the camera turns towards the nearest machine in a control step
-_ARC = math.radians(60.0)  # of a bite, to either side
-_RAYS = 15
 
 
 class CombatStage:
@@ -242,11 +240,11 @@ def _warning(
     if kind == "area":
         glows.cylinder((*place, 0.06), (2 * reach, 2 * reach, 0.06), colour)
         return
-    angles = np.linspace(-_ARC, _ARC, _RAYS) if kind == "cone" else np.zeros(1)
-    width = {"cone": 0.06 * reach, "charge": 2 * radius}.get(kind, 0.3)
-    for angle in yaw + angles:
-        middle = place + reach / 2 * np.array([math.cos(angle), math.sin(angle)])
-        glows.box((*middle, 0.06), (reach, width, 0.04), colour, about_z(float(angle)))
+    if kind == "cone":
+        glows.sector((*place, 0.06), (2 * reach, 2 * reach, 0.06), colour, about_z(yaw))
+        return
+    middle = place + reach / 2 * np.array([math.cos(yaw), math.sin(yaw)])
+    glows.box((*middle, 0.06), (reach, 2 * radius if kind == "charge" else 0.3, 0.04), colour, about_z(yaw))
 
 
 def _ground_marks(s: Mapping[str, np.ndarray], glows: Parts) -> Parts:
