@@ -136,7 +136,7 @@ export class RecordedPanel {
         }
         const text = found === null ? "–" : shortOf(measure, found);
         const shift = anchor === "start" ? -half : anchor === "end" ? half : 0;
-        drawn.push(shape("text", { class: here, x: x + shift, style: `text-anchor: ${anchor}`, y: (found === null ? up(0) : Math.min(up(found), up(0))) - 4 }, text));
+        drawn.push(shape("text", { class: `${here} ${anchor}`, x: x + shift, y: (found === null ? up(0) : Math.min(up(found), up(0))) - 4 }, text));
         if (asked.length) drawn.push(shape("line", { x1: x - half - 2, x2: x + half + 2, y1: up(value), y2: up(value) }));
         return drawn;
       });
