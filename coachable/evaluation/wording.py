@@ -23,6 +23,16 @@ def readable_number(value: float, unit: str = "") -> str:
     return f"{number} {unit}".rstrip()
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a number of things, such as "1 episode" or "20 episodes".
+
+    Args:
+        count: The number.
+        noun: What is counted, in the singular.
+    """
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def measures_by_parameter(
     space: StyleSpace, names: Iterable[str], beside: Mapping[str, str] | None = None
 ) -> dict[str, list[str]]:
@@ -59,6 +69,21 @@ def unit_of(domain: Domain, space: StyleSpace, name: str) -> str:
     """
     parameter = name.removesuffix("_error")
     return domain.units.get(name) or (getattr(space[parameter], "unit", "") if parameter in space else "")
+
+
+def heading_of(domain: Domain, space: StyleSpace, column: str, form: str = "") -> str:
+    """Return the heading of a published column with its unit, such as "power [W]".
+
+    Args:
+        domain: The domain.
+        space: The style space.
+        column: Name of the column, which may begin with `measured_`.
+        form: Format of its values; shares have no unit.
+    """
+    name = column.removeprefix("measured_")
+    text = f"measured {domain.words.name(name)}" if name != column else domain.words.name(name)
+    unit = "" if form.endswith("%") else unit_of(domain, space, name)
+    return f"{text} [{unit}]" if unit else text
 
 
 def measured_text(domain: Domain, space: StyleSpace, name: str, value: float) -> str:
