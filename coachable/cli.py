@@ -6,19 +6,18 @@ import math
 import runpy
 import sys
 import time
-import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from coachable import __version__
+from coachable.coach.sources import SOURCE_HELP, located, require_agent
 from coachable.gl import RenderingError, choose_gl_backend
 
 __all__ = ["main"]
 
 _LARGEST = 2**31 - 1
 _PICTURES = (".png", ".svg", ".pdf")
-_SOURCE_HELP = "a run's folder, a checkpoint, a weights file, an exported model, or a domain that ships with weights"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -73,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
         parser = commands.add_parser(name, help=text)
         parser.set_defaults(run=run)
         if source:
-            parser.add_argument("source", help=source)
+            parser.add_argument("source", type=located, help=source)
         return parser
 
     train = command("train", _train, "train an agent with a recipe, as python recipes/RECIPE.py does")
@@ -82,14 +81,14 @@ def _parser() -> argparse.ArgumentParser:
         "arguments", nargs=argparse.REMAINDER, help="KEY=VALUE ... seeds=0,1,2, or --help for all of them"
     )
 
-    evaluate = command("evaluate", _evaluate, "measure every style of an agent: tables and a figure", _SOURCE_HELP)
+    evaluate = command("evaluate", _evaluate, "measure every style of an agent: tables and a figure", SOURCE_HELP)
     _add_out(evaluate, "evaluation", "folder")
     _add_number(evaluate, "--episodes", 20, "per style")
     _add_number(evaluate, "--switch-episodes", 60, "with switching styles, 0 for none", lowest=0)
     _add_rollout(evaluate)
     evaluate.epilog = ENV_OPTIONS
 
-    render = command("render", _render, "film an agent whose style is switched while it acts", _SOURCE_HELP)
+    render = command("render", _render, "film an agent whose style is switched while it acts", SOURCE_HELP)
     _add_out(render, "coachable.mp4", ".mp4, .gif, .webp or .png")
     text = "one request, NAME=VALUE,NAME=VALUE; repeat it to switch (default: a tour of the styles)"
     render.add_argument("--style", action="append", type=_style, dest="styles", metavar="NAME=VALUE,...", help=text)
@@ -117,7 +116,8 @@ def _parser() -> argparse.ArgumentParser:
     weights.add_argument("out", type=Path, help="the file, such as weights.pt")
 
     report = command("report", _report, "write all measurements of an agent on one page")
-    report.add_argument("sources", nargs="+", metavar="source", help=f"{_SOURCE_HELP}; several: one per training seed")
+    text = f"{SOURCE_HELP}; several: one per training seed"
+    report.add_argument("sources", nargs="+", type=located, metavar="source", help=text)
     _add_out(report, "report", "folder")
     _add_number(report, "--seeds", 5, "runs of a single agent")
     _add_number(report, "--episodes", 4, "per run and style")
@@ -125,13 +125,13 @@ def _parser() -> argparse.ArgumentParser:
     _add_number(report, "--sweep-points", 5, "values of each weight", lowest=2)
     _add_rollout(report)
 
-    explain = command("explain", _explain, "rank the inputs of an agent, by SHAP and saliency", _SOURCE_HELP)
+    explain = command("explain", _explain, "rank the inputs of an agent, by SHAP and saliency", SOURCE_HELP)
     _add_out(explain, "explanation", "folder")
     _add_number(explain, "--episodes", 100, "trajectories", lowest=2)
     _add_number(explain, "--states", 16, "of each trajectory")
     _add_rollout(explain)
 
-    export = command("export", _export, "write the policy as one ONNX file, to run it without torch", _SOURCE_HELP)
+    export = command("export", _export, "write the policy as one ONNX file, to run it without torch", SOURCE_HELP)
     target = export.add_mutually_exclusive_group()
     target.add_argument("--out", type=Path, default=Path("policy.onnx"), help="(default: %(default)s)")
     text = "write a page instead, on which the agent acts in the visitor's browser, or plays recordings"
@@ -144,7 +144,7 @@ def _parser() -> argparse.ArgumentParser:
     text = "whose environment is compared with the recording (default: the model's own, if it is installed)"
     verify.add_argument("--domain", metavar="NAME", help=text)
 
-    add_parser(commands, _SOURCE_HELP, _coach)
+    add_parser(commands, SOURCE_HELP, _coach)
 
     command("doctor", _doctor, "check this installation")
     return parser
@@ -291,7 +291,8 @@ def _verify(options: argparse.Namespace) -> int:
 
 
 def _coach(options: argparse.Namespace) -> int:
-    _require_agent(options.source)  # before the page's address is announced
+    options.source = located(options.source)
+    require_agent(options.source)  # before the page's address is announced
     from coachable.coach.page.command import serve
 
     serve(say=lambda text: print(text, flush=True), **_arguments(options))
@@ -309,22 +310,6 @@ def _doctor(_options: argparse.Namespace) -> int:
 
 def _arguments(options: argparse.Namespace) -> dict[str, Any]:
     return {name: value for name, value in vars(options).items() if name not in ("run", "command")}
-
-
-def _require_agent(source: str) -> None:
-    """Check that a source can be an agent, without importing torch, which takes seconds.
-
-    Raises:
-        ValueError: If it cannot; the message lists the agents that ship with weights.
-    """
-    shipped = Path(__file__).parent / "pretrained"
-    if source and ((shipped / source / "weights.pt").is_file() or Path(source).is_dir()):
-        return
-    names = ", ".join(sorted(path.parent.name for path in shipped.glob("*/weights.pt")))
-    if not source or not Path(source).exists():
-        raise ValueError(f"there is no agent {source!r}: expected {_SOURCE_HELP} ({names})")
-    if not source.endswith(".onnx") and not zipfile.is_zipfile(source):
-        raise ValueError(f"{source} is no weights file: expected {_SOURCE_HELP} ({names})")
 
 
 def _at_least(lowest: int) -> Callable[[str], int]:

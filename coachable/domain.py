@@ -81,11 +81,13 @@ class Control:
         parameter: Name, range, unit and neutral value.
         apply: Function that writes a value into the base environment.
         circular: Whether values wrap around at the ends of the range, as angles do.
+        rate: Largest change per second while a new value is approached, in the parameter's unit; None for at once.
     """
 
     parameter: Setpoint
     apply: Callable[[EnvBase, float], None]
     circular: bool = False
+    rate: float | None = None
 
     def fit(self, value: float) -> float:
         """Wrap a value around or clamp it to the control's range.
@@ -161,8 +163,7 @@ class Recorded:
         alike: Function from a number of episodes to options of `make_env` with which that many episodes begin alike, so
             that styles can be compared; by default they begin differently.
         columns: Measures that the page shows, with the format of their values; None for the domain's `columns`.
-        beside: Style parameter beside which the page shows a measure, by the measure's name; a measured parameter is
-            shown beside itself.
+        opens: Number of the style that the page shows at first; by default the last one, which asks for most.
         title: Title of the page; "" for one from the domain's name.
         summary: One sentence for the visitor.
     """
@@ -171,7 +172,7 @@ class Recorded:
     seconds: float = 30.0
     alike: Callable[[int], Mapping[str, Any]] | None = None
     columns: Mapping[str, str] | None = None
-    beside: Mapping[str, str] = field(default_factory=dict)
+    opens: int = -1
     title: str = ""
     summary: str = "Ask for a style, and see what the agent does and what is measured."
 
@@ -184,13 +185,19 @@ class Words:
         vocabulary: Phrases by meaning; see `coachable.coach.phrases.grammar.StyleGrammar`.
         presets: Named styles.
         examples: Phrases that the phrase box suggests.
+        names: What parameters and measures are called on pages, if not by their own names without underscores.
         terminated: Verb for a terminated episode in the past tense, such as "fell" in "the agent fell".
     """
 
     vocabulary: Mapping[str, Sequence[str]] = field(default_factory=dict)
     presets: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     examples: Sequence[str] = ()
+    names: Mapping[str, str] = field(default_factory=dict)
     terminated: str = "ended"
+
+    def name(self, name: str) -> str:
+        """Return what a parameter or a measure is called on pages."""
+        return self.names.get(name, name.replace("_", " "))
 
 
 class _WorkedOut:
@@ -244,6 +251,7 @@ class Domain:
         targets: Largest value of a metric that is wanted as its median over the styles, by name.
         columns: Metrics of the published table, in order, with the format of their values; by default all.
         units: Units of measured quantities by name, for the axes of figures and the page of `coachable coach`.
+        beside: Style parameter that a measure tells about, by the measure's name, where its name does not contain it.
         observation_groups: Blocks of the observation, in order, for explanations and exported models; by default every
             entry is explained on its own.
         action_groups: Blocks of the action, in order, for exported models.
@@ -272,6 +280,7 @@ class Domain:
     targets: Mapping[str, float] = field(default_factory=dict)
     columns: Mapping[str, str] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
+    beside: Mapping[str, str] = field(default_factory=dict)
     observation_groups: Sequence[Signal] = ()
     action_groups: Sequence[Signal] = ()
     controls: Sequence[Control] = ()

@@ -119,6 +119,20 @@ def test_the_page_is_opened_for_an_agent(source, monkeypatch, tmp_path):
     assert opened == [source]
 
 
+def test_a_shipped_agent_goes_before_a_folder_that_is_no_run(monkeypatch, tmp_path):
+    opened = []
+    monkeypatch.setattr("coachable.coach.page.command.serve", lambda **settings: opened.append(settings["source"]))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "humanoid").mkdir()
+    (tmp_path / "humanoid" / "notes.txt").write_text("of my own")
+    assert main(["coach", "humanoid"]) == 0
+    assert Path(opened.pop()).parts[-3:] == ("pretrained", "humanoid", "weights.pt")
+    assert main(["export", "humanoid", "--out", "humanoid.onnx"]) == 0
+    (tmp_path / "humanoid" / "checkpoints").mkdir()  # a run goes before the shipped agent
+    assert main(["coach", "humanoid"]) == 0
+    assert opened == ["humanoid"]
+
+
 def test_another_file_is_no_agent(capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "README.md").write_text("# Not an agent\n")

@@ -24,6 +24,7 @@ from coachable.evaluation.style_grid import (
     write_results,
 )
 from coachable.evaluation.switching import SwitchReport, evaluate_switching
+from coachable.evaluation.wording import counted
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
 
@@ -77,7 +78,7 @@ def evaluate_styles(
         switching = evaluate_switching(domain, agent.actor, agent.space, episodes=switch_episodes, **settings.rollout)
     tables = {"grid": grid.rows(), "response": grid.response(agent.space)}
     tables |= {"medians": median_rows(domain, grid), "trials": trials}
-    title = f"{domain.name}: {episodes} episodes of {grid.steps} steps per style, 95 % intervals"
+    title = f"{domain.name}: {counted(episodes, 'episode')} of {grid.steps} steps per style, 95 % intervals"
     draw_style_grid(grid, domain, agent.space, out / "grid.png", title)
     report = _report(domain, agent, grid, tables, switching, switch_episodes)
     return write_results(out, report, _summary(grid, tables, switching), tables), grid
@@ -168,7 +169,7 @@ def _report(
     columns = {name: ".6g" if isinstance(value, float) else "" for name, value in grid.cells[0].items()}
     columns |= published(domain, grid.episodes)
     text = f"# {domain.name}: requested and measured style\n\n"
-    text += f"{policy_sentence(agent)}; {rows[0]['episodes']} episodes of "
+    text += f"{policy_sentence(agent)}; {counted(int(rows[0]['episodes']), 'episode')} of "
     text += f"{grid.steps} steps per style, seed {grid.seed}.\n\n![style grid](grid.png)\n\n"
     text += markdown_table(rows, columns)
     if medians:
@@ -189,7 +190,7 @@ def _report(
         return text
     times = switching.comply_seconds
     median = f"{times.median():.2f} s" if len(times) else "never"
-    text += f"\n## Style switched at random every 100 steps ({switch_episodes} episodes)\n\n"
+    text += f"\n## Style switched at random every 100 steps ({counted(switch_episodes, 'episode')})\n\n"
     text += markdown_table([switching.metrics], dict.fromkeys(switching.metrics, ".3f"))
     if not switching.switches:
         return text + "\nThe episodes are too short for a switch.\n"

@@ -23,6 +23,7 @@ from coachable.scene.palette import css
 from coachable.styles import Choice, StyleSpace
 
 _PANELS_PER_ROW = 4
+RARE = 0.2  # shares below this have an axis of their own range
 MARKERS = "osD^vP*X"  # distinguishable without colour as well
 _LOOK = {
     "axes.prop_cycle": cycler(color=list(map(css, LINES))),
@@ -108,7 +109,7 @@ def draw_style_grid(grid: StyleGrid, domain: Domain, space: StyleSpace, path: Pa
                 panel.set_ylabel(f"measured {with_unit(name, space[name].unit)}")
             else:
                 panel.set_ylabel(with_unit(name, domain.units.get(name, "")))
-                if formats.get(column, "").endswith("%"):
+                if formats.get(column, "").endswith("%") and panel.get_ylim()[1] > RARE:
                     panel.set_ylim(-0.03, 1.05)
             panel.set_xlabel(f"requested {with_unit(axis, space[axis].unit)}" if axis else "style, by row of the table")
         if axes[0, 0].get_legend_handles_labels()[1]:

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from coachable.domain import Domain
 from coachable.evaluation.outputs import complete_folder
 from coachable.evaluation.style_grid import published
-from coachable.evaluation.wording import readable
+from coachable.evaluation.wording import measures_by_parameter, readable, unit_of
 from coachable.export.web.pinned_files import provide
 from coachable.export.web.simulated_page import about, copy_page, finish_page
 from coachable.keys import TASK_REWARD
@@ -208,6 +208,7 @@ def _manifest(agent: LoadedPolicy, domain: Domain, requests: list[dict[str, Any]
         "parameters": [
             {
                 "name": parameter.name,
+                "text": domain.words.name(parameter.name),
                 "kind": "choice" if isinstance(parameter, Choice) else "number",
                 "unit": getattr(parameter, "unit", ""),
                 "help": parameter.help,
@@ -215,6 +216,7 @@ def _manifest(agent: LoadedPolicy, domain: Domain, requests: list[dict[str, Any]
             }
             for parameter in agent.space.parameters
         ],
+        "opens": range(len(requests))[domain.recorded.opens],
         "terminated": domain.words.terminated,
         "control_step": domain.control_step,
         "viewpoint": vars(stage.viewpoint),
@@ -225,14 +227,16 @@ def _manifest(agent: LoadedPolicy, domain: Domain, requests: list[dict[str, Any]
 def _measure(domain: Domain, space: StyleSpace, column: str, form: str) -> dict[str, Any]:
     """Return what the page has to know of a published column."""
     name = column.removeprefix("measured_")
-    beside = domain.recorded.beside.get(name, name if name in space.names else "")
-    unit = domain.units.get(name) or (getattr(space[name], "unit", "") if name in space.names else "")
+    groups = measures_by_parameter(space, [name], domain.beside)
+    beside = next(parameter for parameter, measures in groups.items() if measures)
+    unit = unit_of(domain, space, name)
     digits = int("".join(c for c in form.partition(".")[2] if c.isdigit()) or 3)
     return {
         "name": name,
         "parameter": beside,
-        "text": "mean over the recording" if name == beside else readable(name),
+        "text": "mean over the recording" if name == beside else domain.words.name(name),
         "unit": unit,
+        "asked": bool(beside and unit) and unit == getattr(space[beside], "unit", ""),
         "share": form.endswith("%"),
         "digits": digits,
         "significant": form.endswith("g"),

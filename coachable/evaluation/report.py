@@ -28,8 +28,8 @@ from coachable.evaluation.runs import (
     sweep_estimate,
 )
 from coachable.evaluation.style_grid import acting, training_counts, write_csv
-from coachable.evaluation.wording import readable
-from coachable.styles import Setpoint
+from coachable.evaluation.wording import counted, heading_of, readable
+from coachable.styles import Setpoint, StyleSpace
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy, widths_of
 
 __all__ = ["report", "write_report"]
@@ -114,11 +114,12 @@ def write_report(
         agent = next(iter(agents.values()))
         styles = StyleTable(runs, agent.space)
         formats = _formats(styles, domain)
+        titles = _titles(domain, agent.space, styles, formats)
         page = Page(f"{domain.name}: requested and measured style", _lead(agents, runs, episodes))
-        _styles(page, styles, formats, agent, folder)
+        _styles(page, styles, formats, agent, folder, titles)
         _requests(page, styles, agent, runs, folder)
-        _switches(page, domain, runs, switch_episodes, formats, folder)
-        _tradeoffs(page, styles, runs, formats, folder)
+        _switches(page, domain, runs, switch_episodes, formats, folder, titles)
+        _tradeoffs(page, styles, runs, formats, folder, titles)
         if domain.evaluation is not None:
             settings = EvaluationSettings(episodes, switch_episodes, sweeps=runs[0].sweeps, **options)
             _own(page, domain, agent, folder, settings)
@@ -138,6 +139,13 @@ def _formats(styles: StyleTable, domain: Domain) -> dict[str, str]:
     return published or {name: ".0%" if name == "survived" else ".3g" for name in styles.scores}
 
 
+def _titles(domain: Domain, space: StyleSpace, styles: StyleTable, formats: Mapping[str, str]) -> dict[str, str]:
+    """Return headings with units of metrics, by their names and by their columns."""
+    names = {name: formats.get(name, "") for name in styles.scores}
+    own = {name: heading_of(domain, space, name, form) for name, form in names.items()}
+    return own | {c: heading_of(domain, space, c, form) for n, form in names.items() if (c := styles.column(n)) != n}
+
+
 def _lead(agents: Mapping[str, LoadedPolicy], runs: Sequence[Run], episodes: int) -> str:
     (name, agent), *others = agents.items()
     counts = training_counts(agent)
@@ -145,25 +153,32 @@ def _lead(agents: Mapping[str, LoadedPolicy], runs: Sequence[Run], episodes: int
     subject = "Several agents" if others else f"{acting(agent)} of {name}{trained}"
     grid = runs[0].grid
     return (
-        f"{subject}. {len(runs)} runs ({', '.join(run.label for run in runs)}) of {episodes} episodes in each of "
-        f"{len(grid.cells)} styles, up to {grid.steps} steps each. Values are interquartile means over the runs, each "
-        "run counting with the mean of its episodes; in brackets 95 % intervals, by stratified bootstrap over runs. "
-        "An interquartile mean leaves out the lowest and the highest quarter: of shares it tells the typical style, so "
-        "the summary also has the plain mean."
+        f"{subject}. {counted(len(runs), 'run')} ({', '.join(run.label for run in runs)}) of "
+        f"{counted(episodes, 'episode')} in each of {counted(len(grid.cells), 'style')}, up to {grid.steps} steps "
+        "each. Values are interquartile means over the runs, each run counting with the mean of its episodes; in "
+        "brackets 95 % intervals, by stratified bootstrap over runs. An interquartile mean leaves out the lowest and "
+        "the highest quarter: of shares it tells the typical style, so the summary also has the plain mean."
     )
 
 
-def _styles(page: Page, styles: StyleTable, formats: Mapping[str, str], agent: LoadedPolicy, out: Path) -> None:
+def _styles(
+    page: Page,
+    styles: StyleTable,
+    formats: Mapping[str, str],
+    agent: LoadedPolicy,
+    out: Path,
+    titles: Mapping[str, str],
+) -> None:
     metrics = list(formats)
     by_column = {styles.column(name): form for name, form in formats.items()}
     summary, rows = styles.summary(metrics), styles.rows(metrics)
     write_csv([flat_row(row) for row in summary], out / "summary.csv")
     write_csv([flat_row(row) for row in styles.rows(list(styles.scores))], out / "styles.csv")
     free = [name for name in metrics if name not in styles.cells[0]] or metrics
-    draw_metrics(styles, agent.space, free, by_column, out / "styles.png")
-    page.section("Summary", table(summary, by_column))
+    draw_metrics(styles, agent.space, free, by_column, out / "styles.png", titles)
+    page.section("Summary", table(summary, by_column, titles=titles))
     figure = picture(out / "styles.png", "metrics per style, with intervals")
-    page.section("Every style", figure, table(rows, by_column, colour=True))
+    page.section("Every style", figure, table(rows, by_column, colour=True, titles=titles))
 
 
 def _requests(page: Page, styles: StyleTable, agent: LoadedPolicy, runs: Sequence[Run], out: Path) -> None:
@@ -182,7 +197,13 @@ def _requests(page: Page, styles: StyleTable, agent: LoadedPolicy, runs: Sequenc
 
 
 def _switches(
-    page: Page, domain: Domain, runs: Sequence[Run], episodes: int, formats: Mapping[str, str], out: Path
+    page: Page,
+    domain: Domain,
+    runs: Sequence[Run],
+    episodes: int,
+    formats: Mapping[str, str],
+    out: Path,
+    titles: Mapping[str, str],
 ) -> None:
     period = SWITCH_PERIOD * domain.control_step
     draw_switches(runs, period, out / "switches.png")
@@ -197,19 +218,27 @@ def _switches(
     page.section(
         "Styles that change while the agent acts",
         paragraph(
-            f"{episodes} episodes per run, another style every {period:g} s, {switches} switches. "
+            f"{counted(episodes, 'episode')} per run, another style every {period:g} s, "
+            f"{switches} {'switch' if switches == 1 else 'switches'}. "
             "Complied: the agent did what was asked before the next switch."
         ),
         picture(out / "switches.png", "share of switches complied with over time"),
-        table([row], {**formats, "complied": ".0%", "median_seconds": ".2f"}),
+        table([row], {**formats, "complied": ".0%", "median_seconds": ".2f"}, titles=titles),
     )
 
 
-def _tradeoffs(page: Page, styles: StyleTable, runs: Sequence[Run], formats: Mapping[str, str], out: Path) -> None:
+def _tradeoffs(
+    page: Page,
+    styles: StyleTable,
+    runs: Sequence[Run],
+    formats: Mapping[str, str],
+    out: Path,
+    titles: Mapping[str, str],
+) -> None:
     if not runs[0].sweeps:
         return
     success = _success(runs, formats)
-    draw_tradeoffs(runs, success, formats.get(success, ""), out / "tradeoffs.png")
+    draw_tradeoffs(runs, success, formats.get(success, ""), out / "tradeoffs.png", titles)
     rows = [
         {"weight": sweeps[0].weight, "value": float(value), "style": sweep_estimate(sweeps, sweeps[0].score, i)}
         | {name: sweep_estimate(sweeps, name, i) for name in sweeps[0].episodes}
@@ -226,7 +255,7 @@ def _tradeoffs(page: Page, styles: StyleTable, runs: Sequence[Run], formats: Map
             f"{readable(success)}."
         ),
         picture(out / "tradeoffs.png", "task success against style score along each weight"),
-        table([{name: row[name] for name in kept} for row in rows], formats),
+        table([{name: row[name] for name in kept} for row in rows], formats, titles=titles),
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import PercentFormatter
 
-from coachable.evaluation.figures import MARKERS, drawing, grid_lines, with_unit
+from coachable.evaluation.figures import MARKERS, RARE, drawing, grid_lines, with_unit
 from coachable.evaluation.runs import Estimate, Run, StyleTable, estimate, sweep_estimate
 from coachable.evaluation.sweep import UNIT_REWARD
 from coachable.evaluation.wording import readable
@@ -24,7 +24,12 @@ _GROWTH_POINTS = 200
 
 
 def draw_metrics(
-    table: StyleTable, space: StyleSpace, metrics: Sequence[str], formats: Mapping[str, str], path: Path
+    table: StyleTable,
+    space: StyleSpace,
+    metrics: Sequence[str],
+    formats: Mapping[str, str],
+    path: Path,
+    titles: Mapping[str, str],
 ) -> None:
     """Draw each metric in every style: as lines over a numeric parameter if there is one, else as one point each.
 
@@ -34,10 +39,11 @@ def draw_metrics(
         metrics: Metrics to draw.
         formats: Format specification by column; shares end in "%".
         path: PNG file to write.
+        titles: Labels of the axes by metric.
     """
     axis, lines = grid_lines(table.cells, space)
     if axis is None:
-        _draw_points(table, metrics, formats, path)
+        _draw_points(table, metrics, formats, path, titles)
         return
     with _panels(path, len(metrics)) as panels:
         for panel, metric in zip(panels, metrics, strict=False):
@@ -45,7 +51,7 @@ def draw_metrics(
                 estimates = [table.of(metric, [i]) for i in cells]
                 _line(panel, [table.cells[i][axis] for i in cells], estimates, index, label, len(lines))
             panel.set_xlabel(f"requested {with_unit(axis, space[axis].unit)}")
-            panel.set_ylabel(readable(metric))
+            panel.set_ylabel(titles.get(metric, readable(metric)))
             _as_share(panel, formats.get(table.column(metric), ""))
         _legend(panels[0], len(lines))
 
@@ -98,7 +104,7 @@ def draw_switches(runs: Sequence[Run], period_seconds: float, path: Path) -> Non
         _as_share(panel, ".0%")
 
 
-def draw_tradeoffs(runs: Sequence[Run], success: str, form: str, path: Path) -> None:
+def draw_tradeoffs(runs: Sequence[Run], success: str, form: str, path: Path, titles: Mapping[str, str]) -> None:
     """Draw task success over the amount of style along each weight, from neutral to maximum (Pareto curves).
 
     Args:
@@ -106,6 +112,7 @@ def draw_tradeoffs(runs: Sequence[Run], success: str, form: str, path: Path) -> 
         success: Metric of task success.
         form: Format of its values, such as ".0%".
         path: Image file to write.
+        titles: Labels of the axes by metric.
     """
     with _panels(path, len(runs[0].sweeps)) as panels:
         for panel, sweeps in zip(panels, zip(*(run.sweeps for run in runs), strict=True), strict=False):
@@ -120,22 +127,25 @@ def draw_tradeoffs(runs: Sequence[Run], success: str, form: str, path: Path) -> 
                     panel.annotate(f"{value:g}", point, (5, 5), textcoords="offset points", fontsize=8)
             panel.set_title(readable(sweeps[0].weight), fontsize=10)
             unit_reward = "style reward per step at weight 1"
-            panel.set_xlabel(unit_reward if score == UNIT_REWARD else f"measured {readable(score)}")
-            panel.set_ylabel(readable(success))
+            panel.set_xlabel(unit_reward if score == UNIT_REWARD else f"measured {titles.get(score, readable(score))}")
+            panel.set_ylabel(titles.get(success, readable(success)))
             _as_share(panel, form)
 
 
-def _draw_points(table: StyleTable, metrics: Sequence[str], formats: Mapping[str, str], path: Path) -> None:
+def _draw_points(
+    table: StyleTable, metrics: Sequence[str], formats: Mapping[str, str], path: Path, titles: Mapping[str, str]
+) -> None:
     height = 0.9 + 0.22 * len(table.cells)
     with drawing(path, 1, len(metrics), size=(2.2 + 2.6 * len(metrics), height), sharey=True) as panels:
         rows = list(range(len(table.cells)))
         for panel, metric in zip(panels[0], metrics, strict=True):
             estimates = [table.of(metric, [i]) for i in rows]
             panel.errorbar([e.value for e in estimates], rows, xerr=_reach(estimates), fmt="o", ms=4, capsize=2)
-            panel.set_xlabel(readable(metric))
+            panel.set_xlabel(titles.get(metric, readable(metric)))
             if formats.get(table.column(metric), "").endswith("%"):
-                panel.set_xlim(-0.03, 1.03)
-                panel.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+                rare = panel.get_xlim()[1] < RARE
+                panel.set_xlim(*((None, None) if rare else (-0.03, 1.03)))
+                panel.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=None if rare else 0))
         panels[0, 0].set_yticks(rows, table.labels, fontsize=8)
         panels[0, 0].invert_yaxis()
 
@@ -174,5 +184,6 @@ def _legend(panel: Axes, entries: int) -> None:
 
 def _as_share(panel: Axes, form: str) -> None:
     if form.endswith("%"):
-        panel.set_ylim(-0.03, 1.05)
-        panel.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+        rare = panel.get_ylim()[1] < RARE
+        panel.set_ylim(*((None, None) if rare else (-0.03, 1.05)))
+        panel.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=None if rare else 0))

@@ -123,23 +123,29 @@ def picture(path: Path, description: str) -> str:
     )
 
 
-def table(rows: Sequence[Mapping[str, Any]], formats: Mapping[str, str], colour: bool = False) -> str:
+def table(
+    rows: Sequence[Mapping[str, Any]],
+    formats: Mapping[str, str],
+    colour: bool = False,
+    titles: Mapping[str, str] | None = None,
+) -> str:
     """Return rows as an HTML table.
 
     Args:
         rows: Values by column name; an `Estimate` is shown with its interval.
         formats: Format specification of numbers by column or metric; by default ".3g".
         colour: Whether to shade the estimates of a column, the highest value most.
+        titles: Headings by column or metric; by default their readable names.
     """
-    columns = list(rows[0])
+    columns, titles = list(rows[0]), titles or {}
     numeric = {c for c in columns if any(isinstance(row[c], Estimate | float | int) for row in rows)}
     ranges = {c: _range([row[c].value for row in rows if isinstance(row[c], Estimate)]) for c in columns}
-    head = "".join(f"<th{_class(c in numeric)}>{html.escape(readable(c))}</th>" for c in columns)
+    head = "".join(f"<th{_class(c in numeric)}>{html.escape(titles.get(c, readable(c)))}</th>" for c in columns)
     lines = []
     for row in rows:
         cells = []
         for column in columns:
-            value = row[column]
+            value = titles.get(row[column], row[column]) if column == "metric" else row[column]
             form = formats.get(str(row.get("metric", "")), formats.get(column, ".3g"))
             shade = _shade(value, ranges[column]) if colour and isinstance(value, Estimate) else ""
             cells.append(f"<td{_class(column in numeric)}{shade}>{_cell(value, form)}</td>")

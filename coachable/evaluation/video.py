@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from coachable.domain import Domain
 from coachable.evaluation.outputs import complete_file
-from coachable.evaluation.wording import measures_by_parameter, readable, readable_number
+from coachable.evaluation.wording import measured_text, measures_by_parameter, readable, readable_number
 from coachable.extras import how_to_install
 from coachable.scene.look import DARK
 from coachable.scene.renderer import SceneRenderer
@@ -250,25 +250,16 @@ def _measured_line(
     record = {name: torch.stack([row[name] for row in recent]) for name in recent[0]}
     measured = domain.measures.summarise(record, torch.ones(len(recent), 1, dtype=torch.bool))
     known = {name: value.item() for name, value in measured.items() if not bool(value.isnan().any())}
-    owned = measures_by_parameter(space, known)
+    owned = measures_by_parameter(space, known, domain.beside)
     asked = [name for name in space.names if style[name] or not isinstance(space[name], Weight)]
     columns = [name.removeprefix("measured_") for name in domain.columns]
     ranked = [*(m for name in asked for m in owned[name] if not m.endswith("_error"))]
     ranked += [name for name in columns if name in domain.units] or ([] if ranked else columns)
     names = [name for name in dict.fromkeys(ranked) if name in known] or list(known)
     names = names[: _FEWEST if short else _MOST]
-    shown = ", ".join(f"{readable(name)} {_measured_value(domain, space, name, known[name])}" for name in names)
+    shown = ", ".join(f"{domain.words.name(name)} {measured_text(domain, space, name, known[name])}" for name in names)
     count = "" if not failures or short else f"; {failures} {'failure' if failures == 1 else 'failures'}"
     return f"measured: {shown or 'nothing yet'}{count}"
-
-
-def _measured_value(domain: Domain, space: StyleSpace, name: str, value: float) -> str:
-    """Return a measured value as the domain publishes it, or else with three digits, with its unit."""
-    form = domain.columns.get(name, domain.columns.get(f"measured_{name}", ""))
-    if form.endswith("%"):
-        return format(value, form)
-    unit = domain.units.get(name, getattr(space[name], "unit", "") if name in space else "")
-    return f"{format(value, form)} {unit}".rstrip() if form else readable_number(value, unit)
 
 
 def caption(frame: np.ndarray, lines: tuple[str, str]) -> np.ndarray:

@@ -1,8 +1,9 @@
 """Names and numbers as text for people, and which measures tell about which parameter."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
+from coachable.domain import Domain
 from coachable.styles import StyleSpace
 
 
@@ -22,7 +23,19 @@ def readable_number(value: float, unit: str = "") -> str:
     return f"{number} {unit}".rstrip()
 
 
-def measures_by_parameter(space: StyleSpace, names: Iterable[str]) -> dict[str, list[str]]:
+def counted(count: int, noun: str) -> str:
+    """Return a number of things, such as "1 episode" or "20 episodes".
+
+    Args:
+        count: The number.
+        noun: What is counted, in the singular.
+    """
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def measures_by_parameter(
+    space: StyleSpace, names: Iterable[str], beside: Mapping[str, str] | None = None
+) -> dict[str, list[str]]:
     """Group measures by the parameter that they belong to; those of no parameter are listed under "".
 
     A measure belongs to the parameter whose name is part of its own, word by word: `pose_held` to `pose`,
@@ -31,6 +44,7 @@ def measures_by_parameter(space: StyleSpace, names: Iterable[str]) -> dict[str, 
     Args:
         space: The style space.
         names: Names of the measures.
+        beside: Parameters by measure where the names do not tell, as `Domain.beside`. These measures come first.
 
     Example:
         >>> from coachable.styles import Setpoint
@@ -38,8 +52,51 @@ def measures_by_parameter(space: StyleSpace, names: Iterable[str]) -> dict[str, 
         {'gap': ['gap', 'gap_error'], '': ['speed']}
     """
     groups: dict[str, list[str]] = {name: [] for name in space.names} | {"": []}
-    by_length = sorted(space.names, key=len, reverse=True)
-    for measure in names:
+    by_length, known = sorted(space.names, key=len, reverse=True), beside or {}
+    for measure in sorted(names, key=lambda name: name not in known):  # stable, so otherwise in the given order
         owner = next((name for name in by_length if f"_{name}_" in f"_{measure}_"), "")
-        groups[owner].append(measure)
+        groups[known.get(measure, owner)].append(measure)
     return groups
+
+
+def unit_of(domain: Domain, space: StyleSpace, name: str) -> str:
+    """Return the unit of a measure: the domain's, or that of the parameter that the measure or its error belongs to.
+
+    Args:
+        domain: The domain.
+        space: The style space.
+        name: Name of the measure.
+    """
+    parameter = name.removesuffix("_error")
+    return domain.units.get(name) or (getattr(space[parameter], "unit", "") if parameter in space else "")
+
+
+def heading_of(domain: Domain, space: StyleSpace, column: str, form: str = "") -> str:
+    """Return the heading of a published column with its unit, such as "power [W]".
+
+    Args:
+        domain: The domain.
+        space: The style space.
+        column: Name of the column, which may begin with `measured_`.
+        form: Format of its values; shares have no unit.
+    """
+    name = column.removeprefix("measured_")
+    text = f"measured {domain.words.name(name)}" if name != column else domain.words.name(name)
+    unit = "" if form.endswith("%") else unit_of(domain, space, name)
+    return f"{text} [{unit}]" if unit else text
+
+
+def measured_text(domain: Domain, space: StyleSpace, name: str, value: float) -> str:
+    """Return a measured value with its unit, in the format in which the domain publishes it or else with three digits.
+
+    Args:
+        domain: The domain.
+        space: The style space.
+        name: Name of the measure.
+        value: Its value.
+    """
+    form = domain.columns.get(name, domain.columns.get(f"measured_{name}", ""))
+    if form.endswith("%"):
+        return format(value, form)
+    unit = unit_of(domain, space, name)
+    return f"{format(value, form)} {unit}".rstrip() if form else readable_number(value, unit)

@@ -13,9 +13,13 @@ from coachable.scene.palette import Colour
 Numbers = Sequence[float] | np.ndarray
 """Coordinates, sizes or a quaternion."""
 
-BOX, BALL, CYLINDER = "box", "ball", "cylinder"
-SHAPES = (BOX, BALL, CYLINDER)
-"""Shapes; a box, ellipsoid or upright cylinder of size (1, 1, 1) fits into the unit cube around the origin."""
+BOX, BALL, CYLINDER, SECTOR = "box", "ball", "cylinder", "sector"
+SHAPES = (BOX, BALL, CYLINDER, SECTOR)
+"""Shapes; a box, ellipsoid or upright cylinder of size (1, 1, 1) fits into the unit cube around the origin.
+
+A sector is the part of the cylinder's upper side that lies within `SECTOR_ANGLE` of the x axis, seen from above.
+"""
+SECTOR_ANGLE = math.radians(60.0)
 
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
@@ -87,6 +91,19 @@ class Parts:
             wxyz: Rotation as unit quaternion (4,).
         """
         return self._add(CYLINDER, position, size, colour, wxyz)
+
+    def sector(self, position: Numbers, size: Numbers, colour: Colour, wxyz: Numbers = _UPRIGHT) -> Parts:
+        """Add a flat sector of a disc, which opens along its x axis, and return this collection.
+
+        Films show it only among the translucent primitives.
+
+        Args:
+            position: Tip of the sector, and middle of the disc (3,) [m].
+            size: Diameters of the disc, and its height (3,) [m].
+            colour: Red, green and blue, 0 to 255.
+            wxyz: Rotation as unit quaternion (4,).
+        """
+        return self._add(SECTOR, position, size, colour, wxyz)
 
     def capsule(self, start: Numbers, end: Numbers, radius: float, colour: Colour) -> Parts:
         """Add a cylinder between two points with a ball at each end, and return this collection.
@@ -267,6 +284,8 @@ def unit_mesh(shape: str) -> tuple[np.ndarray, np.ndarray]:
     """
     if shape == BOX:
         return _unit_box()
+    if shape == SECTOR:
+        return _unit_sector()
     return _unit_ball() if shape == BALL else _unit_cylinder()
 
 
@@ -306,6 +325,13 @@ def _unit_ball(around: int = 20, rings: int = 9) -> tuple[np.ndarray, np.ndarray
     count, rim = len(points), np.arange(around)
     caps = [_fan(count, rim, False), _fan(count + 1, count - around + rim, True)]
     return np.concatenate([points, poles]), np.concatenate([_around(rings, around), *caps])
+
+
+def _unit_sector(around: int = 12) -> tuple[np.ndarray, np.ndarray]:
+    angle = np.linspace(-SECTOR_ANGLE, SECTOR_ANGLE, around + 1)
+    rim = np.stack([np.cos(angle) / 2, np.sin(angle) / 2, np.full(around + 1, 0.5)], -1)
+    index = np.arange(1, around + 1)
+    return np.concatenate([[[0.0, 0.0, 0.5]], rim]), np.stack([np.zeros(around, int), index, index + 1], -1)
 
 
 def _unit_cylinder(around: int = 20) -> tuple[np.ndarray, np.ndarray]:

@@ -14,12 +14,13 @@ from coachable.offscreen import OffscreenMujoco
 from coachable.scene.between import between, continues
 from coachable.scene.frame import Backdrop, Frame, Gauge, Map, Stage
 from coachable.scene.palette import AIR, HAZE, INK, WHITE, mixed
-from coachable.scene.parts import BALL, BOX, CYLINDER, SHAPES
+from coachable.scene.parts import BALL, BOX, CYLINDER, SECTOR, SHAPES, rotated, unit_mesh
 
 _GEOMS = {
     BOX: mujoco.mjtGeom.mjGEOM_BOX,
     BALL: mujoco.mjtGeom.mjGEOM_ELLIPSOID,
     CYLINDER: mujoco.mjtGeom.mjGEOM_CYLINDER,
+    SECTOR: mujoco.mjtGeom.mjGEOM_TRIANGLE,  # several of them
 }
 _NARROW, _FEW = 480, 4  # [px], width below which only the first gauges are drawn, and how many
 _BAR = 0.26  # of the width, least length of a gauge's bar
@@ -238,12 +239,29 @@ def _decorate(scene: mujoco.MjvScene, frame: Frame) -> None:
             for at, wxyz, size, colour in zip(batch.positions, batch.wxyzs, batch.sizes, colours, strict=True):
                 if scene.ngeom == scene.maxgeom:
                     return
+                if shape == SECTOR:
+                    _fan(scene, at, wxyz, size, colour)
+                    continue
                 mujoco.mju_quat2Mat(turn, wxyz)
                 geom = scene.geoms[scene.ngeom]
                 mujoco.mjv_initGeom(geom, _GEOMS[shape], size / 2, at, turn, colour.astype(np.float32))
                 geom.size[:] = size / 2  # also of cylinders, which may be elliptic
                 geom.specular, geom.category = 0.1, mujoco.mjtCatBit.mjCAT_DYNAMIC
                 scene.ngeom += 1
+
+
+def _fan(scene: mujoco.MjvScene, at: np.ndarray, wxyz: np.ndarray, size: np.ndarray, colour: np.ndarray) -> None:
+    """Add a sector as triangles; those of MuJoCo lie between two axes, which need not be orthogonal."""
+    corners, faces = unit_mesh(SECTOR)
+    corners = rotated(wxyz, corners * size)
+    for tip, one, other in corners[faces]:
+        if scene.ngeom == scene.maxgeom:
+            return
+        geom = scene.geoms[scene.ngeom]
+        axes = np.stack([one - tip, other - tip, rotated(wxyz, np.array([[0.0, 0.0, 1.0]]))[0]], axis=1)
+        mujoco.mjv_initGeom(geom, _GEOMS[SECTOR], np.ones(3), at + tip, axes.ravel(), colour.astype(np.float32))
+        geom.specular, geom.category = 0.1, mujoco.mjtCatBit.mjCAT_DYNAMIC
+        scene.ngeom += 1
 
 
 _STILL = {"contype": 0, "conaffinity": 0}

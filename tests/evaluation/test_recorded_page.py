@@ -53,6 +53,8 @@ def test_the_page_tells_what_the_evaluation_measures(changed, tmp_path):
     )
     expected = domain.measures.summarise(record.measures, record.alive)
     assert {measure["name"]: measure["parameter"] for measure in manifest["measures"]}["fuel_per_km"] == "fuel"
+    assert manifest["opens"] == 3, "the page opens with the strongest request"
+    assert {parameter["text"] for parameter in manifest["parameters"]} >= {"tyres", "fuel"}
     for name in ("pace", "wear_per_km", "fuel_per_km"):
         values = [row["measured"][name] for row in manifest["recordings"]]
         assert values == pytest.approx(expected[name].tolist())

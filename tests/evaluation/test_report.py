@@ -10,7 +10,7 @@ import torch
 from tensordict.nn import TensorDictModule
 
 from coachable.cli import main
-from coachable.domain import Domain
+from coachable.domain import Domain, load_domain
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.report import report, write_report
 from coachable.evaluation.report_page import shown, table
@@ -18,6 +18,7 @@ from coachable.evaluation.runs import Estimate, Run, StyleTable, describe, estim
 from coachable.evaluation.style_grid import StyleGrid
 from coachable.evaluation.sweep import sweep_weights
 from coachable.evaluation.switching import SwitchReport
+from coachable.evaluation.wording import counted, heading_of
 from coachable.scene.look import TITLE, icon_link, stylesheet
 from coachable.styles import Choice, Setpoint, StyleReward, StyleSpace, Weight, WeightedFeature
 from coachable.training.weights import LoadedPolicy, load_policy
@@ -230,3 +231,13 @@ def test_how_numbers_are_written():
     assert describe({"pose": "t_pose", "step_length": 0.5}) == "t pose, step length 0.5"
     text = table([{"style": "<b>", "score": Estimate(1.0, 0.5, 2.0)}], {"score": ".1f"}, colour=True)
     assert "&lt;b&gt;" in text and "1.0 <small>[0.5, 2.0]</small>" in text
+
+
+def test_headings_have_units_and_one_is_singular():
+    domain = load_domain("humanoid")
+    space = domain.make_space()
+    assert heading_of(domain, space, "power", ".0f") == "power [W]"
+    assert heading_of(domain, space, "measured_step_length", ".3f") == "measured step length [m]"
+    assert heading_of(domain, space, "step_length_error", ".3f") == "step length error [m]"
+    assert heading_of(domain, space, "survived", ".0%") == "survived"
+    assert (counted(1, "episode"), counted(2, "episode")) == ("1 episode", "2 episodes")

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
+from coachable.envs.combat.constants import CONE_COSINE
 from coachable.scene import palette
 from coachable.scene.between import between, continues
 from coachable.scene.frame import Frame, Map
 from coachable.scene.parts import (
+    SECTOR_ANGLE,
     SHAPES,
     Batch,
     Parts,
@@ -31,6 +33,16 @@ def test_unit_meshes_are_closed_and_face_outwards(shape, volume):
     assert (np.cross(a, b) * c).sum() / 6 == pytest.approx(volume, rel=0.05)
     assert np.cross(b - a, c - a).sum(0) == pytest.approx(0.0, abs=1e-9), "the surface has a hole"
     assert np.abs(vertices).max() == pytest.approx(0.5)
+
+
+def test_a_sector_is_a_third_of_a_disc_and_faces_up():
+    vertices, faces = unit_mesh("sector")
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    normals = np.cross(b - a, c - a)
+    assert (normals[:, 2] > 0).all() and np.abs(normals[:, :2]).max() < 1e-12
+    assert normals[:, 2].sum() / 2 == pytest.approx(np.pi / 12, rel=0.02)
+    assert np.abs(np.arctan2(vertices[1:, 1], vertices[1:, 0])).max() == pytest.approx(SECTOR_ANGLE)
+    assert np.cos(SECTOR_ANGLE) == pytest.approx(CONE_COSINE), "as far as a bite reaches to either side"
 
 
 def test_rotations():

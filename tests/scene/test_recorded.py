@@ -53,7 +53,7 @@ def placed(arrays, segment, at):
 def test_primitives_that_move_together_are_one_figure():
     frames = [car_frame(step) for step in range(12)]
     header, arrays = decoded(encode_frames(frames, {"": 0}))
-    counts = {"box": 3, "ball": 0, "cylinder": 2}
+    counts = {"box": 3, "ball": 0, "cylinder": 2, "sector": 0}
     assert header["segments"] == [{"first": 0, "frames": 12, "counts": counts, "place": 0}]
     assert arrays["0/figure"].tolist() == [0, 1, 1, 2, 3]  # the post, the body, and a wheel each
     for step, frame in enumerate(frames):

@@ -189,6 +189,7 @@ def describe(session: CoachSession) -> dict[str, Any]:
         "push": None if push is None else {"largest": push.largest, "unit": push.unit},
         "presets": dict(session.presets),
         "units": dict(session.domain.units),
+        "names": dict(session.domain.words.names),
         "bindings": [asdict(binding) for binding in make_bindings(session.space, session.domain.controls)],
     }
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,16 +14,17 @@ from coachable.coach.page.api import CoachApi
 from coachable.coach.page.film import FilmStudio
 from coachable.coach.page.server import serve_api
 from coachable.coach.page.views import View, make_view
-from coachable.coach.page.widgets import Chart, MeasuredText, ParameterWidget, write
+from coachable.coach.page.widgets import Chart, MeasuredText, ParameterWidget, label, write
 from coachable.coach.phrases.grammar import Understanding
 from coachable.coach.session.loop import LiveLoop
 from coachable.coach.session.plan import read_plan
 from coachable.coach.session.readout import StyleReport
 from coachable.coach.session.recording import Recording
 from coachable.coach.session.session import CoachSession
-from coachable.domain import Push
-from coachable.evaluation.wording import measures_by_parameter, readable, readable_number
-from coachable.styles import Parameter
+from coachable.domain import Domain, Push
+from coachable.evaluation.wording import measured_text, measures_by_parameter
+from coachable.keys import TASK_REWARD
+from coachable.styles import Parameter, StyleSpace
 
 if TYPE_CHECKING:
     import viser
@@ -71,16 +72,19 @@ class CoachPage:
         self.widgets: dict[str, ParameterWidget] = {}
         self.measured: dict[str, MeasuredText] = {}
         self.overlay = server.gui.add_html("")
-        self.status = server.gui.add_markdown("")
-        self._add_run()
         tabs = server.gui.add_tab_group()
-        with tabs.add_tab("Coach"):
-            self._add_phrase_box()
+        with tabs.add_tab("Coach"):  # requests come first, right after the scene
             self._add_style()
+            self._add_influences()
+            self._add_phrase_box()
+            self.view_folder = server.gui.add_folder("View")
         with tabs.add_tab("Plan"):
             self._add_presets()
         with tabs.add_tab("Session"):
             self._add_session()
+        self.status = server.gui.add_markdown("")
+        self._add_run()
+        server.gui.add_html('<p class="links"><a href="/pad" target="_blank">Keyboard and gamepad</a></p>')
 
     def start(self) -> None:
         """Start the loop, and let other programs coach the session, too."""
@@ -98,11 +102,19 @@ class CoachPage:
             self._view.close()
 
     def _add_style(self) -> None:
-        with self.server.gui.add_folder("Style"):
-            for parameter in self.session.space.parameters:
+        domain, space, gui = self.session.domain, self.session.space, self.server.gui
+        with gui.add_folder("Style"):
+            for parameter in space.parameters:
                 self._add_widget(parameter, self.session.style[parameter.name], self._set)
-                self.measured[parameter.name] = MeasuredText(self.server, parameter, self.session.domain.units)
-            self.others = self.server.gui.add_markdown("")
+                self.measured[parameter.name] = MeasuredText(self.server, parameter, domain, space)
+            self.others = gui.add_markdown("")
+            with gui.add_folder("Further measures", expand_by_default=False):
+                self.further = gui.add_markdown("")
+        folder = gui.add_folder("Requested and measured")
+        self.chart = Chart(self.server, folder, space, domain, self.loop.show)
+
+    def _add_influences(self) -> None:
+        """Add what acts on the agent beside its style."""
         if self.session.domain.controls:
             with self.server.gui.add_folder("Steering"):
                 for control in self.session.domain.controls:
@@ -110,13 +122,11 @@ class CoachPage:
                     self._add_widget(control.parameter, self.session.controls[name], self._steer)
         if self.session.domain.push is not None:
             self._add_push(self.session.domain.push)
-        folder = self.server.gui.add_folder("Requested and measured")
-        self.chart = Chart(self.server, folder, self.session.space, self.loop.show)
-        self.view_folder = self.server.gui.add_folder("View")
 
     def _add_widget(self, parameter: Parameter, value: float | str, request: Callable[[ParameterWidget], None]) -> None:
         name = parameter.name
-        self.widgets[name] = ParameterWidget(self.server, parameter, value, lambda: request(self.widgets[name]))
+        title = label(parameter, self.session.domain.words)
+        self.widgets[name] = ParameterWidget(self.server, parameter, value, lambda: request(self.widgets[name]), title)
 
     def _add_push(self, push: Push) -> None:
         """Add a slider for the strength of a push, and a button for each direction."""
@@ -298,15 +308,14 @@ class CoachPage:
             buttons = (_RESUME if self.loop.paused else _PAUSE, _STEP, _RESET)
             if self.run.options != buttons:
                 self.run.options = buttons
-            groups = measures_by_parameter(self.session.space, [*report.measured, *report.unmeasured])
+            domain, space = self.session.domain, self.session.space
+            groups = measures_by_parameter(space, [*report.measured, *report.unmeasured], domain.beside)
             for name, text in self.measured.items():
                 text.update(report, groups[name])
             rest = [m for m in groups[""] if m in report.measured]
-            units = self.session.domain.units
-            others = ", ".join(
-                f"{readable(m)} **{readable_number(report.measured[m], units.get(m, ''))}**" for m in rest
-            )
-            write(self.others, f"also measured: {others}" if others else "")
+            told = [m for m in rest if m in domain.columns or (not domain.columns and m != TASK_REWARD)]
+            for box, names in ((self.others, told), (self.further, [m for m in rest if m not in told])):
+                write(box, listed(domain, space, {name: report.measured[name] for name in names}))
             self.chart.add(self.session.step_count * self.session.domain.control_step, report)
 
     def _status(self, report: StyleReport) -> str:
@@ -331,6 +340,18 @@ def _read_recording(content: bytes) -> Recording:
         return Recording.from_json(content.decode())
     except UnicodeDecodeError:
         raise ValueError("this is no recording: expected JSON written by a coaching session") from None
+
+
+def listed(domain: Domain, space: StyleSpace, measured: Mapping[str, float]) -> str:
+    """Return measured values with their names as Markdown.
+
+    Args:
+        domain: The domain.
+        space: The style space.
+        measured: Values by name.
+    """
+    texts = [f"{domain.words.name(name)} **{measured_text(domain, space, name, v)}**" for name, v in measured.items()]
+    return f"also measured: {', '.join(texts)}" if texts else ""
 
 
 def verdict(report: StyleReport) -> str:

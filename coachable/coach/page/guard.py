@@ -17,7 +17,6 @@ import re
 import socket
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -27,7 +26,7 @@ from websockets import Headers
 from websockets.http11 import Request, Response
 
 from coachable.coach.page.api import PATH, PROTOCOL, CoachApi
-from coachable.coach.page.looks import dressed
+from coachable.coach.page.looks import dressed, pad_page
 
 _THIS_MACHINE = ("localhost", "127.0.0.1", "::1")
 _EVERYWHERE = ("", "*", "0.0.0.0", "::")
@@ -121,9 +120,7 @@ class Guard:
     def _read(self, request: Request) -> Response | None:
         """Return the answer to a request over HTTP if the path is the API's or that of the page for keys."""
         if request.path == _PAD:
-            return _answered(
-                Path(__file__).with_name("pad.html").read_text(encoding="utf-8"), "text/html; charset=utf-8"
-            )
+            return _answered(pad_page(), "text/html; charset=utf-8")
         if not request.path.startswith(f"{PATH}/"):
             return None
         found = None if self.api is None else self.api.read(request.path)

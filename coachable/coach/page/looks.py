@@ -5,10 +5,11 @@ from __future__ import annotations
 import gzip
 import re
 from functools import lru_cache
+from pathlib import Path
 
 from websockets.http11 import Response
 
-from coachable.scene.look import FONT, TITLE, icon_link
+from coachable.scene.look import FONT, TITLE, icon_link, stylesheet
 from coachable.scene.palette import INK, WHITE, css
 
 # viser shows the page in dark colours if the address says so. The browser's own setting decides here.
@@ -42,6 +43,8 @@ _STYLE = (
 }
 .legend { margin: 0 1em 0.6em; font-size: 0.85em; }
 .legend summary { cursor: pointer; opacity: 0.8; }
+.links { margin: 4px 12px; font-size: 13px; }
+.links a { color: #0a7aba; }
 .legend div { display: flex; gap: 8px; align-items: center; }
 .legend i { flex: none; width: 14px; height: 14px; border-radius: 3px; border: 1px solid rgba(128, 128, 128, 0.7); }
 @media (max-width: 576px) {
@@ -57,6 +60,12 @@ _STYLE = (
     .replace("WHITE", css(WHITE))
     .replace("FONT", FONT)
 )
+
+
+def pad_page() -> str:
+    """Return the page for keys and gamepads, as HTML."""
+    page = Path(__file__).with_name("pad.html").read_text(encoding="utf-8")
+    return page.replace("ICON", icon_link(), 1).replace("LOOK", stylesheet(), 1)
 
 
 def dressed(response: Response) -> Response:

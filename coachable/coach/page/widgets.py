@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from coachable.coach.session.readout import StyleReport
-from coachable.evaluation.wording import measures_by_parameter, readable, readable_number
+from coachable.domain import Domain, Words
+from coachable.evaluation.wording import measured_text, measures_by_parameter, readable, readable_number
 from coachable.scene import palette
 from coachable.scene.palette import css
 from coachable.styles import Choice, Parameter, StyleSpace, Weight
@@ -32,14 +33,15 @@ class ParameterWidget:
         parameter: The parameter.
         value: Current value.
         ask: Called in viser's threads after the user changed the value.
+        title: What the widget is called.
     """
 
     def __init__(
-        self, server: viser.ViserServer, parameter: Parameter, value: float | str, ask: Callable[[], None]
+        self, server: viser.ViserServer, parameter: Parameter, value: float | str, ask: Callable[[], None], title: str
     ) -> None:
         self.parameter = parameter
         self._shown = value
-        name, hint = label(parameter), parameter.help or None
+        name, hint = title, parameter.help or None
         if isinstance(parameter, Choice):
             options = [readable(option) for option in parameter.options]
             self.handle: Any = server.gui.add_dropdown(name, options, initial_value=readable(value), hint=hint)
@@ -86,12 +88,12 @@ class MeasuredText:
     Args:
         server: Server of the page.
         parameter: The widget's parameter.
-        units: Units of measures by name; a measure that has the parameter's name has its unit.
+        domain: The domain.
+        space: The style space.
     """
 
-    def __init__(self, server: viser.ViserServer, parameter: Parameter, units: Mapping[str, str]) -> None:
-        self.parameter = parameter
-        self._units = {parameter.name: parameter.unit, f"{parameter.name}_error": parameter.unit} | dict(units)
+    def __init__(self, server: viser.ViserServer, parameter: Parameter, domain: Domain, space: StyleSpace) -> None:
+        self.parameter, self._domain, self._space = parameter, domain, space
         self.handle = server.gui.add_markdown(trained(parameter))
 
     def update(self, report: StyleReport, measures: list[str]) -> None:
@@ -114,7 +116,9 @@ class MeasuredText:
         write(self.handle, text)
 
     def _name(self, measure: str) -> str:
-        """Return the name of a measure without the name of the parameter."""
+        """Return the name of a measure: what the domain calls it, or its own without the parameter's."""
+        if measure in self._domain.words.names and measure != self.parameter.name:
+            return f"{self._domain.words.name(measure)} "
         rest = f"_{measure}_".replace(f"_{self.parameter.name}_", "_").strip("_")
         return f"{readable(rest)} " if rest else ""
 
@@ -122,7 +126,7 @@ class MeasuredText:
         """Format a value; that of a choice is the share of time in which it was met."""
         if isinstance(self.parameter, Choice):
             return f"{value:.0%}"
-        return readable_number(value, self._units.get(measure, ""))
+        return measured_text(self._domain, self._space, measure, value)
 
 
 class Chart:
@@ -135,26 +139,33 @@ class Chart:
         server: Server of the page.
         folder: Folder of the page that contains the chart.
         space: The style space.
+        domain: The domain.
         redraw: Called in viser's threads after the user chose another parameter; `add` has to follow.
     """
 
-    def __init__(self, server: viser.ViserServer, folder: Any, space: StyleSpace, redraw: Callable[[], None]) -> None:
-        self._server, self._folder, self._space = server, folder, space
+    def __init__(
+        self, server: viser.ViserServer, folder: Any, space: StyleSpace, domain: Domain, redraw: Callable[[], None]
+    ) -> None:
+        self._server, self._folder, self._space, self._domain = server, folder, space, domain
         self._history: deque[tuple[float, StyleReport]] = deque(maxlen=_HISTORY)
-        self._names = {readable(name): name for name in space.names}
+        self._names = {domain.words.name(name): name for name in space.names}
         numeric = [p.name for p in space.parameters if not isinstance(p, Choice)]
         self.shown = [*numeric, *space.names][0]
         with folder:
-            self.choice = server.gui.add_dropdown("show", list(self._names), initial_value=readable(self.shown))
+            self.choice = server.gui.add_dropdown(
+                "show", list(self._names), initial_value=domain.words.name(self.shown)
+            )
             self.note = server.gui.add_markdown("", visible=False)
         self.choice.on_update(lambda _: redraw())
         self.plot: Any = None
-        self._drawn: tuple[str, bool] | None = None  # parameter of the plot, and whether it has anything measured
+        # Parameter of the plot, whether it has anything measured, and whether requested and measured values are all 0.
+        self._drawn: tuple[str, bool, bool, bool] | None = None
 
     def follow(self, name: str) -> None:
         """Show a parameter that was just requested."""
-        if self.choice.value != readable(name):
-            self.choice.value = readable(name)
+        title = self._domain.words.name(name)
+        if self.choice.value != title:
+            self.choice.value = title
 
     def add(self, time: float, report: StyleReport) -> None:
         """Add a report as a further point and draw the chart.
@@ -178,12 +189,14 @@ class Chart:
         rows = [(ago, self._requested(report), self._measured(report)) for ago, report in recent]
         measured = [row for row in rows if math.isfinite(row[2])]  # uPlot draws nothing at all if there are NaN
         columns = np.array(measured or rows, dtype=float).T
-        self._plot((self.shown, bool(measured)), tuple(columns if measured else columns[:2]))
-        write(self.note, f"{readable(self.shown)}: nothing was measured in the last {_SPAN:g} s")
+        shown = tuple(columns if measured else columns[:2])
+        zero = [not line.any() for line in shown[1:]]
+        self._plot((self.shown, bool(measured), zero[0], zero[-1]), shown)
+        write(self.note, f"{self._domain.words.name(self.shown)}: nothing was measured in the last {_SPAN:g} s")
         if self.note.visible == bool(measured):
             self.note.visible = not measured
 
-    def _plot(self, kind: tuple[str, bool], data: tuple[np.ndarray, ...]) -> None:
+    def _plot(self, kind: tuple[str, bool, bool, bool], data: tuple[np.ndarray, ...]) -> None:
         """Draw data in the plot, or in a new one if the parameter changes, so that all its settings change together."""
         if kind == self._drawn:
             self.plot.data = data
@@ -194,8 +207,11 @@ class Chart:
             self.plot = self._server.gui.add_uplot(data=data, height=190, **self._layout(*kind))
         self._drawn = kind
 
-    def _layout(self, name: str, measured: bool) -> dict[str, Any]:
-        """Return the layout of the plot; a weight and its measure have different units and get an axis each."""
+    def _layout(self, name: str, measured: bool, nothing_asked: bool, nothing_found: bool) -> dict[str, Any]:
+        """Return the layout of the plot; a weight and its measure have different units and get an axis each.
+
+        An axis of zeros, which the plot would let end at 100, has the parameter's range, or ends at 1.
+        """
         import viser.uplot as uplot
 
         series = [uplot.Series(label="seconds ago"), uplot.Series(label="requested", stroke=_REQUESTED, width=2)]
@@ -207,9 +223,15 @@ class Chart:
             label, scale = ("measured (right)", "right") if apart else ("measured", "y")
             dots = uplot.Series_Points(show=True, size=3, fill=_MEASURED)  # where it was measured; lines only join them
             series.append(uplot.Series(label=label, stroke=_MEASURED, width=2, scale=scale, points=dots))
+        scales = {"x": uplot.Scale(time=False, range=(-_SPAN, 0.0))}
+        parameter = self._space[name]
+        if nothing_asked and (apart or nothing_found) and not isinstance(parameter, Choice):
+            scales["y"] = uplot.Scale(range=(parameter.low, parameter.high))
+        if apart and nothing_found:
+            scales["right"] = uplot.Scale(range=(0.0, 1.0))
         return {
             "series": tuple(series),
-            "scales": {"x": uplot.Scale(time=False, range=(-_SPAN, 0.0))},
+            "scales": scales,
             "axes": tuple(axes),
         }
 
@@ -218,20 +240,25 @@ class Chart:
         return 1.0 if isinstance(value, str) else value
 
     def _measured(self, report: StyleReport) -> float:
-        measures = measures_by_parameter(self._space, report.measured)[self.shown]
+        measures = measures_by_parameter(self._space, report.measured, self._domain.beside)[self.shown]
         return report.measured[measures[0]] if measures else math.nan
 
 
-def label(parameter: Parameter) -> str:
-    """Return the name and unit of a parameter."""
-    return readable(parameter.name) + (f" [{parameter.unit}]" if parameter.unit else "")
+def label(parameter: Parameter, words: Words) -> str:
+    """Return the name and unit of a parameter.
+
+    Args:
+        parameter: The parameter.
+        words: Words of its domain.
+    """
+    return words.name(parameter.name) + (f" [{parameter.unit}]" if parameter.unit else "")
 
 
 def trained(parameter: Parameter) -> str:
     """Return the trained range of a numeric parameter, or an empty text for a choice."""
     if isinstance(parameter, Choice):
         return ""
-    return f"trained {parameter.low:g} to {parameter.high:g} {parameter.unit}".rstrip()
+    return f"trained {readable_number(parameter.low)} to {readable_number(parameter.high, parameter.unit)}"
 
 
 def write(handle: Any, text: str) -> None:

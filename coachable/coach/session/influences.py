@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import cast
 
 from torchrl.envs import EnvBase
 
-from coachable.domain import Domain
+from coachable.domain import Control, Domain
 
 
 class Influences:
@@ -18,7 +19,8 @@ class Influences:
 
     Attributes:
         controls: Live controls by name.
-        values: Their values by name, in their units.
+        values: Their values in force by name, in their units.
+        wanted: The values that they approach.
         push: The push, or None if the domain has none.
     """
 
@@ -26,6 +28,23 @@ class Influences:
         self._domain, self.push = domain.name, domain.push
         self.controls = {control.parameter.name: control for control in domain.controls}
         self.values = {name: cast(float, c.parameter.default) for name, c in self.controls.items()}
+        self.wanted = dict(self.values)
+
+    def approached(self, seconds: float) -> dict[str, float]:
+        """Return the values of controls that change during some time [s] on the way to those that are wanted."""
+        changing = {name: wanted for name, wanted in self.wanted.items() if wanted != self.values[name]}
+        return {name: _approach(self.controls[name], self.values[name], w, seconds) for name, w in changing.items()}
+
+    def change(self, values: Mapping[str, float], settled: bool) -> None:
+        """Put values in force.
+
+        Args:
+            values: Values of controls by name.
+            settled: Whether they are also the wanted ones from now on.
+        """
+        self.values |= values
+        if settled:
+            self.wanted |= values
 
     def fitted(self, values: Mapping[str, float]) -> dict[str, float]:
         """Return values of controls, wrapped around or clamped to their ranges.
@@ -69,3 +88,13 @@ class Influences:
         """
         if self.push is not None:
             self.push.apply(env, *strength)
+
+
+def _approach(control: Control, present: float, wanted: float, seconds: float) -> float:
+    """Return the value of a control some time [s] later on the shorter way to another one."""
+    apart = wanted - present
+    if control.circular:
+        apart = math.remainder(apart, control.parameter.high - control.parameter.low)
+    if control.rate is None or abs(apart) <= control.rate * seconds:
+        return wanted
+    return control.fit(present + math.copysign(control.rate * seconds, apart))

@@ -112,8 +112,8 @@ class CoachSession:
 
     @property
     def controls(self) -> dict[str, float]:
-        """Values of the live controls, by name, in their units."""
-        return dict(self._influences.values)
+        """Requested values of the live controls, by name, in their units."""
+        return dict(self._influences.wanted)
 
     def set(self, **values: float | str) -> None:
         """Request another style from the next observation on; parameters that are not named keep their values.
@@ -138,14 +138,14 @@ class CoachSession:
         self.set(**self._preset(preset))
 
     def steer(self, **values: float) -> None:
-        """Set live controls from the next step on; circular ones wrap around, others are clamped to their range.
+        """Set live controls, as values that those with a rate approach; circular ones wrap around, others are clamped.
 
         Raises:
             ValueError: For an unknown control or NaN.
         """
         fitted = self._influences.fitted(values)
         self._timeline.take_over()
-        self._apply({"controls": fitted})
+        self._influences.wanted |= fitted
 
     def push(self, forward: float = 0.0, left: float = 0.0) -> None:
         """Push the agent before the next step; see `coachable.domain.Push`, whose largest strength limits the push.
@@ -233,10 +233,10 @@ class CoachSession:
             self._apply({"reset": True})
             return
         check_seed(seed)
+        self._influences.values |= self._influences.wanted
         start = Recording(self.domain.name, self.source, seed, self.style, self.controls, self._episodes.endless)
         self._timeline = Timeline(start)
-        self._steps_at_request = 0
-        self._complied_at: int | None = None
+        self._steps_at_request, self._complied_at = 0, None
         self._generator = torch.Generator().manual_seed(seed)
         self._episodes.seed(seed)
         self._influences.steer(self.base_env)
@@ -264,6 +264,8 @@ class CoachSession:
         """
         for event in self._timeline.due():
             self._apply(event)
+        if changes := self._influences.approached(self.domain.control_step):
+            self._apply({"controls": changes})
         if self.ended is not None:
             self._begin_episode()
         transition = self._episodes.step(self.policy, self._theta)
@@ -273,7 +275,7 @@ class CoachSession:
         self._timeline.advance(self._episodes.observation)
         return transition
 
-    def run(self, seconds: float, on_step: Callable[[CoachSession], None] | None = None) -> None:
+    def run(self, seconds: float, on_step: Callable[[CoachSession], None] = lambda _: None) -> None:
         """Make steps for some simulated time.
 
         Args:
@@ -282,8 +284,7 @@ class CoachSession:
         """
         for _ in range(round(seconds / self.domain.control_step)):
             self.step()
-            if on_step is not None:
-                on_step(self)
+            on_step(self)
 
     def report(self) -> StyleReport:
         """Return requested and measured style over the window, which restarts with each request and episode."""
@@ -346,7 +347,7 @@ class CoachSession:
         """
         recording.check(self.domain.name, self.space, self._influences.controls, self._influences.push)
         self._theta, self._outside = self.space.make(strict=True, **recording.style), {}
-        self._influences.values |= recording.controls
+        self._influences.change(recording.controls, settled=True)
         self._episodes.endless = recording.endless
         self.reset(recording.seed)
         self._timeline.repeat(recording)
@@ -366,7 +367,7 @@ class CoachSession:
         if "style" in event:
             self._request(self.space.make(**(self.style | event["style"])), event["style"])
         if "controls" in event:
-            self._influences.values |= event["controls"]
+            self._influences.change(event["controls"], settled=self.replaying)  # a recording has all of the way
             self._influences.steer(self.base_env)
             self._timeline.note({"controls": dict(event["controls"])})
         if "push" in event:
@@ -378,10 +379,9 @@ class CoachSession:
 
     def _request(self, theta: Tensor, asked: Mapping[str, Any]) -> None:
         """Put a style in force and record it; `asked` are the requested values before clamping."""
-        everything = {**self._outside, **asked}
-        self._outside = {name: value for name, value in everything.items() if not is_trained(self.space[name], value)}
-        before = self.style
-        self._theta = theta
+        values = {**self._outside, **asked}.items()
+        self._outside = {name: value for name, value in values if not is_trained(self.space[name], value)}
+        before, self._theta = self.style, theta
         changed = {name: value for name, value in self.style.items() if value != before[name]}
         if changed:
             self._steps_at_request, self._complied_at = self.step_count, None

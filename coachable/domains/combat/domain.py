@@ -74,6 +74,7 @@ DOMAIN = Domain(
     evaluation=evaluate_fights,
     recorded=Recorded(
         seconds=45.0,
+        opens=1,
         title="A fighter who uses what you ask for",
         summary="Ask for a way to fight, and see how much of the damage it does.",
     ),

@@ -40,12 +40,11 @@ LAMPS: dict[int, Colour] = {
 }
 _PLAIN = palette.SILVER  # ammunition without an element
 _BAR = (2.4, 0.26)  # [m], health bar
+_HIGHEST = 4.6  # [m], of a health bar, so that it is in the picture
 _SHOWN = 0.05  # build-up of an element from which it is shown
 _BOUND_POSTS = 48
 _AHEAD = 4.0  # [m], from the player to what the camera looks at
 _LAG = 0.3  # share by which the camera turns towards the nearest machine in a control step
-_ARC = math.radians(60.0)  # of a bite, to either side
-_RAYS = 15
 
 
 class CombatStage:
@@ -174,8 +173,11 @@ class CombatStage:
                 part = removable(int(kinds.argmax()), size, offset)
                 shown = part if s["count"][slot, enemy] > 0 else _vanished(part)
                 parts.figure(shown, above(ground, radius), turn)
-        top = above(ground, 2.6 * radius + 0.8)
-        _health_bar(parts, top, hp / full, math.radians(self.viewpoint.azimuth) + (self._heading or 0.0))
+        azimuth, height = math.radians(self.viewpoint.azimuth) + (self._heading or 0.0), 2.6 * radius + 0.8
+        top = above(ground, min(height, _HIGHEST))
+        if height > _HIGHEST:  # the bar of a tall machine is in front of it
+            top += 1.6 * radius * np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
+        _health_bar(parts, top, hp / full, azimuth)
         active = [e for i, e in enumerate(ELEMENTS) if s["state_timer"][i, enemy] > 0]
         for index, element in enumerate(active):
             ring = 2 * radius + 1.0 + 0.7 * index
@@ -238,11 +240,11 @@ def _warning(
     if kind == "area":
         glows.cylinder((*place, 0.06), (2 * reach, 2 * reach, 0.06), colour)
         return
-    angles = np.linspace(-_ARC, _ARC, _RAYS) if kind == "cone" else np.zeros(1)
-    width = {"cone": 0.06 * reach, "charge": 2 * radius}.get(kind, 0.3)
-    for angle in yaw + angles:
-        middle = place + reach / 2 * np.array([math.cos(angle), math.sin(angle)])
-        glows.box((*middle, 0.06), (reach, width, 0.04), colour, about_z(float(angle)))
+    if kind == "cone":
+        glows.sector((*place, 0.06), (2 * reach, 2 * reach, 0.06), colour, about_z(yaw))
+        return
+    middle = place + reach / 2 * np.array([math.cos(yaw), math.sin(yaw)])
+    glows.box((*middle, 0.06), (reach, 2 * radius if kind == "charge" else 0.3, 0.04), colour, about_z(yaw))
 
 
 def _ground_marks(s: Mapping[str, np.ndarray], glows: Parts) -> Parts:

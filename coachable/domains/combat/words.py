@@ -26,5 +26,17 @@ WORDS = Words(
         "scavenger": {"part_weapon": 1.0, "part_canister": 1.0, "part_shield": 1.0},
     },
     examples=("use acid", "no traps", "more melee", "use the warrior bow"),
+    names={
+        "ancestors_return": "Ancestor's Return",
+        "corrosive_blastsling": "Corrosive Blastsling",
+        "carjas_bane": "Carja's Bane",
+        "icestorm_boltblaster": "Icestorm Boltblaster",
+        "sunscourge": "Sunscourge",
+        "skykiller": "Skykiller",
+        "part_weapon": "weapon parts",
+        "part_canister": "canister parts",
+        "part_shield": "shield parts",
+        "style_score": "share of the damage in this style",
+    },
     terminated="ended the fight",
 )

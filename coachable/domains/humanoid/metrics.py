@@ -30,7 +30,7 @@ POSE_TOLERANCE_DEG = 10.0
 LENGTH_TOLERANCE = 0.06  # [m], a step this close to the request complies
 SPEED_TOLERANCE = 0.15  # [m/s], a step whose speed is this close to the request complies
 _DRIFT_SECONDS = 15.0
-_FORWARD_SPEED = sum(group.width for group in OBSERVATION_GROUPS[:4])  # first of `com_velocity`
+FORWARD_SPEED = sum(group.width for group in OBSERVATION_GROUPS[:4])  # first of `com_velocity`
 
 
 class HumanoidMeasures:
@@ -72,8 +72,8 @@ class HumanoidMeasures:
         knee = -at_strike[:, SWING_KNEE].rad2deg()
         right = at_strike[:, FOOT] == 0
         return {
-            "forward_speed": observation[:, _FORWARD_SPEED],
-            "sideways_speed": observation[:, _FORWARD_SPEED + 1],
+            "forward_speed": observation[:, FORWARD_SPEED],
+            "sideways_speed": observation[:, FORWARD_SPEED + 1],
             "pose_held": held.float(),
             "step_length": length,
             "step_length_error": (length - theta[:, len(POSES)]).abs(),

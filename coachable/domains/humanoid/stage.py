@@ -14,9 +14,10 @@ from torchrl.envs import EnvBase
 from coachable.envs.humanoid.env import HumanoidEnv
 from coachable.envs.humanoid.model import CONTROL_STEP, FEET, load_spec
 from coachable.envs.humanoid.observation import rotate_to_course
+from coachable.export.web.part import WebScene
 from coachable.scene import palette
 from coachable.scene.frame import Backdrop, Frame, Gauge, Label, Viewpoint
-from coachable.scene.palette import Colour
+from coachable.scene.palette import Colour, css
 from coachable.scene.parts import BALL, CYLINDER, Batch, Parts, about_z, above, plain, towards
 
 _HALF = 30.0  # [m], of the ground around the walker
@@ -26,10 +27,14 @@ _BODY: Colour = (214, 208, 196)
 _SPINE = (120, 116, 110)
 SIDES: dict[str, Colour] = {"right": palette.ORANGE, "left": palette.SKY}
 _PRINTS, _LENGTHS = 24, 4  # footprints, and how many of them have the length of their step beside them
+_SHORTEST = 0.05  # [m], of a step whose length is written; the first ones begin on the spot
 _SOLE = (0.26, 0.10, 0.006)  # [m]
 _FASTEST = 2.0  # [m/s], full bar
 _SMOOTH = 0.05  # share of the latest speed in the mean
 _SHADOW = ((0.8, (134, 142, 150)), (0.55, (118, 126, 134)), (0.35, (104, 112, 120)))  # diameters [m] and colours
+_EYES = tuple((0.08, side, 0.01) for side in (-0.035, 0.035))  # [m], in the frame of the head
+_EYE = 0.035  # [m]
+_SPINE_RADIUS = 0.055  # [m]
 _PUSH_SCALE = 0.006  # [m/N], length of the arrow
 
 
@@ -40,7 +45,8 @@ class HumanoidStage:
     legend = (
         (SIDES["right"], "right leg, arm and footprints"),
         (SIDES["left"], "left leg, arm and footprints"),
-        (palette.REQUESTED, "where a step of the requested length ends"),
+        (palette.REQUESTED, "line: where a step of the requested length ends"),
+        (palette.BLUE, "arrow: course"),
         (_METRE, "metres; thin lines: half metres"),
     )
 
@@ -130,14 +136,14 @@ class HumanoidStage:
             if self._last is not None:
                 apart = prints[foot] - self._last[1 - foot]
                 length = float(rotate_to_course(apart[None], np.array([course]))[0, 0])
-                self._lengths.append((length, prints[foot]))
+                if length >= _SHORTEST:
+                    self._lengths.append((length, prints[foot]))
         self._last = prints
 
     def _prints_on_the_ground(self) -> tuple[Parts, list[Label]]:
         marks = Parts()
         for foot, place, direction in self._prints:
-            colour = palette.mixed(SIDES["right" if foot == 0 else "left"], (0, 0, 0), 0.15)
-            marks.box((*place, 0.006), _SOLE, colour, about_z(direction))
+            marks.box((*place, 0.006), _SOLE, _print_colour("left" if foot else "right"), about_z(direction))
         return marks, [Label(f"{length:.2f} m", (*place, 0.05)) for length, place in self._lengths]
 
     def _target(self, marks: Parts, course: float, length: float) -> None:
@@ -179,11 +185,11 @@ class HumanoidStage:
             ends = places + (side * half)[:, None] * axes
             parts.batch(BALL, Batch(ends, turns, np.repeat(2 * radius[:, None], 3, 1), colours))
         chest, pelvis = (self._data.xpos[self._model.body(name).id] for name in ("torso", "pelvis"))
-        parts.capsule(chest, pelvis, 0.055, _SPINE)
+        parts.capsule(chest, pelvis, _SPINE_RADIUS, _SPINE)
         head = self._model.body("head").id
         axes = self._data.xmat[head].reshape(3, 3)
-        for side in (-0.035, 0.035):  # eyes, which show where it looks
-            parts.ball(self._data.xpos[head] + axes @ (0.08, side, 0.01), (0.035,) * 3, palette.INK)
+        for place in _EYES:  # which show where it looks
+            parts.ball(self._data.xpos[head] + axes @ place, (_EYE,) * 3, palette.INK)
         return parts
 
     def _gauges(self) -> Sequence[Gauge]:
@@ -193,6 +199,32 @@ class HumanoidStage:
 
     def _time(self) -> str:
         return f"{self._steps * CONTROL_STEP:.1f} s"
+
+
+def web_scene() -> WebScene:
+    """Return how the exported page draws the walker: with the colours, marks and legend of this stage."""
+    model = load_spec().compile()
+    names = [model.body(index).name for index in range(1, model.nbody)]
+    eyes = [{"body": "head", "at": place, "diameter": _EYE, "colour": css(palette.INK)} for place in _EYES]
+    return WebScene(
+        bodies={name: css(_colour(name)) for name in names},
+        body=css(_BODY),
+        links=[{"bodies": ("torso", "pelvis"), "radius": _SPINE_RADIUS, "colour": css(_SPINE)}],
+        balls=eyes,
+        ground=css(_GROUND),
+        lines=(css(_LINE), css(_METRE)),
+        marks=(css(_print_colour("right")), css(_print_colour("left"))),
+        lengths=_LENGTHS,
+        shortest=_SHORTEST,
+        asked=css(palette.REQUESTED),
+        course=css(palette.BLUE),
+        viewpoint=vars(HumanoidStage.viewpoint),
+        legend=[(css(colour), meaning) for colour, meaning in HumanoidStage.legend],
+    )
+
+
+def _print_colour(side: str) -> Colour:
+    return palette.mixed(SIDES[side], (0, 0, 0), 0.15)
 
 
 def _colour(name: str) -> Colour:

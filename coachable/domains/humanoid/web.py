@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from coachable.domains.humanoid.metrics import HumanoidMeasures
+from coachable.domains.humanoid.metrics import FORWARD_SPEED, HumanoidMeasures
+from coachable.domains.humanoid.stage import web_scene
 from coachable.envs.humanoid.env import EPISODE_STEPS, FALL_HEIGHT, PUSH_DURATION, STEP_MAX, HumanoidEnv
 from coachable.envs.humanoid.features import WALK, WALK_SIZE, pack_style_features
 from coachable.envs.humanoid.gait import GaitTracker
@@ -27,12 +28,15 @@ from coachable.export.web.part import Measure, WebPart
 from coachable.keys import STYLE, STYLE_FEATURES
 from coachable.styles import StyleSpace
 
+HEADING = "heading"  # direction of travel, of which the domain measures only the parts along and across the course
+OPENS = {"pose": "t_pose", "step_length": 0.50}  # what is easy to see
 MEASURES = (
     Measure("pose_held", "pose", "arms in this pose", share=True),
     Measure("step_length", "step_length", "last steps", "m", at_marks=True),
     Measure("forward_speed", "", "speed", "m/s"),
+    Measure(HEADING, "course", "walks towards", "deg", circular=True),
 )
-GAIT_MEASURES = (*MEASURES[:2], Measure("speed", "speed", "speed", "m/s"))
+GAIT_MEASURES = (*MEASURES[:2], Measure("speed", "speed", "speed", "m/s"), MEASURES[3])
 PUSH_FORCE = 120.0  # [N]
 _STARTS = 16
 
@@ -100,6 +104,8 @@ class WalkFeatures(nn.Module):
             ("next", WALK): torch.zeros(1, WALK_SIZE),
         }
         measured = self.measures.step(transition)
+        forward, left = observation[:, FORWARD_SPEED], observation[:, FORWARD_SPEED + 1]
+        measured[HEADING] = (controls[:, 0] + torch.atan2(left, forward).rad2deg()).float()
         place = gait.prints[np.arange(1), report.foot]
         ahead = place - kinematics.feet[np.arange(1), report.foot, :2]
         mark = np.concatenate([place, ahead, report.foot[:, None]], axis=1)
@@ -159,6 +165,8 @@ def humanoid_web(
         },
         push={"force": PUSH_FORCE, "duration": PUSH_DURATION},
         followed="torso",
+        scene=web_scene(),
+        opens=OPENS,
         terminated="fell",
         picture="The walker, seen from the side",
         licence="The humanoid's model is from dm_control, Copyright The dm_control Authors, Apache-2.0.",

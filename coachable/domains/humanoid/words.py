@@ -22,7 +22,10 @@ def _push(env: EnvBase, forward: float, left: float) -> None:
 
 
 COURSE = Control(
-    Setpoint("course", -180.0, 180.0, unit="deg", help="direction of walking, left is positive"), _steer, circular=True
+    Setpoint("course", -180.0, 180.0, unit="deg", help="direction of walking, left is positive"),
+    _steer,
+    circular=True,
+    rate=45.0,  # sudden turns fell the walker; of half turns at 60 deg/s none did
 )
 
 PUSH = Push(_push, largest=200.0, unit="N")

@@ -14,8 +14,8 @@ DOMAIN = racing_domain(
     evaluation=evaluate_aggressiveness,
     recorded=Recorded(
         columns={
-            "longitudinal": ".1f",
-            "lateral": ".1f",
+            "longitudinal_least": ".1f",
+            "lateral_least": ".1f",
             "complied": ".1%",
             "contact": ".1%",
             "place": ".1f",

@@ -30,6 +30,7 @@ def racing_domain(
     columns: Mapping[str, str],
     evaluation: Callable[..., str],
     recorded: Recorded,
+    beside: Mapping[str, str] | None = None,
     **options: Any,
 ) -> Domain:
     """Return the domain of a family of styles.
@@ -41,6 +42,7 @@ def racing_domain(
         columns: Published columns beside survival, pace, time off course and changes of the steering command.
         evaluation: Function that `coachable evaluate` calls.
         recorded: What the exported page plays.
+        beside: Parameters by the measure that tells about them, as in `Domain`.
         **options: Options of the environment that differ from training when an agent is shown and measured.
     """
     make_env, make_space, make_reward = racing_family(family)
@@ -66,8 +68,10 @@ def racing_domain(
         )
 
     angles = ("sideslip", "sideslip_corners", "sideslip_straights") if family == "drift" else ()
-    units = {"pace": "m/s", "speed": "m/s", "fuel_per_km": "l", "wear_per_km": "tyres"}
+    units = {"pace": "m/s", "speed": "m/s", "fuel_per_km": "l"}
     units |= dict.fromkeys(("slip_angle_front", "slip_angle_rear", *angles), "deg")
+    units |= dict.fromkeys(("overtake", "defend"), "m/s") if family == "resources" else {}
+    units |= dict.fromkeys(("longitudinal_least", "lateral_least"), "m") if family == "aggressiveness" else {}
     domain = Domain(
         name=f"racing_{family}",
         make_env=partial(make_env, **options),
@@ -82,6 +86,7 @@ def racing_domain(
         episode_steps=EPISODE_STEPS,
         columns={"survived": ".0%", "pace": ".1f", "off": ".1%", "steering_change": ".2f"} | dict(columns),
         units=units,
+        beside=beside or {},
         observation_groups=observation_groups(cars > 1, pool=False),
         action_groups=ACTION_GROUPS,
         words=WORDS[family],

@@ -15,9 +15,9 @@ DOMAIN = racing_domain(
     grid=[*({**_NONE, **dict.fromkeys(_REAR, weight)} for weight in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)), _ALL],
     columns={"sideslip_corners": ".1f", "sideslip_straights": ".1f", "turned_per_km": ".2f"},
     evaluation=evaluate_drift,
+    beside={"sideslip_corners": "slip_angle_rear", "sideslip_straights": "slip_angle_rear"},
     recorded=Recorded(
         grid={**{name: (0.0,) for name in DRIFT_NAMES}, **dict.fromkeys(_REAR, (0.0, 1.0, 2.0, 3.0, 5.0))},
-        beside={"sideslip_corners": "slip_angle_rear", "sideslip_straights": "slip_angle_rear"},
         title="A car that drifts when you ask",
         summary="Ask for sliding rear tyres, and see how far the car goes sideways.",
     ),

@@ -55,12 +55,14 @@ def resource_env(num_envs: int = 64, **options: Any) -> RacingEnv:
 
     Args:
         num_envs: Number of cars that the agent drives. If it is not a multiple of `cars`, the agent drives one car of
-            each race and the others are scripted.
+            each race. Cars that it does not drive are scripted.
         **options: Options of `RacingEnv`.
     """
     cars = options.get("cars", 1)
-    if num_envs % cars:
-        options = {"controlled": 1, "driver": _line_follower(options, HOME["resources"], CAR["resources"])[1]} | options
+    controlled = options.get("controlled") or (1 if num_envs % cars else cars)
+    if controlled < cars:
+        driver = _line_follower(options, HOME["resources"], CAR["resources"])[1]
+        options = {"driver": driver} | options | {"controlled": controlled}
     defaults: dict[str, Any] = {
         "track": HOME["resources"],
         "car": CAR["resources"],

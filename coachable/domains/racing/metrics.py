@@ -13,9 +13,11 @@ from coachable.domains.racing.families import racing_family
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
 from coachable.envs.racing.race.features import (
     CORNER_RADIUS,
+    DEFEND,
     DRIFT,
     FUEL,
     NEAR_DISTANCE,
+    OVERTAKE,
     TIRE,
     anyone_near,
     gap_columns,
@@ -57,6 +59,8 @@ class RacingMeasures:
         "steering_change" is the change of the steering command in a control step, at most 2. It reveals agents that
         steer from lock to lock but drive well otherwise. For aggressiveness, "longitudinal" is the distance to the
         nearest car straight ahead or behind and "lateral" that to the nearest car beside; NaN if none is within 10 m.
+        For resources, "overtake" and "defend" are the metres gained per second on cars ahead and on cars behind; NaN
+        while no other car is near.
         """
         theta, features = transition.get(STYLE), transition.get(("next", STYLE_FEATURES))
         telemetry = transition.get(("next", "telemetry"))
@@ -85,6 +89,9 @@ class RacingMeasures:
             found |= _drifting(told("sideslip") * degrees, told("speed"), told("curvature"), theta[:, 1] > 1.0)
         elif self.family == "resources":
             found["complied"] = 1.0 - found["off"]
+            near = anyone_near(features)
+            for name, column in (("overtake", OVERTAKE), ("defend", DEFEND)):
+                found[name] = torch.where(near, features[:, column] / CONTROL_STEP, torch.nan)
         else:
             found["longitudinal"], found["lateral"] = _distances(features)
             found["complied"] = torch.where(anyone_near(features), _margins_kept(features, theta).float(), torch.nan)
@@ -95,6 +102,7 @@ class RacingMeasures:
 
         For drift, "turns" is the largest rotation against the track in one direction, in whole turns, "turned_per_km"
         how often per kilometre the car turned to face backwards, and "backwards" the share of time that it faced so.
+        For aggressiveness, "longitudinal_least" and "lateral_least" are the smallest gaps, which the margins are about.
 
         Args:
             record: Outputs of `step` (T, N), by name.
@@ -105,7 +113,12 @@ class RacingMeasures:
         """
         record = dict(record)
         heading = record.pop("heading", None)
-        means = {name: torch.where(alive, values, torch.nan).nanmean(0) for name, values in record.items()}
+        least = {
+            f"{name}_least": _nearest(record[name].T, alive.T & ~record[name].T.isnan())
+            for name in ("longitudinal", "lateral")
+            if name in record
+        }
+        means = least | {name: torch.where(alive, values, torch.nan).nanmean(0) for name, values in record.items()}
         kilometres = (means["pace"] * CONTROL_STEP / 1000.0).clamp(min=1e-6)
         for name in ("wear", "fuel"):
             means[f"{name}_per_km"] = means.pop(name) / kilometres

@@ -3,6 +3,14 @@
 from coachable.domain import Words
 
 _DRIVING = ("drive", "driving")
+_NAMES = {
+    "survived": "not retired",
+    "pace": "pace along the track",
+    "off": "off the track",
+    "steering_change": "change of the steering command",
+    "place": "mean place",
+    "contact": "in contact with another car",
+}
 
 WORDS = {
     "drift": Words(
@@ -25,6 +33,16 @@ WORDS = {
             "grip": {"slip_angle_front": -0.4, "slip_angle_rear": -0.4},
         },
         examples=("drift more", "no wheelspin", "grip"),
+        names=_NAMES
+        | {
+            "slip_angle_front": "front slip angle",
+            "slip_angle_rear": "rear slip angle",
+            "slip_ratio_front": "front slip ratio",
+            "slip_ratio_rear": "rear slip ratio",
+            "sideslip_corners": "sideslip in corners",
+            "sideslip_straights": "sideslip on straights",
+            "turned_per_km": "turns to face backwards per km",
+        },
         terminated="retired",
     ),
     "resources": Words(
@@ -53,6 +71,14 @@ WORDS = {
             "attack": {"overtake": 2.0, "tire": 0.0, "fuel": 0.0},
         },
         examples=("save fuel", "save more tyres", "overtake more"),
+        names=_NAMES
+        | {
+            "overtake": "overtaking",
+            "defend": "defending",
+            "tire": "tyres",
+            "wear_per_km": "tyre wear per km",
+            "fuel_per_km": "fuel per km",
+        },
         terminated="retired",
     ),
     "aggressiveness": Words(
@@ -75,6 +101,14 @@ WORDS = {
             "room to breathe": {"longitudinal": 2.0, "lateral": 1.0},
         },
         examples=("be aggressive", "give more room", "0.3 m beside"),
+        names=_NAMES
+        | {
+            "longitudinal": "gap ahead and behind",
+            "lateral": "gap beside",
+            "longitudinal_least": "smallest gap kept",
+            "lateral_least": "smallest gap kept",
+            "complied": "margins kept, of the time near other cars",
+        },
         terminated="retired",
     ),
 }

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from torch import Tensor, nn
 
-__all__ = ["Measure", "WebPart"]
+__all__ = ["Measure", "WebPart", "WebScene"]
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,7 @@ class Measure:
         unit: Unit, or "" for none.
         share: Whether it is a share of time, which the page shows in percent.
         at_marks: Whether the values at the last marks are listed beside the request.
+        circular: Whether it is a direction in degrees, whose mean is that of directions.
     """
 
     name: str
@@ -30,6 +31,42 @@ class Measure:
     unit: str = ""
     share: bool = False
     at_marks: bool = False
+    circular: bool = False
+
+
+@dataclass(frozen=True)
+class WebScene:
+    """How the page draws the model: the colours of the domain's stage.
+
+    Attributes:
+        bodies: Colours of the bodies by name, as in CSS; `body` for the others.
+        body: Colour of bodies that are not named.
+        links: Capsules between two bodies, each with `bodies`, `radius` [m] and `colour`.
+        balls: Balls on a body, each with `body`, `at` (3,) [m] in the body's frame, `diameter` [m] and `colour`.
+        ground: Colour of the ground.
+        lines: Colours of the lines at half metres and at metres.
+        marks: Colours of the marks on the ground by side.
+        lengths: Number of the latest marks that have their measured value beside them.
+        shortest: Smallest value that is written [unit of the measure].
+        asked: Colour of the line where a mark of the requested value is.
+        course: Colour of the arrow along the course.
+        viewpoint: Where the camera is, as in `coachable.scene.frame.Viewpoint`.
+        legend: Colours and what they mean.
+    """
+
+    bodies: Mapping[str, str]
+    body: str
+    links: Sequence[Mapping[str, Any]]
+    balls: Sequence[Mapping[str, Any]]
+    ground: str
+    lines: tuple[str, str]
+    marks: tuple[str, str]
+    lengths: int
+    shortest: float
+    asked: str
+    course: str
+    viewpoint: Mapping[str, Any]
+    legend: Sequence[tuple[str, str]]
 
 
 @dataclass(frozen=True)
@@ -56,6 +93,8 @@ class WebPart:
             whatever else is worth telling.
         push: Force [N] and `duration` [s] of the page's push, which acts on the first three velocities.
         followed: Body that the camera follows.
+        scene: How the model is drawn.
+        opens: Request with which the page opens, by name; what it lacks has its default.
         picture: What the picture shows, for those who do not see it.
         licence: Notice that the licence of the model asks for, or "" for none.
         terminated: Verb for a terminated episode in the past tense.
@@ -73,5 +112,7 @@ class WebPart:
     push: Mapping[str, float]
     followed: str
     terminated: str
+    scene: WebScene
+    opens: Mapping[str, Any] = field(default_factory=dict)
     picture: str = "The agent"
     licence: str = ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, metadata
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Any
@@ -111,9 +112,20 @@ def about(agent: LoadedPolicy) -> dict[str, Any]:
     return {
         "schema_version": SCHEMA_VERSION,
         "coachable_version": __version__,
+        "home": home_page(),
         "domain": agent.metadata["domain"],
         "frames": agent.metadata["frames"],
     }
+
+
+def home_page() -> str:
+    """Return the address that the installed package declares for its documentation or its repository, or ""."""
+    try:
+        declared = metadata("coachable").get_all("Project-URL") or []
+    except PackageNotFoundError:
+        return ""
+    addresses = {name.strip().lower(): address.strip() for name, _, address in (d.partition(",") for d in declared)}
+    return next((addresses[name] for name in ("documentation", "repository", "homepage") if name in addresses), "")
 
 
 def manifest_of(agent: LoadedPolicy, part: WebPart) -> dict[str, Any]:
@@ -133,6 +145,7 @@ def manifest_of(agent: LoadedPolicy, part: WebPart) -> dict[str, Any]:
             "help": control.parameter.help,
             "default": control.parameter.default,
             "circular": control.circular,
+            "rate": control.rate,
         }
         for control in domain.controls
     ]
@@ -145,6 +158,10 @@ def manifest_of(agent: LoadedPolicy, part: WebPart) -> dict[str, Any]:
         "default_style": space.default.tolist(),
         "presets": {name: dict(style) for name, style in domain.words.presets.items()},
         "controls": controls,
+        "opens": dict(part.opens),
+        "names": dict(domain.words.names),
+        "scene": vars(part.scene),
+        "legend": [list(entry) for entry in part.scene.legend],
         "measures": [vars(measure) for measure in part.measures],
         "models": _MODELS,
         "graphs": _GRAPHS,

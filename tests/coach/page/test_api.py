@@ -22,6 +22,7 @@ from coachable.coach.page.coach_page import CoachPage  # noqa: E402
 from coachable.coach.page.server import make_server  # noqa: E402
 from coachable.coach.session.session import CoachSession  # noqa: E402
 from tests.coach.echo_domain import echo_session  # noqa: E402
+from tests.coach.page.driving import do  # noqa: E402
 
 
 def make_page(session, port):
@@ -229,6 +230,7 @@ def test_steer_and_push(humanoid):
     with connect(humanoid) as connection:
         assert ask(connection, do="steer", controls={"course": 190})["controls"] == {"course": -170.0}
         ask(connection, do="steer", controls={"course": 90})
+        do(humanoid, lambda session: session.run(2.1))  # until it has turned
         ask(connection, do="push", forward=600, left=0)
         (event,) = [event for event in humanoid.session.recording().events if "push" in event]
         assert event["push"] == [200.0, 0.0]

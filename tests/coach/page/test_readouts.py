@@ -8,7 +8,9 @@ viser = pytest.importorskip("viser")
 
 
 from coachable.coach.page.coach_page import verdict  # noqa: E402
+from coachable.coach.page.looks import pad_page  # noqa: E402
 from coachable.coach.session.readout import StyleReport  # noqa: E402
+from coachable.scene.look import icon_link, stylesheet  # noqa: E402
 from tests.coach.page.driving import do, say, wait_for  # noqa: E402
 
 
@@ -126,3 +128,27 @@ def test_a_weight_and_what_it_brings_about_have_an_axis_each(page):
     assert page.chart.plot.series[2]["label"] == "measured (right)"
     page.chart.choice.value = "target"
     wait_for(lambda: len(page.chart.plot.axes) == 2)
+
+
+def test_measures_that_the_domain_does_not_publish_are_folded(page):
+    page._press("Step")
+    do(page)
+    assert "pace" in page.others.content and "task reward" not in page.others.content
+    assert page.further.content.startswith("also measured: task reward **")
+
+
+def test_an_axis_of_zeros_has_the_range_of_the_request(page):
+    do(page, lambda session: session.set(target=0.0))
+    page._press("Step")
+    do(page)
+    page.chart.choice.value = "fire"
+    wait_for(lambda: len(page.chart.plot.axes) == 3)
+    assert page.chart.plot.scales["y"]["range"] == (-0.5, 2.0) and page.chart.plot.scales["right"]["range"] == (
+        0.0,
+        1.0,
+    )
+
+
+def test_the_page_for_keys_has_the_shared_look():
+    text = pad_page()
+    assert stylesheet() in text and icon_link() in text and "LOOK" not in text

@@ -93,7 +93,7 @@ def test_the_camera_follows_turns_or_stays(server, monkeypatch):
 
     view.mode.value = scene_view.TURN
     session.steer(course=90.0)
-    session.step()
+    session.run(2.1)  # until it has turned
     view.update()
     x, y = session.base_env.simulation.positions[0, :2]
     assert view._root.position[:2] == pytest.approx([-y, x], abs=1e-5), "what lies ahead is ahead in the picture"

@@ -55,10 +55,17 @@ class TestHumanoid:
         assert report.complying is not None and "step_length" in report.measured
 
     def test_the_course_turns_and_wraps_around(self, humanoid):
+        humanoid.steer(course=0.0)
         humanoid.reset(seed=1)
         humanoid.steer(course=190.0)
         assert humanoid.controls == {"course": -170.0}
-        assert humanoid.base_env.course[0] == pytest.approx(math.radians(-170.0))
+        assert humanoid.base_env.course[0] == 0.0
+        humanoid.run(0.1)
+        assert humanoid.base_env.course[0] == pytest.approx(math.radians(-4.5)), "45 deg/s, on the shorter way"
+        recording = humanoid.recording()
+        assert [event["controls"] for event in recording.events][-1] == {"course": pytest.approx(-4.5)}
+        humanoid.reset(seed=1)
+        assert humanoid.base_env.course[0] == pytest.approx(math.radians(-170.0)), "an episode begins there"
         humanoid.say("turn left by 30 degrees")
         assert humanoid.controls == {"course": -140.0}
         for bad, message in [({"course": math.nan}, "course = nan"), ({"altitude": 1.0}, "no live control named")]:

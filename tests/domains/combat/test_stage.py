@@ -5,13 +5,13 @@ import pytest
 import torch
 
 from coachable.domains.combat.machine_scene import PART_COLOURS, machine, plan_of, player
-from coachable.domains.combat.stage import ELEMENT_COLOURS, LAMPS, CombatStage
+from coachable.domains.combat.stage import ELEMENT_COLOURS, LAMPS, CombatStage, _warning
 from coachable.envs.combat import constants as c
 from coachable.envs.combat.env import CombatEnv
 from coachable.envs.combat.state import ACTIVE, IDLE, TELEGRAPH
 from coachable.envs.combat.tables import ALL_MACHINES, ELEMENTS, MACHINES, TRAPS, WEAPONS
 from coachable.scene import palette
-from coachable.scene.parts import SHAPES
+from coachable.scene.parts import SHAPES, Parts
 
 
 @pytest.fixture
@@ -107,6 +107,23 @@ def test_attacks_mark_the_ground_that_they_reach(env, phase, colour):
     for slot in range(4):
         env.state.attack.fill_(slot)
         assert len(shown(stage.frame(env).glows, colour)) > 0
+
+
+def test_a_bite_is_one_sector_of_the_ground():
+    glows = Parts()
+    _warning(glows, np.zeros(2), 0.5, 1.0, "cone", 8.0, palette.YELLOW)
+    sector = glows.of("sector")
+    assert len(glows) == len(sector) == 1
+    assert sector.sizes[0, :2].tolist() == [16.0, 16.0] and sector.positions[0, :2].tolist() == [0.0, 0.0]
+
+
+def test_the_bar_of_a_tall_machine_is_in_the_picture(env):
+    env.traits.radius[:] = 4.0
+    stage = CombatStage()
+    boxes = stage.frame(env).parts.of("box")
+    bar = boxes.positions[(boxes.colours == palette.GREEN).all(1) & np.isclose(boxes.sizes[:, 0], 2.4)]
+    place = env.state.enemy_position[:, 0, 0].numpy()
+    assert bar[0, 2] < 5.0 and np.hypot(*(bar[0, :2] - place)) > 4.0, "in front of its body"
 
 
 def test_a_line_of_fire_when_a_round_is_gone(env):

@@ -15,6 +15,7 @@ from coachable.envs.racing import RacingEnv
 from coachable.envs.racing.circuit.circuits import SETS
 from coachable.envs.racing.race.referee import TELEMETRY
 from coachable.envs.racing.race.scenarios import Conditions
+from coachable.evaluation.wording import measured_text, measures_by_parameter
 from coachable.scene.renderer import SceneRenderer
 from coachable.transforms import coachable_env
 
@@ -134,3 +135,21 @@ def test_events_are_what_their_names_say(family, names):
 def test_families_are_checked_everywhere(make):
     with pytest.raises(ValueError, match="unknown family 'speed': expected drift, resources or aggressiveness"):
         make("speed")
+
+
+@pytest.mark.parametrize(
+    ("family", "parameter", "measures"),
+    [
+        ("resources", "tire", ["wear_per_km"]),
+        ("resources", "overtake", ["overtake"]),
+        ("drift", "slip_angle_rear", ["sideslip_corners", "slip_angle_rear"]),
+        ("aggressiveness", "lateral", ["lateral_least", "lateral"]),
+    ],
+)
+def test_a_request_has_its_measures_beside_it(family, parameter, measures):
+    domain = load_domain(f"racing_{family}")
+    names = ["lateral_least", "lateral", "slip_angle_rear", "sideslip_corners", "wear_per_km", "overtake", "pace"]
+    space = domain.make_space()
+    groups = measures_by_parameter(space, [n for n in names if n in measures or n == "pace"], domain.beside)
+    assert groups[parameter] == measures and groups[""] == ["pace"]
+    assert measured_text(domain, space, "wear_per_km", 0.0092) == ("0.92%" if family == "resources" else "0.0092")

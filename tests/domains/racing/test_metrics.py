@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 
 from coachable.domains.racing.metrics import RacingMeasures
-from coachable.envs.racing.race.features import GAPS
+from coachable.envs.racing.race.features import GAPS, OVERTAKE
 from coachable.envs.racing.race.observation import own_columns
 from coachable.envs.racing.race.referee import TELEMETRY
 
@@ -43,6 +43,25 @@ def test_margins_are_judged_by_cars_nearby(gaps, judged, kept, longitudinal, lat
         expected = float("nan") if value is None else value
         assert found[name].item() == pytest.approx(expected, nan_ok=True)
     assert measures.needs == "another car within 10 m"
+
+
+def test_the_smallest_gap_is_what_a_margin_is_about():
+    measures = RacingMeasures("aggressiveness")
+    gaps = ([(4.0, 0.0, 1.0)], [(1.5, 0.0, 1.0)], [(0.2, 0.0, 1.0)])
+    found = [measures.step(race(gap, [1.0, 0.5])) for gap in gaps]
+    record = {name: torch.stack([row[name] for row in found]) for name in found[0]}
+    summary = measures.summarise(record, torch.tensor([[True], [True], [False]]))  # the last one does not count
+    assert summary["longitudinal_least"].item() == 1.5 and summary["longitudinal"].item() == 2.75
+    assert summary["lateral_least"].isnan().all()
+
+
+def test_gains_are_measured_among_others_only():
+    measures = RacingMeasures("resources")
+    alone = measures.step(race([], [1.0, 1.0, 0.0, 0.0]))
+    assert alone["overtake"].isnan().all() and alone["defend"].isnan().all()
+    step = race([(4.0, 0.0, 1.0)], [1.0, 1.0, 0.0, 0.0])
+    step["next", "style_features"][0, OVERTAKE] = 0.3
+    assert measures.step(step)["overtake"].item() == pytest.approx(3.0)  # [m/s], of 0.1 s
 
 
 def test_alone_on_the_track_no_margin_is_judged():

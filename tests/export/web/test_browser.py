@@ -4,6 +4,7 @@ import contextlib
 import functools
 import http.server
 import json
+import os
 import shutil
 import subprocess
 import threading
@@ -102,8 +103,11 @@ def browser(tmp_path):
 
 
 def test_the_page_follows_its_sliders_and_asks_no_other_site(browser, address):
+    begin = time.monotonic()
     browser.call("Page.navigate", url=f"{address}#pose=t_pose&step_length={LENGTHS[0]}")
     wait_for(lambda: browser.evaluate("document.getElementById('loading')?.hidden === true"), 120)
+    wait_for(lambda: seconds(browser) > 0, 120)
+    print(f"acts after {time.monotonic() - begin:.1f} s, at a load of {os.getloadavg()[0]:.1f}")  # shown by pytest -s
     assert browser.evaluate("document.querySelector('input[value=t_pose]').checked")
     measured = []
     for length in LENGTHS:

@@ -3,15 +3,19 @@
 import base64
 import gzip
 import json
+import math
 import shutil
 import subprocess
 from importlib.resources import files
 from pathlib import Path
 
 import pytest
+import torch
 
 from coachable.cli import main
 from coachable.domain import load_domain
+from coachable.domains.humanoid.metrics import FORWARD_SPEED
+from coachable.domains.humanoid.stage import HumanoidStage
 from coachable.export.web import pinned_files
 from coachable.scene.frame import Frame, Gauge
 from coachable.scene.parts import Parts
@@ -37,9 +41,36 @@ def test_a_walker_with_a_styled_speed_measures_it():
     assert domain.make_web is not None
     part = domain.make_web(domain.make_space())
     observation, measured, mark, memory, terminated = part.features(*part.example.values())
-    assert [measure.parameter for measure in part.measures] == ["pose", "step_length", "speed"]
+    assert [measure.parameter for measure in part.measures] == ["pose", "step_length", "speed", "course"]
     shapes = [tuple(result.shape) for result in (observation, measured, mark, memory, terminated)]
-    assert shapes == [(1, 82), (1, 3), (1, 5), tuple(part.example["memory"].shape), (1,)]
+    assert shapes == [(1, 82), (1, 4), (1, 5), tuple(part.example["memory"].shape), (1,)]
+
+
+def test_a_heading_is_the_direction_of_travel():
+    domain = load_domain("humanoid")
+    assert domain.make_web is not None
+    part = domain.make_web(domain.make_space())
+    start = {name: torch.tensor([part.starts[0][name]], dtype=torch.float64) for name in ("positions", "memory")}
+    velocities = torch.zeros_like(part.example["velocities"])
+    sensors = torch.zeros_like(part.example["sensors"])
+    headings = []
+    for course in (0.0, 30.0):
+        controls = torch.tensor([[course]], dtype=torch.float64)
+        arguments = (start["positions"], velocities, sensors, controls, part.example["style"], start["memory"])
+        observation, measured, *_ = part.features(*arguments)
+        forward, left = observation[0, FORWARD_SPEED : FORWARD_SPEED + 2].tolist()
+        headings.append((measured[0, -1].item(), course + math.degrees(math.atan2(left, forward))))
+    for heading, expected in headings:
+        assert heading == pytest.approx(expected, abs=1e-3)
+
+
+def test_the_page_has_the_looks_of_the_stage():
+    domain = load_domain("humanoid")
+    assert domain.make_web is not None
+    part = domain.make_web(domain.make_space())
+    assert [meaning for _, meaning in part.scene.legend] == [meaning for _, meaning in HumanoidStage.legend]
+    assert part.scene.bodies["right_foot"] != part.scene.bodies["left_foot"]
+    assert part.opens == {"pose": "t_pose", "step_length": 0.5}
 
 
 def test_assets_belong_to_the_page(capsys, tmp_path):
@@ -71,7 +102,8 @@ def test_an_archive_with_another_hash_is_refused():
 
 SCRIPT = """
 import assert from "node:assert/strict";
-const { entriesOf, defaultsOf, thetaOf, controlsOf, fragmentOf, fromFragment, isOutside } = await import(REQUEST);
+const { approach, entriesOf, defaultsOf, thetaOf, controlsOf, ...links } = await import(REQUEST);
+const { fragmentOf, fromFragment, isOutside } = links;
 const { Readout } = await import(READOUT);
 const manifest = {
   style_space: { parameters: [
@@ -95,6 +127,15 @@ assert.equal(readout.mean("held"), null);
 assert.equal(readout.mean("held"), 1); // the first row has left the window
 assert.equal(readout.mean("length"), 0.5);
 assert.deepEqual(readout.last("length"), [0.4, 0.6]);
+const course = { low: -180, high: 180, circular: true, rate: 40 };
+assert.equal(approach(course, 0, 90, 0.5), 20);
+assert.equal(approach(course, 80, 90, 0.5), 90);
+assert.equal(approach(course, 170, -150, 0.5), -170); // the shorter way
+assert.equal(approach(course, -170, 150, 0.25), 180 - 360);
+assert.equal(approach({ ...course, rate: null }, 0, 90, 0.01), 90);
+const towards = new Readout([{ name: "heading", circular: true }]);
+[170, -170].forEach((value) => towards.add(0, [value]));
+assert.equal(Math.abs(Math.round(towards.mean("heading"))), 180);
 readout.clear();
 assert.equal(readout.mean("length"), null);
 """

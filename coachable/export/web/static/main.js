@@ -7,6 +7,7 @@ async function start() {
   document.title = manifest.title;
   at("title").textContent = manifest.title;
   at("summary").textContent = manifest.summary;
+  if (manifest.home) at("home").href = manifest.home;
   tellLoads(manifest);
   const kind = await import(manifest.kind === "recordings" ? "./recorded.js" : "./simulated.js");
   await kind.start(manifest);

@@ -1,6 +1,6 @@
 // What all pages share: messages, buttons, keys and links.
 
-import { at, megabytes } from "./dom.js";
+import { at, make, megabytes } from "./dom.js";
 
 export class Page {
   resting = "Play"; // what the button says while the page is paused
@@ -19,6 +19,16 @@ export class Page {
     at("banner").hidden = !text;
     clearTimeout(this.quiet);
     if (milliseconds) this.quiet = setTimeout(() => this.tell(""), milliseconds);
+  }
+
+  /** List what the colours of the scene mean. */
+  explain(legend) {
+    at("legend-more").hidden = !legend.length;
+    at("meanings").append(...legend.map(([colour, meaning]) => {
+      const patch = make("i", {});
+      patch.style.background = colour;
+      return make("li", {}, patch, meaning);
+    }));
   }
 
   /** Address of what is to be seen now. */

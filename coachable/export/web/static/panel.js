@@ -20,7 +20,7 @@ export class Panel {
       form.append(entry.options ? this.#choice(entry, own, ask) : this.#number(entry, own, ask));
     }
     for (const measure of measures.filter(({ parameter }) => !parameter)) {
-      others.append(make("div", {}, make("dt", {}, words(measure.text)), this.#value(measure, "dd")));
+      others.append(make("div", {}, make("dt", {}, `${words(measure.text)}:`), this.#value(measure, "dd")));
     }
   }
 
@@ -168,6 +168,7 @@ function placeOf({ from, to }, value) {
   return `calc(12px + ${share.toFixed(4)} * (100% - 24px))`;
 }
 
-function textOfMeasure({ share, unit }, value) {
+function textOfMeasure({ share, unit, circular }, value) {
+  if (circular) return withUnit(String(Math.round(value) || 0), unit);
   return share ? `${Math.round(100 * value)} % of the time` : withUnit(value.toFixed(2), unit);
 }

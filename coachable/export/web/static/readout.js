@@ -36,8 +36,13 @@ export class Readout {
   /** Mean of a measure, or null if there is no value. */
   mean(name) {
     const index = this.measures.findIndex((measure) => measure.name === name);
-    const values = this.measures[index].at_marks ? this.last(name) : this.rows.map((row) => row.values[index]);
+    const { at_marks, circular } = this.measures[index];
+    const values = at_marks ? this.last(name) : this.rows.map((row) => row.values[index]);
     const known = values.filter((value) => !Number.isNaN(value));
+    if (circular && known.length) {
+      const sum = (part) => known.reduce((total, value) => total + part((value * Math.PI) / 180), 0);
+      return (Math.atan2(sum(Math.sin), sum(Math.cos)) * 180) / Math.PI;
+    }
     return known.length ? known.reduce((sum, value) => sum + value, 0) / known.length : null;
   }
 }

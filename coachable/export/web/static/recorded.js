@@ -19,14 +19,10 @@ class RecordedPage extends Page {
     at("where").textContent = "Everything comes from this site.";
     at("scale").hidden = true;
     at("trained").hidden = true;
-    at("scene").setAttribute("aria-label", "Recording of the agent");
-    at("keys").textContent = "Keys: Space pauses, R starts again, arrows move the slider in focus.";
-    at("legend-more").hidden = !manifest.legend.length;
-    at("meanings").append(...manifest.legend.map(([colour, meaning]) => {
-      const patch = make("i", {});
-      patch.style.background = colour;
-      return make("li", {}, patch, meaning);
-    }));
+    at("legend").classList.add("recorded");
+    at("scene").setAttribute("aria-label", "Recording of the agent. Arrow keys turn the camera.");
+    at("keys").textContent = "Keys: Space pauses, R starts again, arrows move the slider in focus or turn the camera.";
+    this.explain(manifest.legend);
     this.loaded = new Map();
     const { number, moment } = fromFragment(manifest, location.hash);
     const files = download([...manifest.backdrops, manifest.recordings[number].file], manifest.downloads);

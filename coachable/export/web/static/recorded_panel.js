@@ -31,11 +31,13 @@ export class RecordedPanel {
         own.forEach(({ name }) => beside.add(name));
         form.append(parameter.kind === "choice" ? this.#choice(parameter, own, ask) : this.#slider(parameter, own, ask));
       }
-      const told = fixed.filter(({ values }) => values[0] !== 0).map((p) => `${words(p.name).toLowerCase()} ${textOf(p, p.values[0])}`);
+      const told = fixed.filter(({ values }) => values[0] !== 0).map((p) => `${p.text} ${textOf(p, p.values[0])}`);
       if (told.length) form.append(make("p", { class: "small" }, `Requested in all recordings: ${told.join(", ")}.`));
     }
     for (const measure of manifest.measures.filter(({ name }) => !beside.has(name))) {
-      others.append(make("div", {}, make("dt", {}, words(measure.text)), this.#value(measure, "dd")));
+      const line = make("div", {}, make("dt", {}, `${words(measure.text)}:`), this.#value(measure, "dd"));
+      this.show.push(({ measured }) => (line.hidden = measured[measure.name] === null));
+      others.append(line);
     }
   }
 
@@ -49,8 +51,9 @@ export class RecordedPanel {
   sentences(number) {
     const { style, measured } = this.manifest.recordings[number];
     const parameters = varied(this.manifest);
-    const requested = parameters.length > SLIDERS ? this.labels[number] : parameters.map((p) => `${words(p.name)} ${textOf(p, style[p.name])}`).join(", ");
-    const found = this.manifest.measures.map((measure) => `${measure.text} ${textOfMeasure(measure, measured[measure.name])}`);
+    const requested = parameters.length > SLIDERS ? this.labels[number] : parameters.map((p) => `${words(p.text)} ${textOf(p, style[p.name])}`).join(", ");
+    const known = this.manifest.measures.filter(({ name }) => measured[name] !== null);
+    const found = known.map((measure) => `${measure.text} ${textOfMeasure(measure, measured[measure.name])}`);
     return `Requested: ${requested}. Measured in the recording: ${found.join(", ")}.`;
   }
 
@@ -70,7 +73,7 @@ export class RecordedPanel {
       asked.textContent = textOf(parameter, style[name]);
       input.setAttribute("aria-valuetext", asked.textContent);
     });
-    const top = make("div", { class: "row" }, make("label", { class: "name", for: id }, words(name)), asked);
+    const top = make("div", { class: "row" }, make("label", { class: "name", for: id }, words(parameter.text)), asked);
     const text = make("p", { class: "help", id: `${id}-help` }, sentence(help));
     const slider = make("div", { class: "slider ranged recorded" }, input, ...ticks);
     return make("div", { class: "request" }, top, text, slider, ...measures.flatMap((m) => this.#bars(m, parameter)));
@@ -79,7 +82,7 @@ export class RecordedPanel {
   #choice(parameter, measures, ask) {
     const { name, values, help } = parameter;
     const options = this.#options(name, values.map((value) => words(value)), (i) => ask(name, values[i]), ({ style }) => values.indexOf(style[name]));
-    const legend = make("legend", {}, words(name));
+    const legend = make("legend", {}, words(parameter.text));
     const lines = measures.flatMap((measure) => this.#bars(measure, parameter));
     return make("fieldset", { class: "request" }, legend, make("p", { class: "help" }, sentence(help)), options, ...lines);
   }
@@ -90,8 +93,7 @@ export class RecordedPanel {
     const neutral = recordings[0].style;
     this.labels = recordings.map(({ style }) => {
       const asked = parameters.filter(({ name }) => style[name] !== neutral[name]);
-      const text = asked.map((p) => (p.values.length > 2 || p.kind === "choice" ? `${words(p.name)} ${textOf(p, style[p.name])}` : words(p.name)));
-      return text.join(", ") || "No request";
+      return asked.map((p) => styleText(p, style[p.name])).join(", ") || "No request";
     });
     const help = make("p", { class: "help", "aria-live": "off" });
     this.show.push(({ style }) => {
@@ -113,17 +115,19 @@ export class RecordedPanel {
     const { name } = parameter;
     const top = make("div", { class: "row" }, make("span", { class: "help" }, words(measure.text)), this.#value(measure, "output"));
     const bars = shape("svg", { class: "steps recorded", "aria-hidden": "true" });
-    const known = this.manifest.recordings.map(({ measured }) => measured[measure.name]).filter((value) => value !== null);
-    const asked = measure.name === name ? parameter.values : [];
-    const [low, high] = [Math.min(0, ...known), Math.max(1e-9, ...known, ...asked)];
+    const asked = measure.asked ? parameter.values : [];
     this.show.push(({ style }) => {
+      const rows = along(this.manifest, style, name).map(([value, number]) => [value, this.manifest.recordings[number].measured[measure.name]]);
+      const known = rows.map(([, found]) => found).filter((value) => value !== null);
+      const [low, high] = [Math.min(0, ...known), Math.max(1e-9, ...known, ...asked)];
       const [width, height, foot, head] = [bars.clientWidth || 300, 84, 6, 14];
       const column = (width - 24) / Math.max(parameter.values.length - 1, 1);
       const up = (value) => head + ((high - value) / (high - low)) * (height - foot - head);
-      const shapes = along(this.manifest, style, name).flatMap(([value, number]) => {
-        const found = this.manifest.recordings[number].measured[measure.name];
-        const x = 12 + parameter.values.indexOf(value) * column;
-        const half = Math.min(0.36 * column, 18);
+      const shapes = rows.flatMap(([value, found]) => {
+        const at = parameter.values.indexOf(value);
+        const x = 12 + at * column; // below the slider's own mark
+        const half = Math.min(0.36 * column, 10);
+        const anchor = { 0: "start", [parameter.values.length - 1]: "end" }[at] ?? "middle";
         const here = value === style[name] ? "here" : "";
         const drawn = [];
         if (found !== null) {
@@ -131,8 +135,9 @@ export class RecordedPanel {
           drawn.push(shape("rect", { class: here, x: x - half, y, width: 2 * half, height: Math.max(size, 1), rx: 3 }));
         }
         const text = found === null ? "–" : shortOf(measure, found);
-        drawn.push(shape("text", { class: here, x, y: (found === null ? up(0) : Math.min(up(found), up(0))) - 4 }, text));
-        if (asked.length) drawn.push(shape("line", { x1: x - half - 4, x2: x + half + 4, y1: up(value), y2: up(value) }));
+        const shift = anchor === "start" ? -half : anchor === "end" ? half : 0;
+        drawn.push(shape("text", { class: `${here} ${anchor}`, x: x + shift, y: (found === null ? up(0) : Math.min(up(found), up(0))) - 4 }, text));
+        if (asked.length) drawn.push(shape("line", { x1: x - half - 2, x2: x + half + 2, y1: up(value), y2: up(value) }));
         return drawn;
       });
       bars.replaceChildren(...shapes);
@@ -150,12 +155,20 @@ export class RecordedPanel {
   }
 }
 
+/** What a whole style asks for by one weight. */
+function styleText(parameter, value) {
+  const { text, kind, values } = parameter;
+  if (kind === "choice") return `${words(text)} ${textOf(parameter, value)}`;
+  if (value < 0 && values.filter((other) => other < 0).length === 1) return `Avoid ${text}`;
+  return value > 0 && values.filter((other) => other > 0).length === 1 ? words(text) : `${words(text)} ${textOf(parameter, value)}`;
+}
+
 function textOf({ kind, unit }, value) {
   return kind === "choice" ? words(value) : withUnit(plain(value), unit);
 }
 
 function textOfMeasure(measure, value) {
-  if (value === null) return "no value";
+  if (value === null) return "–";
   if (measure.answer) return value ? "yes" : "no";
   return measure.share ? shortOf(measure, value) : withUnit(shortOf(measure, value), measure.unit);
 }

@@ -9,11 +9,12 @@ const COLOURS = {
   light: { sky: "#dde7f0", sun: 2.4, fill: 1.7 },
   dark: { sky: "#141b24", sun: 1.5, fill: 0.75 },
 };
-const SHAPES = ["box", "ball", "cylinder"]; // in the order of the files
+const SHAPES = ["box", "ball", "cylinder", "sector"]; // in the order of the files
 const GEOMETRIES = {
   box: new THREE.BoxGeometry(1, 1, 1),
   ball: new THREE.SphereGeometry(0.5, 24, 16),
   cylinder: new THREE.CylinderGeometry(0.5, 0.5, 1, 24).rotateX(Math.PI / 2),
+  sector: new THREE.CircleGeometry(0.5, 12, -Math.PI / 3, (2 * Math.PI) / 3).translate(0, 0, 0.5),
 };
 const GLOW = 0.45; // opacity of translucent primitives
 const TURN = 32767; // a quaternion's 1

@@ -60,7 +60,7 @@ export function along(manifest, style, name) {
 /** The recording that is most like what the fragment of an address names, and the moment in it [s]. */
 export function fromFragment(manifest, fragment) {
   const given = new URLSearchParams(fragment.replace(/^#/, ""));
-  const style = { ...manifest.recordings[0].style };
+  const style = { ...manifest.recordings[manifest.opens ?? 0].style };
   for (const { name, kind, values } of varied(manifest)) {
     const text = given.get(name)?.trim();
     if (kind === "choice" ? values.includes(text) : text && Number.isFinite(Number(text))) {

@@ -6,7 +6,7 @@ const MARGIN = 0.2; // share of the trained range by which a slider exceeds it t
 export function entriesOf(manifest) {
   const styles = manifest.style_space.parameters.map((parameter) => ({ ...parameter, style: true }));
   const controls = manifest.controls.map((control) => ({ ...control, kind: "control" }));
-  return [...styles, ...controls].map((entry) => ({ ...entry, label: words(entry.name), ...sliderOf(entry) }));
+  return [...styles, ...controls].map((entry) => ({ ...entry, label: words(manifest.names?.[entry.name] ?? entry.name), ...sliderOf(entry) }));
 }
 
 /** Range and step of an entry's slider. A control has no trained range of its own. */
@@ -23,6 +23,15 @@ function sliderOf({ kind, low, high }) {
 /** Every entry's default by name. */
 export function defaultsOf(entries) {
   return Object.fromEntries(entries.map(({ name, default: value }) => [name, value]));
+}
+
+/** The value of a control some time [s] later, while it approaches another one at its rate on the shorter way. */
+export function approach({ low, high, circular, rate }, present, wanted, seconds) {
+  const turn = high - low;
+  const apart = wanted - present - (circular ? turn * Math.round((wanted - present) / turn) : 0);
+  if (rate === null || Math.abs(apart) <= rate * seconds) return wanted;
+  const next = present + Math.sign(apart) * rate * seconds;
+  return circular ? next - turn * Math.floor((next - low) / turn) : next;
 }
 
 /** Theta of a request: options as one-hot vectors, and numbers as they are. */

@@ -4,7 +4,7 @@ import { at } from "./dom.js";
 import { Page, download } from "./page.js";
 import { Panel } from "./panel.js";
 import { Readout } from "./readout.js";
-import { controlsOf, defaultsOf, entriesOf, fragmentOf, fromFragment, thetaOf } from "./request.js";
+import { approach, controlsOf, defaultsOf, entriesOf, fragmentOf, fromFragment, thetaOf } from "./request.js";
 import { createSimulator } from "./simulator.js";
 
 const THIRD_PARTY = "third_party";
@@ -40,7 +40,7 @@ class SimulatedPage extends Page {
     const parts = new Map(own.map((name, i) => [name, contents[i]]));
     this.simulator = await createSimulator({ mujoco, ort, manifest, files: parts });
     try {
-      this.scene = new drawing.Scene(at("scene"), this.simulator.kinematics, manifest.followed);
+      this.scene = new drawing.Scene(at("scene"), this.simulator.kinematics, manifest.followed, manifest.scene);
     } catch (error) {
       console.error(error);
       this.tell("This browser cannot draw in 3-D: the numbers go on.");
@@ -50,12 +50,13 @@ class SimulatedPage extends Page {
   start() {
     const { manifest } = this;
     this.entries = entriesOf(manifest);
-    at("scene").setAttribute("aria-label", manifest.picture);
+    at("scene").setAttribute("aria-label", `${manifest.picture}. Arrow keys turn the camera.`);
+    this.explain(manifest.legend);
     this.readout = new Readout(manifest.measures);
     this.panel = new Panel(at("requests"), at("others"), this.entries, manifest.measures, (name, value) =>
       this.ask({ ...this.request, [name]: value }),
     );
-    this.request = fromFragment(this.entries, location.hash, defaultsOf(this.entries));
+    this.request = fromFragment(this.entries, location.hash, { ...defaultsOf(this.entries), ...manifest.opens });
     this.episode = 0;
     this.ask(this.request);
     this.again();
@@ -71,17 +72,29 @@ class SimulatedPage extends Page {
   ask(request) {
     this.request = request;
     this.simulator.style = Float32Array.from(thetaOf(this.entries, request));
-    this.simulator.controls = Float64Array.from(controlsOf(this.entries, request));
     this.readout.clear();
     this.panel.request(request);
     this.panel.measured(this.readout);
     this.announceAt = this.time + ANNOUNCE;
+    this.#steer(0);
     history.replaceState(null, "", fragmentOf(this.entries, request));
+  }
+
+  /** Let the controls approach what is asked for during some time [s]. */
+  #steer(seconds) {
+    const { controls } = this.simulator;
+    const wanted = controlsOf(this.entries, this.request);
+    this.manifest.controls.forEach((control, i) => (controls[i] = approach(control, controls[i], wanted[i], seconds)));
+    const course = this.manifest.controls.findIndex(({ unit }) => unit === "deg");
+    const length = this.manifest.measures.find(({ at_marks }) => at_marks);
+    this.scene?.ask(length ? this.request[length.parameter] : null, course < 0 ? 0 : (controls[course] * Math.PI) / 180);
   }
 
   /** Begin an episode in another of the initial states. */
   again() {
     this.simulator.reset(this.episode++);
+    this.simulator.controls = Float64Array.from(this.manifest.controls, (control) => control.default);
+    this.#steer(0);
     this.readout.clear();
     this.panel.measured(this.readout);
     this.pending = 0;
@@ -128,12 +141,13 @@ class SimulatedPage extends Page {
 
   /** One control step. */
   async advance() {
+    this.#steer(this.manifest.physics.control_step);
     const { measured, mark, terminated } = await this.simulator.step();
     this.readout.add(this.time, measured);
     this.scene?.take();
     if (mark.every(Number.isFinite)) {
       const index = this.manifest.measures.findIndex(({ at_marks }) => at_marks);
-      this.scene?.mark(mark, index < 0 ? "" : measured[index].toFixed(2));
+      this.scene?.mark(mark, index < 0 ? null : measured[index]);
     }
     if (this.time >= this.announceAt) {
       this.announceAt = Infinity;

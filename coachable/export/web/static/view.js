@@ -1,7 +1,12 @@
 // What the scenes of all pages share: a camera that the visitor turns, and a picture as large as its place.
 
+const LOWEST = 0.03; // [rad], elevation
+const HIGHEST = 1.4;
+const TURN = 0.12; // [rad], per press of an arrow key
+const NEARER = 0.87; // per press of a key
+
 /**
- * Turn a view by dragging, and come nearer with the wheel or two fingers.
+ * Turn a view by dragging or with the arrow keys, and come nearer with the wheel, two fingers, plus and minus.
  *
  * @param {HTMLCanvasElement} canvas  Where the visitor drags.
  * @param {{azimuth: number, elevation: number, distance: number}} view  Angles [rad] and distance [m] to change.
@@ -12,6 +17,23 @@ export function orbit(canvas, view, limits) {
   const zoom = (factor) => {
     view.distance = Math.min(Math.max(view.distance * factor, limits.near), limits.far);
   };
+  const turn = (across, upwards) => {
+    view.azimuth += across;
+    view.elevation = Math.min(Math.max(view.elevation + upwards, LOWEST), HIGHEST);
+  };
+  const keys = {
+    ArrowLeft: () => turn(-TURN, 0),
+    ArrowRight: () => turn(TURN, 0),
+    ArrowUp: () => turn(0, TURN),
+    ArrowDown: () => turn(0, -TURN),
+    "+": () => zoom(NEARER),
+    "-": () => zoom(1 / NEARER),
+  };
+  canvas.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey || !(event.key in keys)) return;
+    event.preventDefault();
+    keys[event.key]();
+  });
   canvas.addEventListener("pointerdown", (event) => {
     fingers.set(event.pointerId, [event.clientX, event.clientY]);
     canvas.setPointerCapture(event.pointerId);
@@ -25,8 +47,7 @@ export function orbit(canvas, view, limits) {
       const apart = ([x, y]) => Math.hypot(x - other[0], y - other[1]);
       zoom(apart(before) / Math.max(apart(now), 1));
     } else {
-      view.azimuth -= 0.008 * (now[0] - before[0]);
-      view.elevation = Math.min(Math.max(view.elevation + 0.006 * (now[1] - before[1]), 0.03), 1.4);
+      turn(-0.008 * (now[0] - before[0]), 0.006 * (now[1] - before[1]));
     }
     fingers.set(event.pointerId, now);
   });
