@@ -28,7 +28,7 @@ SECONDS = 60.0  # that a command may take
 NOT_RUN = {
     r"^\S+ -m (venv|pip) |^pip ": "installs packages, which .ci/run does",
     r"pytest": "the tests, which .ci/run runs, and benchmarks",
-    r"^coachable (coach|evaluate|explain|export|report|train RECIPE|verify)$": "the name of a command",
+    r"^coachable (coach|curves|evaluate|explain|export|report|train RECIPE|verify)$": "the name of a command",
     r"collector=ray": "needs the extra [cluster], and most of them a cluster",
     r"preset=smoke|--help": "",  # is run
     r"my_circuit": "needs a circuit of the reader's",
