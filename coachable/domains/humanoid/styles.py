@@ -23,6 +23,7 @@ from coachable.envs.humanoid.features import (
 )
 from coachable.envs.humanoid.model import CONTROL_STEP
 from coachable.envs.humanoid.rewards import WALK_SPEED
+from coachable.ranges import Range
 from coachable.styles import Choice, ChoiceTolerance, Setpoint, StyleReward, StyleSpace, StyleTerm, Term, tolerance
 
 STEP_LENGTH_RANGE = (0.30, 0.65)  # [m]
@@ -118,7 +119,11 @@ def humanoid_style_reward(
             strike with the interest that makes up for the delay, so that quick steps are not preferred. 1 pays none.
         speed_scale: Scale of the speed of steps.
         speed_guide_scale: Scale of the speed's guide.
+
+    Raises:
+        ValueError: If `step_discount` lies outside (0, 1].
     """
+    Range("(0, 1]").check("step_discount", step_discount)
     bounds = torch.from_numpy(np.deg2rad(pose_bounds_deg()))
 
     def arms(margin_deg: float, sigmoid: str, value_at_margin: float) -> ChoiceTolerance:

@@ -25,7 +25,7 @@ COURSE = Control(
     Setpoint("course", -180.0, 180.0, unit="deg", help="direction of walking, left is positive"),
     _steer,
     circular=True,
-    rate=45.0,  # sudden turns fell the walker; of half turns at 60 deg/s none did
+    rate=45.0,  # sudden large turns fell the walker
 )
 
 PUSH = Push(_push, largest=200.0, unit="N")

@@ -173,6 +173,12 @@ def test_with_a_step_discount_the_discounted_reward_does_not_depend_on_the_durat
     assert reward.terms_of(step, theta)["gait"].item() == pytest.approx(longest), "nobody is paid for waiting"
 
 
+@pytest.mark.parametrize("discount", [0.0, 1.1, math.nan])
+def test_a_step_discount_outside_its_range_is_refused(discount):
+    with pytest.raises(ValueError, match="step_discount is"):
+        humanoid_style_reward(SPACE, step_discount=discount)
+
+
 GAIT_SPACE = gait_style_space()
 
 
