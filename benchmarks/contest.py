@@ -2,6 +2,7 @@
 
 import json
 import os
+import platform
 import subprocess
 import sys
 import time
@@ -20,6 +21,16 @@ def thread_settings(threads: int) -> dict[str, str]:
         "JAX_PLATFORMS": "cpu",
         "PYTHONPATH": str(HERE.parent),
     }
+
+
+def processor() -> str:
+    """Return the processor's name and its family and model, which tell apart what shares a name."""
+    try:
+        lines = [line.split(":") for line in Path("/proc/cpuinfo").read_text().splitlines() if ":" in line]
+    except OSError:
+        return platform.processor()
+    known = {key.strip(): value.strip() for key, value in reversed(lines)}
+    return f"{known.get('model name', platform.processor())}, family {known.get('cpu family')}, {known.get('model')}"
 
 
 class Worker:

@@ -11,12 +11,11 @@ less work. The gain of `matmul-bf16`, large products of matrices, is what the pr
 
 import argparse
 import json
-import platform
 import statistics
 import sys
 from pathlib import Path
 
-from contest import Worker, measure
+from contest import Worker, measure, processor
 from learner_work import WIDTH, flops_per_update
 from learner_workers import MATMUL_FLOPS, PEERS, WORKERS
 
@@ -59,16 +58,6 @@ def share_of_products(seconds: dict[str, list[float]]) -> float:
     """Return the time of an update's matrix products, at the rate of large ones, over the time of the update."""
     update, product = (statistics.median(seconds[name]) for name in (OURS, YARDSTICK))
     return flops_per_update() / update / (MATMUL_FLOPS / product)
-
-
-def processor() -> str:
-    """Return the processor's name and its family and model, which tell apart what shares a name."""
-    try:
-        lines = [line.split(":") for line in Path("/proc/cpuinfo").read_text().splitlines() if ":" in line]
-    except OSError:
-        return platform.processor()
-    known = {key.strip(): value.strip() for key, value in reversed(lines)}
-    return f"{known.get('model name', platform.processor())}, family {known.get('cpu family')}, {known.get('model')}"
 
 
 def main() -> None:

@@ -6,8 +6,9 @@ A car-step is one control step of 0.1 s (10 substeps) of one car. "physics" is t
 with projection, observation, task reward, style features and TensorDict; "race" the same with five cars and contact;
 "policy" is "step" with actions sampled by a network of 3 x 256. The rate counts CPU seconds of this process times the
 threads that it was given, best of k, so that other work on the machine disturbs it little; the wall rate is given
-beside it. `--peers` names an interpreter with highway-env and gymnasium[box2d], whose environments then step in turn
-with ours, each in a process of its own with one thread.
+beside it. `--peers` names an interpreter with highway-env, gymnasium[box2d] and envpool, whose environments then step
+in turn with ours, each in a process of its own with so many threads. The environments of highway-env and Gymnasium
+step one at a time, in Python; those of EnvPool are in C++ and step together.
 """
 
 import argparse
@@ -20,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from contest import Worker, measure
-from racing_workers import CARS, KINDS, OURS, PEERS, make_env
+from contest import Worker, measure, processor
+from racing_workers import CARS, KINDS, OURS, PEERS, POOLED, POOLS, make_env
 
 MODES = ("eager", "compiled")
 
@@ -63,14 +64,21 @@ def memory(cars: int) -> dict[str, float]:
     return {name: sum(t.nbytes for t in some) / env.num_envs for name, some in (("kept", kept), ("written", written))}
 
 
-def beside_peers(peers: str, rounds: int, seconds: float) -> dict[str, float]:
-    """Steps per CPU second of one process of each, in turn, median of the rounds; each works about so many seconds."""
-    pythons = dict.fromkeys(OURS, sys.executable) | dict.fromkeys(PEERS, peers)
-    workers = [Worker("racing_workers.py", name, python, threads=1) for name, python in pythons.items()]
-    work = {name: round((50 if name in OURS else 100) * seconds) for name in pythons}
+def beside_peers(peers: str, rounds: int, seconds: float, threads: int) -> dict[str, dict[str, float]]:
+    """Steps per CPU second and per second of one process of each, in turn, median of the rounds.
+
+    Each works about so many seconds per round.
+    """
+    pythons = dict.fromkeys(OURS, sys.executable) | dict.fromkeys((*PEERS, *POOLS), peers)
+    workers = [Worker("racing_workers.py", name, python, threads) for name, python in pythons.items()]
+    work = {name: round((50 if name in (*OURS, *POOLS) else 100) * seconds) for name in pythons}
     times = measure(workers, rounds, work)
-    cars = {name: {"race": CARS - CARS % 5}.get(name, CARS) if name in OURS else 1 for name in times}
-    return {name: cars[name] / statistics.median(t["cpu"] for t in taken) for name, taken in times.items()}
+    units = dict.fromkeys(OURS, CARS) | dict.fromkeys(PEERS, 1) | dict.fromkeys(POOLS, POOLED)
+    units["race"] = CARS - CARS % 5
+    return {
+        name: {clock: units[name] / statistics.median(t[clock] for t in taken) for clock in ("cpu", "wall")}
+        for name, taken in times.items()
+    }
 
 
 def main() -> None:
@@ -81,7 +89,7 @@ def main() -> None:
     parser.add_argument("--modes", nargs="*", choices=MODES, default=MODES)
     parser.add_argument("--rounds", type=int, default=10)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--peers", help="interpreter with highway-env and gymnasium[box2d]")
+    parser.add_argument("--peers", help="interpreter with highway-env, gymnasium[box2d] and envpool")
     parser.add_argument("--json", type=Path, help="where to write the numbers")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
@@ -100,11 +108,14 @@ def main() -> None:
         found[name] = memory(cars)
         print("bytes per car, {}: {kept:.0f} kept, {written:.0f} written".format(name, **found[name]))
     if args.peers:
-        rates = found["beside"] = beside_peers(args.peers, 5, 1.0)
-        print("| in turn, one thread | steps / CPU s | times highway-env |\n|-|-|-|")
+        rates = found["beside"] = beside_peers(args.peers, 5, 1.0, args.threads)
+        print(f"in turn, {args.threads} threads, {processor()}")
+        print("| | steps / CPU s | steps / s (wall) | times highway-env, times envpool racetrack (wall) |\n|-|-|-|-|")
+        rivals = [rates[peer]["wall"] for peer in ("highway-env", "envpool racetrack") if peer in rates]
         for name, rate in rates.items():
-            ratio = rate / rates["highway-env"] if "highway-env" in rates else float("nan")
-            print(f"| {name} | {rate:,.0f} | {ratio:,.2f} |")
+            over = [rate["wall"] / rival for rival in rivals]
+            ratios = ", ".join(f"{ratio:,.2f}" for ratio in over)
+            print(f"| {name} | {rate['cpu']:,.0f} | {rate['wall']:,.0f} | {ratios} |")
     if args.json:
         args.json.write_text(json.dumps(found))
 

@@ -1,5 +1,6 @@
 """The contestants of benchmarks/racing.py, each in a process of its own: `python racing_workers.py NAME`."""
 
+import os
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -7,6 +8,8 @@ from typing import Any
 from contest import serve
 
 CARS = 4096  # 4095 in races of five
+POOLED = 64  # environments of EnvPool, the fastest number of 16, 64 and 256
+THREADS = int(os.environ.get("OMP_NUM_THREADS", "1"))
 
 
 def physics(num_cars: int, compiled: bool, device: str) -> Callable[[], Any]:
@@ -82,12 +85,12 @@ KINDS: dict[str, Callable[..., Callable[[], Any]]] = {
 
 
 def repeated(kind: str) -> Callable[[], Callable[[int], None]]:
-    """A contestant of ours, compiled, one thread; a unit of work is one control step of all cars."""
+    """A contestant of ours, compiled; a unit of work is one control step of all cars."""
 
     def set_up() -> Callable[[int], None]:
         import torch
 
-        torch.set_num_threads(1)
+        torch.set_num_threads(THREADS)
         torch.manual_seed(0)
         step = KINDS[kind](CARS, True, "cpu")
 
@@ -123,9 +126,36 @@ def gymnasium(name: str) -> Callable[[], Callable[[int], None]]:
     return set_up
 
 
+def envpool(name: str) -> Callable[[], Callable[[int], None]]:
+    """A peer in C++: many environments, random actions; a unit of work is one step of all. Ended ones start again."""
+
+    def set_up() -> Callable[[int], None]:
+        import envpool
+        import numpy as np
+
+        env = envpool.make_gymnasium(name, num_envs=POOLED, num_threads=THREADS, seed=0)
+        env.reset()
+        random, actions = np.random.default_rng(0), env.action_space
+        discrete = hasattr(actions, "n")
+
+        def run(steps: int) -> None:
+            for _ in range(steps):
+                if discrete:
+                    action = random.integers(0, actions.n, POOLED)
+                else:
+                    action = random.uniform(actions.low, actions.high, (POOLED, *actions.shape)).astype("float32")
+                env.step(action)
+
+        return run
+
+    return set_up
+
+
 OURS = tuple(KINDS)
 PEERS = {"highway-env": "racetrack-v0", "car-racing": "CarRacing-v3"}
+POOLS = {"envpool racetrack": "Racetrack-v0", "envpool highway": "Highway-v0", "envpool car-racing": "CarRacing-v3"}
 WORKERS = {kind: repeated(kind) for kind in KINDS} | {peer: gymnasium(name) for peer, name in PEERS.items()}
+WORKERS |= {peer: envpool(name) for peer, name in POOLS.items()}
 
 if __name__ == "__main__":
     serve(WORKERS, sys.argv[1], warmup=3)

@@ -269,16 +269,22 @@ def announce(config: dict[str, Any], trainer: Trainer) -> None:
     settings, learner = typed_settings(config), trainer.learner
     parameters = sum(p.numel() for p in learner.loss_module.actor_network_params.parameters())
     device, bf16 = pick_device(settings.device), learner.precision == "bf16"
-    seconds = estimate_update_seconds(parameters, settings.train.batch_size, bf16, device)
 
-    def hours(train: TrainSettings, frames: int) -> float:
-        return max(frames * (train.utd_ratio or 0) * seconds, frames / (train.throttle or float("inf"))) / 3600
+    def update_seconds(settings: Any) -> float:
+        samples = settings.train.batch_size * (settings.impersonation.n + 1)
+        return estimate_update_seconds(parameters, samples, bf16, device)
 
+    def hours(settings: Any, frames: int) -> float:
+        train: TrainSettings = settings.train
+        slowest = frames / (train.throttle or float("inf"))
+        return max(frames * (train.utd_ratio or 0) * update_seconds(settings), slowest) / 3600
+
+    seconds = update_seconds(settings)
     remaining = max(0, settings.train.total_frames - trainer.frames)
-    time_left = hours(settings.train, remaining)
+    time_left = hours(settings, remaining)
     stages = [typed_settings(stage) for stage in settings.stages]
     number = next((i for i, stage in enumerate(stages, 1) if stage.stage == settings.stage), 0)
-    later = sum(hours(stage.train, stage.train.total_frames) for stage in stages[number:])
+    later = sum(hours(stage, stage.train.total_frames) for stage in stages[number:])
     if settings.resume:
         print(f"Resumed {settings.resume} at {trainer.frames:,} env-steps")
     print(f"Found {detect().describe()}: preset {settings.preset}, {learner.precision} updates")

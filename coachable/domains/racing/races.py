@@ -1,6 +1,6 @@
 """Evaluation of aggressiveness: races of five agents with different margins (paper).
 
-Two of the five cars have the lateral margin under test, the other three have moderate ones. The pair starts last
+Two of the five cars have the margin under test, the other three have moderate ones. The pair starts last
 ("pursuer") or first ("leader"), as in Werner et al. (2023). The results are its wins, places, overtakes and contacts.
 """
 
@@ -19,7 +19,7 @@ from torch import Tensor
 from coachable.domains.racing.laps import circuits_report, circuits_summary, drive_circuits
 from coachable.domains.racing.metrics import TelemetryMeasures
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
-from coachable.envs.racing.race.features import anyone_beside
+from coachable.envs.racing.race.features import anyone_beside, anyone_in_line
 from coachable.envs.racing.race.run import Run
 from coachable.envs.racing.race.scenarios import rolling_start
 from coachable.evaluation.episode_records import record_episodes
@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 
 CARS = 5
 SETTINGS = {"pursuer": (3, 4), "leader": (0, 1)}  # slots of the pair on the grid, 0 in front
-LATERAL = (0.0, 0.25, 0.5, 0.75, 1.0)  # [m], of the pair
-OTHERS = tuple(product((0.5, 0.75), repeat=3))  # [m], of the other three
-LONGITUDINAL = 0.0  # [m], of all cars, so that only the lateral margin has an effect
+MARGINS = {"lateral": (0.0, 0.25, 0.5, 0.75, 1.0), "longitudinal": (0.0, 0.5, 1.0, 1.5, 2.0)}  # [m], of the pair
+FIXED = {"lateral": 0.5, "longitudinal": 0.0}  # [m], of the pair, while the other margin changes
+OTHERS = tuple(product((0.5, 0.75), repeat=3))  # [m], lateral margins of the other three
 LAPS = 4
 RACE_STEPS = 10_000
 START_STEPS = 600  # a minute, in which the order of the start settles
@@ -49,22 +49,29 @@ _METRICS = {
     "overtakes": "overtakes per race",
     "contacts": "contacts per race",
 }
-_RANKED = _METRICS | {"places_later": "places gained after the first minute", "beside": "time beside others"}
+_RANKED = _METRICS | {
+    "places_later": "places gained after the first minute",
+    "beside": "time beside others",
+    "in_line": "time close ahead or behind",
+}
 
 
 class _RaceMeasures(TelemetryMeasures):
-    """Telemetry, and whether an opponent is beside the car, closer than the largest margin."""
+    """Telemetry, and whether an opponent is closer than the largest margin, beside the car or in line with it."""
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
-        beside = anyone_beside(transition.get(("next", STYLE_FEATURES)), within=LATERAL[-1])
-        return super().step(transition) | {"beside": beside.float()}
+        features = transition.get(("next", STYLE_FEATURES))
+        beside = anyone_beside(features, within=MARGINS["lateral"][-1])
+        in_line = anyone_in_line(features, within=MARGINS["longitudinal"][-1])
+        return super().step(transition) | {"beside": beside.float(), "in_line": in_line.float()}
 
 
 def evaluate_aggressiveness(domain: Domain, agent: LoadedPolicy, out: Path, settings: EvaluationSettings) -> str:
-    """Race pairs with rising lateral margins against three other copies of the agent, and write the results.
+    """Race pairs with rising margins against three other copies of the agent, and write the results.
 
-    The files are `races.csv` (by setting and margin), `circuits.csv` (laps of `drive_circuits`), `radar.png`,
-    `report.md` and `summary.json`.
+    The lateral margin of the pair rises while its longitudinal one is 0, as in the paper; then the longitudinal margin
+    rises while the lateral one is 0.5 m. The files are `races.csv` (by margin, setting and requested value),
+    `circuits.csv` (laps of `drive_circuits`), `radar.png`, `report.md` and `summary.json`.
 
     Args:
         domain: Domain racing_aggressiveness, as the agent was trained in.
@@ -79,15 +86,16 @@ def evaluate_aggressiveness(domain: Domain, agent: LoadedPolicy, out: Path, sett
     """
     episodes, seed = settings.episodes, settings.seed
     out.mkdir(parents=True, exist_ok=True)
-    cells = [(setting, lateral) for setting in SETTINGS for lateral in LATERAL]
-    races = [(setting, lateral, others) for setting, lateral in cells for others in OTHERS for _ in range(episodes)]
+    cells = [(setting, name, metres) for name, margins in MARGINS.items() for setting in SETTINGS for metres in margins]
+    races = [(*cell, others) for cell in cells for others in OTHERS for _ in range(episodes)]
     found = _race(domain, agent, races, len(cells), settings)
     rows = _rows(cells, {name: values.reshape(len(cells), -1, 2) for name, values in found.items()})
     summary: dict[str, Any] = {}
-    for setting in SETTINGS:
-        own = [row for row in rows if row["setting"] == setting]
-        gained = {name: np.array([row[name] for row in own]) for name in ("lateral", *_RANKED)}
-        summary[setting] = {name: rank_correlation(gained["lateral"], gained[name]) for name in _RANKED}
+    for margin, setting in product(MARGINS, SETTINGS):
+        own = [row for row in rows if (row["margin"], row["setting"]) == (margin, setting)]
+        gained = {name: np.array([row[name] for row in own]) for name in ("requested", *_RANKED)}
+        ranks = {name: rank_correlation(gained["requested"], gained[name]) for name in _RANKED}
+        summary.setdefault(margin, {})[setting] = ranks
     summary |= {"races_per_row": len(OTHERS) * episodes, "seed": seed}
     draw_radar(rows, out / "radar.png")
     circuits = drive_circuits(domain, agent, settings)
@@ -99,20 +107,21 @@ def evaluate_aggressiveness(domain: Domain, agent: LoadedPolicy, out: Path, sett
 def _race(
     domain: Domain,
     agent: LoadedPolicy,
-    races: Sequence[tuple[str, float, tuple[float, ...]]],
+    races: Sequence[tuple[str, str, float, tuple[float, ...]]],
     cells: int,
     settings: EvaluationSettings,
 ) -> dict[str, np.ndarray]:
     """Return the values of `_pair_results` in each race, (races, 2); the races of all cells have equal starts."""
     space, count = agent.space, len(races)
     theta = space.default.repeat(CARS, count, 1)
-    theta[..., space.slices["longitudinal"]] = LONGITUDINAL
+    theta[..., space.slices["longitudinal"]] = FIXED["longitudinal"]
     pair = np.zeros((CARS, count), dtype=bool)
-    for race, (setting, margin, others) in enumerate(races):
-        lateral = list(others)
+    for race, (setting, margin, metres, others) in enumerate(races):
+        own, lateral = FIXED | {margin: metres}, list(others)
         for slot in SETTINGS[setting]:
-            lateral.insert(slot, margin)
+            lateral.insert(slot, own["lateral"])
             pair[slot, race] = True
+            theta[slot, race, space.slices["longitudinal"]] = own["longitudinal"]
         theta[:, race, space.slices["lateral"]] = torch.tensor(lateral)[:, None]
     measured, length = race_alike(
         domain,
@@ -211,8 +220,7 @@ def _pair_results(
         "places_later": (early - places)[chosen].astype(float),
         "overtakes": np.array([_overtakes(distance[:end], car) for car in cars], dtype=float),
         "contacts": np.array([_count(touched[:, car]) for car in cars], dtype=float),
-        "beside": race["beside"][:end, chosen].mean(0),
-        "off": race["off"][:end, chosen].mean(0),
+        **{name: race[name][:end, chosen].mean(0) for name in ("beside", "in_line", "off")},
         "metres": distance[end - 1, chosen].astype(float),
     }
 
@@ -229,16 +237,16 @@ def _overtakes(distance: np.ndarray, car: int) -> int:
     return sum(int((np.diff(np.sign(one[np.abs(one) >= _PASSED])) > 0.0).sum()) for one in gap.T)
 
 
-def _rows(cells: Sequence[tuple[str, float]], found: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
+def _rows(cells: Sequence[tuple[str, str, float]], found: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
     """Return the means of values (cells, races, 2) by setting and margin, with 95 % intervals."""
     rows = []
-    for index, (setting, lateral) in enumerate(cells):
+    for index, (setting, margin, requested) in enumerate(cells):
         of = {name: values[index] for name, values in found.items()}
-        row: dict[str, Any] = {"setting": setting, "lateral": lateral, "races": len(of["won"])}
+        row: dict[str, Any] = {"margin": margin, "setting": setting, "requested": requested, "races": len(of["won"])}
         row["win_rate"] = float(of["top_two"].mean())
         row["win_rate_low"], row["win_rate_high"] = wilson_interval(int(of["top_two"].sum()), of["top_two"].size)
         row["either_won"] = float(of["won"].max(1).mean())
-        for name in ("places_gained", "places_later", "overtakes", "contacts", "beside"):
+        for name in ("places_gained", "places_later", "overtakes", "contacts", "beside", "in_line"):
             per_race = of[name].mean(1)
             row[name] = float(per_race.mean())
             row[f"{name}_low"], row[f"{name}_high"] = bootstrap_interval(per_race)
@@ -247,52 +255,55 @@ def _rows(cells: Sequence[tuple[str, float]], found: Mapping[str, np.ndarray]) -
 
 
 def draw_radar(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw a radar per setting, with a polygon per lateral margin.
+    """Draw a radar per margin and setting, with a polygon per requested value.
 
     Every axis spans the lowest to the highest value of the setting.
 
     Args:
-        rows: One row per setting and margin, with the means over races and `lateral`, the margin [m].
+        rows: One row per margin, setting and requested value [m], with the means over races.
         path: Image file to write.
     """
     angles = np.linspace(0.0, 2.0 * np.pi, len(_METRICS), endpoint=False) + np.pi / 2
-    with drawing(path, 1, len(SETTINGS), size=(9.5, 4.6), grid=False, subplot_kw={"projection": "polar"}) as panels:
-        for panel, setting in zip(panels[0], SETTINGS, strict=True):
-            own = [row for row in rows if row["setting"] == setting]
+    shape = (len(MARGINS), len(SETTINGS))
+    with drawing(path, *shape, size=(9.5, 9.2), grid=False, subplot_kw={"projection": "polar"}) as panels:
+        for panel, (margin, setting) in zip(panels.flat, product(MARGINS, SETTINGS), strict=True):
+            own = [row for row in rows if (row["margin"], row["setting"]) == (margin, setting)]
             table = np.array([[row[name] for name in _METRICS] for row in own])
             low, high = table.min(0), table.max(0)
             scaled = 0.15 + 0.85 * (table - low) / np.maximum(high - low, 1e-9)
             for index, row in enumerate(own):
-                color = shade(index, len(own))
+                color, label = shade(index, len(own)), f"{row['requested']:g} m"
                 closed = np.append(scaled[index], scaled[index, 0])
-                panel.plot(
-                    np.append(angles, angles[0]), closed, color=color, marker="o", ms=3, label=f"{row['lateral']:g} m"
-                )
+                panel.plot(np.append(angles, angles[0]), closed, color=color, marker="o", ms=3, label=label)
             labels = [f"{text}\n{a:.2f} to {b:.2f}" for text, a, b in zip(_METRICS.values(), low, high, strict=True)]
             panel.set_xticks(angles, labels, fontsize=8)
             panel.tick_params(axis="x", pad=26)  # clear of the circle, left and right
             panel.set_yticks([])
             panel.set_ylim(0.0, 1.05)
             panel.set_title(setting)
-        panels[0, -1].legend(title="lateral margin", loc="upper left", bbox_to_anchor=(1.1, 1.0), fontsize=8)
+        for panel, margin in zip(panels[:, -1], MARGINS, strict=True):
+            panel.legend(title=f"{margin} margin", loc="upper left", bbox_to_anchor=(1.1, 1.0), fontsize=8)
 
 
 def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Mapping[str, Any]) -> str:
     text = "# racing, aggressiveness: requested margin and what came of it\n\n"
     text += f"{policy_sentence(agent)} in all five cars; {summary['races_per_row']} races per row, {LAPS} laps, "
     text += f"rolling start, seed {summary['seed']}. Two cars, which start last (pursuer) or first (leader), keep the "
-    text += f"lateral margin, the other three 0.5 or 0.75 m; longitudinal {LONGITUDINAL:g} m.\n\n"
+    text += f"requested margin; their lateral margin is {FIXED['lateral']:g} m and their longitudinal one "
+    text += f"{FIXED['longitudinal']:g} m otherwise. The other three keep 0.5 or 0.75 m laterally.\n\n"
     text += "![radar](radar.png)\n\n"
-    formats = {"setting": "", "lateral": "g", "win_rate": ".0%", "either_won": ".0%", "places_gained": "+.2f"}
-    formats |= {"places_later": "+.2f", "overtakes": ".1f", "contacts": ".1f"}
-    text += markdown_table(rows, formats | {"beside": ".1%", "off": ".1%", "kilometres": ".1f"})
+    formats = {"margin": "", "setting": "", "requested": "g", "win_rate": ".0%", "either_won": ".0%"}
+    formats |= {"places_gained": "+.2f", "places_later": "+.2f", "overtakes": ".1f", "contacts": ".1f"}
+    text += markdown_table(rows, formats | {"beside": ".1%", "in_line": ".1%", "off": ".1%", "kilometres": ".1f"})
     text += "\nWin rate: share of the pair that ends among the first two. Overtakes, contacts: per car and race; a "
     text += f"car has overtaken another when it is {_PASSED:g} m ahead; contacts within a second count once. "
     text += "Places later: gained after the first minute. "
-    text += f"Beside: share of the time with another car alongside, less than {LATERAL[-1]:g} m away."
+    beside, in_line = MARGINS["lateral"][-1], MARGINS["longitudinal"][-1]
+    text += f"Beside: share of the time with another car alongside, less than {beside:g} m away. "
+    text += f"In line: share of the time with another car straight ahead or behind, less than {in_line:g} m away."
     text += "\n\nRank correlation with the margin: "
-    parts = [
-        f"{setting}: " + ", ".join(f"{_RANKED[name]} {value:.2f}" for name, value in summary[setting].items())
-        for setting in SETTINGS
-    ]
+    parts = []
+    for margin, setting in product(MARGINS, SETTINGS):
+        ranks = ", ".join(f"{_RANKED[name]} {value:.2f}" for name, value in summary[margin][setting].items())
+        parts.append(f"{margin}, {setting}: {ranks}")
     return text + "; ".join(parts) + ".\n"

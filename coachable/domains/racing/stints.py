@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from coachable.domains.racing.frontier import TANK, WORN, sweep
 from coachable.domains.racing.laps import SOLO, TRIAL_STEPS, circuits_report, circuits_summary, cut_laps, drive_circuits
 from coachable.domains.racing.metrics import TelemetryMeasures
 from coachable.domains.racing.traffic import draw_traffic, race_in_traffic, traffic_report, traffic_response
-from coachable.envs.racing.circuit.circuits import load_track
+from coachable.envs.racing.circuit.circuits import HELD_OUT, load_track
 from coachable.envs.racing.physics.cars import Resources
 from coachable.envs.racing.race.scenarios import Conditions
 from coachable.evaluation.episode_records import record_styles
@@ -31,6 +32,7 @@ WEIGHTS = {"fuel": "fuel", "tyre": "tire"}  # style weight of each resource
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the largest weight
 COMPARED = 6  # flying laps of each stint whose times are compared; the first lap is on cold tyres
 STINT_STEPS = 9000  # 15 minutes
+UNSEEN = HELD_OUT[0]  # circuit of the stints besides the agent's own
 _COLD = 40.0  # [°C]
 _PRICES = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 9.0, 12.0, 16.0, 24.0, 40.0, 70.0)  # of the frontier, see `LapProgramme.laps`
 
@@ -61,10 +63,12 @@ class Stint:
 def evaluate_resources(domain: Domain, agent: LoadedPolicy, out: Path, settings: EvaluationSettings) -> str:
     """Drive stints under rising weights of one resource at a time, and a time trial without saving; write the results.
 
-    As in the paper, the other resource is switched off. The files are `stints.csv` (by resource and weight), `laps.csv`
-    (every lap), `stints.png` (resource left and lap times over laps), `tradeoff.png` (range against pace, with the
-    frontier), `report.md` and `summary.json`. An agent that was trained with several cars also races in traffic, see
-    `race_in_traffic`, which adds `traffic.csv` and `traffic.png`. `circuits.csv` has the laps of `drive_circuits`.
+    As in the paper, the other resource is switched off. The stints are on the circuit of the family, or the only one of
+    the training, and on one that no preset trains on. The files are `stints.csv` (by circuit, resource and weight),
+    `laps.csv` (every lap), `stints.png` (resource left and lap times over laps, on the first circuit), `tradeoff.png`
+    (range against pace, with the frontier), `report.md` and `summary.json`. An agent that was trained with several cars
+    also races in traffic, see `race_in_traffic`, which adds `traffic.csv` and `traffic.png`. `circuits.csv` has the
+    laps of `drive_circuits`.
 
     Args:
         domain: Domain racing_resources, as the agent was trained in.
@@ -78,34 +82,37 @@ def evaluate_resources(domain: Domain, agent: LoadedPolicy, out: Path, settings:
     """
     out.mkdir(parents=True, exist_ok=True)
     trained, episodes, seed = agent.config.get("env", {}), settings.episodes, settings.seed
-    car, track = trained.get("car", "x2019"), home_track("resources", trained)
-    rates, length = Resources.calibrated(car), load_track(track).length
+    car, home = trained.get("car", "x2019"), home_track("resources", trained)
+    rates, length = Resources.calibrated(car), load_track(home).length
     options: dict[str, Any] = {**settings.rollout, "steps": settings.steps or STINT_STEPS}
     rows: list[dict[str, Any]] = []
     every: list[dict[str, Any]] = []
-    frontiers: dict[str, list[dict[str, float]]] = {}
-    for resource, name in WEIGHTS.items():
+    frontiers: dict[tuple[str, str], list[dict[str, float]]] = {}
+    for track, (resource, name) in product((home, UNSEEN), WEIGHTS.items()):
         only = replace(rates, **{"wear" if resource == "fuel" else "fuel": 0.0})
-        frontiers[resource] = frontier(track, car, resource)
+        bound = frontiers[track, resource] = frontier(track, car, resource)
         high = dict(zip(agent.space.names, agent.space.high.tolist(), strict=True))[name]
         cells = [{name: share * high} for share in SHARES]
-        asked = {"resources": only, "conditions": Conditions(fuel=TANK, heat=_COLD), **options}
-        stints = _drive(domain, agent, cells, episodes, resource, label=resource, length=length, **asked)
-        rows += _rows(resource, [cell[name] for cell in cells], stints, frontiers[resource])
+        asked = {"track": track, "resources": only, "conditions": Conditions(fuel=TANK, heat=_COLD), **options}
+        label, metres = f"{track}, {resource}", load_track(track).length
+        stints = _drive(domain, agent, cells, episodes, resource, label=label, length=metres, **asked)
+        place = {"circuit": track, "resource": resource}
+        rows += [place | row for row in _rows(resource, [cell[name] for cell in cells], stints, bound)]
         for cell, group in zip(cells, stints, strict=True):
             for number, stint in enumerate(group):
                 every += [
-                    {"resource": resource, "weight": cell[name], "stint": number, "lap": lap + 1}
+                    {**place, "weight": cell[name], "stint": number, "lap": lap + 1}
                     | {"time": float(time), "left": float(stint.left[lap]), "clean": bool(stint.clean[lap])}
                     for lap, time in enumerate(stint.laps)
                 ]
     options |= {
+        "track": home,
         "steps": min(options["steps"], TRIAL_STEPS),
         "resources": rates,
         "conditions": Conditions(fuel=TANK / 2),
     }
     [trial] = _drive(domain, agent, [{}], max(episodes, 10), "fuel", label="trial", length=length, **options)
-    summary = _summary(rows, trial, frontiers["fuel"][0]["lap_time"], episodes, seed)
+    summary = _summary(rows, trial, frontiers[home, "fuel"][0]["lap_time"], episodes, seed)
     traffic = race_in_traffic(domain, agent, settings) if trained.get("cars", 1) > 1 else []
     circuits = drive_circuits(domain, agent, settings)
     summary["circuits"] = circuits_summary(circuits)
@@ -114,7 +121,7 @@ def evaluate_resources(domain: Domain, agent: LoadedPolicy, out: Path, settings:
         summary["traffic"] = traffic_response(traffic)
         report += traffic_report(traffic, summary["traffic"])
         draw_traffic(traffic, out / "traffic.png")
-    draw_stints(every, out / "stints.png")
+    draw_stints([lap for lap in every if lap["circuit"] == home], out / "stints.png")
     draw_tradeoff(rows, frontiers, out / "tradeoff.png")
     tables = {"stints": rows, "laps": every, "traffic": traffic, "circuits": circuits}
     return write_results(out, report, summary, tables)
@@ -196,7 +203,6 @@ def _rows(
         clean = np.concatenate([stint.clean for stint in stints[index]])
         rows.append(
             {
-                "resource": resource,
                 "weight": weight,
                 "range_km": float(reach[index].mean()),
                 "range_km_low": low,
@@ -238,10 +244,10 @@ def _summary(
             "clean_laps": float(clean.mean()) if len(clean) else 0.0,
         }
     }
-    for resource in WEIGHTS:
-        own = [row for row in rows if row["resource"] == resource]
+    for track, resource in dict.fromkeys((row["circuit"], row["resource"]) for row in rows):
+        own = [row for row in rows if (row["circuit"], row["resource"]) == (track, resource)]
         weights, reach = (np.array([row[name] for row in own]) for name in ("weight", "range_km"))
-        summary[resource] = {
+        summary.setdefault(track, {})[resource] = {
             "rank_correlation": rank_correlation(weights, reach),
             "range_gain": own[-1]["range_gain"],
             "seconds_lost": own[-1]["seconds_lost"],
@@ -278,24 +284,25 @@ def draw_stints(laps: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def draw_tradeoff(
-    rows: Sequence[Mapping[str, Any]], frontiers: Mapping[str, Sequence[Mapping[str, float]]], path: Path
+    rows: Sequence[Mapping[str, Any]], frontiers: Mapping[tuple[str, str], Sequence[Mapping[str, float]]], path: Path
 ) -> None:
     """Draw the range over the lap time, for the agent and the frontier.
 
     Args:
-        rows: One row per resource and weight, with `lap_time` [s] and `range_km` [km].
-        frontiers: Points of the bound, by resource.
+        rows: One row per circuit, resource and weight, with `lap_time` [s] and `range_km` [km].
+        frontiers: Points of the bound, by circuit and resource.
         path: Image file to write.
     """
-    with drawing(path, 1, len(frontiers), size=(9.5, 4.0)) as panels:
-        for axes, (resource, bound) in zip(panels[0], frontiers.items(), strict=True):
-            own = [row for row in rows if row["resource"] == resource]
+    tracks = list(dict.fromkeys(track for track, _ in frontiers))
+    with drawing(path, len(tracks), len(WEIGHTS), size=(9.5, 4.0 * len(tracks))) as panels:
+        for axes, ((track, resource), bound) in zip(panels.flat, frontiers.items(), strict=True):
+            own = [row for row in rows if (row["circuit"], row["resource"]) == (track, resource)]
             times, ranges = ([point[name] for point in bound] for name in ("lap_time", "range_km"))
             axes.plot(times, ranges, ls="--", label="point mass on a fixed line")
             axes.plot([row["lap_time"] for row in own], [row["range_km"] for row in own], marker="o", label="agent")
             for row in own:
                 axes.annotate(f"{row['weight']:.0f}", (row["lap_time"], row["range_km"]), fontsize=8)
-            axes.set(xlabel="lap time [s]", ylabel="range [km]", title=f"{resource}, weight beside each point")
+            axes.set(xlabel="lap time [s]", ylabel="range [km]", title=f"{track}: {resource}, weight at each point")
             axes.legend(fontsize=8)
 
 
@@ -307,13 +314,15 @@ def _report(
     text += f"{policy_sentence(agent)}; {episodes} stints per weight, seed {seed}. "
     text += "The other resource is switched off, as in the paper; tyres start at 40 °C, with a full tank.\n\n"
     text += "![stints](stints.png) ![range against pace](tradeoff.png)\n\n"
-    formats = {"resource": "", "weight": ".0f", "range_km": ".1f", "range_gain": "+.0%", "lap_time": ".2f"}
+    formats = {"circuit": "", "resource": "", "weight": ".0f", "range_km": ".1f", "range_gain": "+.0%"}
+    formats |= {"lap_time": ".2f"}
     formats |= {"seconds_lost": "+.2f", "frontier_km": ".1f", "laps": "", "clean_laps": ".0%"}
     text += markdown_table(rows, formats)
     text += f"\nRange: until the tank is empty, or until the tyres are worn by {WORN:.0%} on average, at the mean use. "
     text += f"Lap time: mean of {COMPARED} laps from the second one on. Frontier: range of a point mass on a fixed "
     text += "line at the same lap time (nan where it has none so slow). Clean: never three wheels off the track.\n\n"
-    ranks = ", ".join(f"{name} {summary[name]['rank_correlation']:.2f}" for name in WEIGHTS)
+    places = dict.fromkeys((row["circuit"], row["resource"]) for row in rows)
+    ranks = ", ".join(f"{name} on {track} {summary[track][name]['rank_correlation']:.2f}" for track, name in places)
     text += f"Rank correlation of weight and range: {ranks}.\n\n## Time trial, no saving asked\n\n"
     if not trial["laps"]:
         return text + "No car finished a flying lap.\n"

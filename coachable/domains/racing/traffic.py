@@ -16,7 +16,7 @@ from coachable.domains.racing.races import race_alike
 from coachable.envs.racing.race.features import DEFEND, OVERTAKE
 from coachable.envs.racing.race.scenarios import Conditions, Scenario
 from coachable.evaluation.evaluation_settings import EvaluationSettings
-from coachable.evaluation.figures import drawing
+from coachable.evaluation.figures import drawing, shade
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
 from coachable.evaluation.style_grid import markdown_table
 from coachable.keys import STYLE_FEATURES
@@ -31,7 +31,8 @@ TRAFFIC_WEIGHTS = (0.0, 0.5, 1.0, 1.5, 2.0)
 OTHERS_WEIGHT = 1.0  # of all weights of overtaking and defending that do not rise
 TRAFFIC_STEPS = 600  # 60 s
 RACES = 128  # per weight, for each of `EvaluationSettings.episodes`; four leave intervals of 1 to 2 m
-_START = (Scenario("passing", 1.0, "passing", CARS),)
+TRAFFIC_STARTS = ("passing", "slipstream", "rolling")  # kinds of starts, see `Scenario`
+SAVERS = ("nobody", "all")  # cars that save tyres and fuel, with the largest weights
 
 
 class _TrafficMeasures(TelemetryMeasures):
@@ -43,25 +44,40 @@ class _TrafficMeasures(TelemetryMeasures):
 
 
 def race_in_traffic(domain: Domain, agent: LoadedPolicy, settings: EvaluationSettings) -> list[dict[str, Any]]:
-    """Race three copies of an agent that start close together on a straight, with random tyres and fuel, for a minute.
+    """Race three copies of an agent that start close together, with random tyres and fuel, for a minute.
 
-    The last car's weight of overtaking rises, or the first car's weight of defending. The races of all weights have
-    equal starts.
+    The last car's weight of overtaking rises, or the first car's weight of defending. There are three kinds of starts,
+    each in races in which nobody saves tyres and fuel and in others in which all cars do. The races of all weights
+    have equal starts.
 
     Args:
         domain: Domain racing_resources, as the agent was trained in, with several cars.
         agent: Policy of all cars, which acts deterministically.
-        settings: `episodes` times 128 is the number of races per weight; `steps` is their length, 600 at most and by
-            default.
+        settings: `episodes` times 128 is the number of races per weight, start and group of savers; `steps` is their
+            length, 600 at most and by default.
 
     Returns:
-        A row per weight with the metres gained on cars ahead and on cars behind (negative if lost), the places gained,
-        and the shares of time in contact and off the track, each with a 95 % interval.
+        A row per start, savers and weight with the metres gained on cars ahead and on cars behind (negative if lost),
+        the places gained, and the shares of time in contact and off the track, each with a 95 % interval.
     """
+    return [
+        row
+        for start in TRAFFIC_STARTS
+        for savers in SAVERS
+        for row in _race_from(domain, agent, settings, start, savers)
+    ]
+
+
+def _race_from(
+    domain: Domain, agent: LoadedPolicy, settings: EvaluationSettings, start: str, savers: str
+) -> list[dict[str, Any]]:
     races, steps = RACES * settings.episodes, min(settings.steps or TRAFFIC_STEPS, TRAFFIC_STEPS)
     cells = [(name, weight) for name in SLOTS for weight in TRAFFIC_WEIGHTS]
     space = agent.space
-    theta = space.make(strict=True, overtake=OTHERS_WEIGHT, defend=OTHERS_WEIGHT).repeat(CARS, len(cells) * races, 1)
+    asked = dict.fromkeys(SLOTS, OTHERS_WEIGHT)
+    if savers == "all":
+        asked |= {name: float(space.high[space.slices[name]]) for name in ("tire", "fuel")}
+    theta = space.make(strict=True, **asked).repeat(CARS, len(cells) * races, 1)
     for index, (name, weight) in enumerate(cells):
         theta[SLOTS[name], index * races : (index + 1) * races, space.slices[name]] = weight
     measured, _ = race_alike(
@@ -72,7 +88,7 @@ def race_in_traffic(domain: Domain, agent: LoadedPolicy, settings: EvaluationSet
         settings,
         copies=len(cells),
         steps=steps,
-        scenarios=_START,
+        scenarios=(Scenario(start, 1.0, start, CARS),),
         conditions=Conditions.resources(),
     )
     values = {name: value.double() for name, value in measured.items()}
@@ -81,7 +97,7 @@ def race_in_traffic(domain: Domain, agent: LoadedPolicy, settings: EvaluationSet
     found |= {name: values[name].mean(0) for name in ("contact", "off")}
     rows = []
     for index, (name, weight) in enumerate(cells):
-        row: dict[str, Any] = {"sweep": name, "weight": weight, "races": races}
+        row: dict[str, Any] = {"sweep": name, "start": start, "savers": savers, "weight": weight, "races": races}
         for measure, by_slot in found.items():
             own = by_slot[SLOTS[name], index * races : (index + 1) * races].numpy()
             low, high = bootstrap_interval(own)
@@ -90,59 +106,82 @@ def race_in_traffic(domain: Domain, agent: LoadedPolicy, settings: EvaluationSet
     return rows
 
 
-def traffic_response(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Return the rank correlations of each weight with the metres and places gained.
+def traffic_response(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return how metres and places gained follow the weight that asks for them.
 
     Args:
         rows: Rows of `race_in_traffic`.
 
     Returns:
-        Correlations "metres" and "places" in [-1, 1], by weight.
+        A row per weight that rises, start and group of savers: metres gained on cars ahead (overtake) or behind
+        (defend) at the smallest and at the largest weight, whether their 95 % intervals are apart, the rank
+        correlations of the weight with these metres and with the places gained, and the time in contact at the largest
+        weight over that at the smallest (NaN if that is 0).
     """
+    response = []
+    for sweep in SLOTS:
+        for start, savers in dict.fromkeys((row["start"], row["savers"]) for row in rows):
+            own = [row for row in rows if (row["sweep"], row["start"], row["savers"]) == (sweep, start, savers)]
+            first, last = own[0], own[-1]
+            weights = np.array([row["weight"] for row in own])
+            follows = {
+                name: rank_correlation(weights, np.array([row[measure] for row in own]))
+                for name, measure in (("metres", sweep), ("places", "places_gained"))
+            }
+            response.append(
+                {"sweep": sweep, "start": start, "savers": savers, "smallest": first[sweep], "largest": last[sweep]}
+                | {"apart": "yes" if last[f"{sweep}_low"] > first[f"{sweep}_high"] else "no", **follows}
+                | {"contacts": last["contact"] / first["contact"] if first["contact"] else float("nan")}
+            )
+    return response
 
-    def follows(sweep: str, measure: str) -> float:
-        pairs = [(row["weight"], row[measure]) for row in rows if row["sweep"] == sweep]
-        return rank_correlation(*np.array(pairs).T)
 
-    return {name: {"metres": follows(name, name), "places": follows(name, "places_gained")} for name in SLOTS}
-
-
-def traffic_report(rows: Sequence[dict[str, Any]], response: dict[str, dict[str, float]]) -> str:
+def traffic_report(rows: Sequence[dict[str, Any]], response: Sequence[dict[str, Any]]) -> str:
     """Return the section on traffic of the report, as Markdown.
 
     Args:
         rows: Result of `race_in_traffic`.
         response: Result of `traffic_response`.
     """
-    text = f"\n## Among others\n\n{CARS} copies close together on a straight, on tyres and fuel of any state, for a "
-    text += f"minute; {rows[0]['races']} races per weight, the same starts for each. The weight of overtaking of the "
-    text += (
-        f"last car rises, or that of defending of the first; all others are {OTHERS_WEIGHT:g}, and no car saves.\n\n"
+    text = (
+        f"\n## Among others\n\n{CARS} copies, on tyres and fuel of any state, for a minute; {rows[0]['races']} races "
     )
-    text += "![traffic](traffic.png)\n\n"
-    formats = {"sweep": "", "weight": "g", "overtake": "+.1f", "defend": "+.1f", "places_gained": "+.2f"}
-    text += markdown_table(rows, formats | {"contact": ".2%", "off": ".2%"})
-    text += "\nOvertake, defend: metres gained on cars ahead and on cars behind. Rank correlation with the weight of "
-    found = [f"{name} {v['metres']:.2f} in metres, {v['places']:.2f} in places" for name, v in response.items()]
-    return text + "; of ".join(found) + ".\n"
+    text += "per weight, the same starts for each. The weight of overtaking of the last car rises, or that of "
+    text += f"defending of the first; all others are {OTHERS_WEIGHT:g}. Starts: close together on a straight with "
+    text += "some cars faster (passing), in a line there (slipstream), or rolling up to the line. Savers: cars that "
+    text += "save tyres and fuel as much as they can.\n\n![traffic](traffic.png)\n\n"
+    formats = {"sweep": "", "start": "", "savers": "", "smallest": "+.1f", "largest": "+.1f", "apart": ""}
+    text += markdown_table(response, formats | {"metres": ".2f", "places": ".2f", "contacts": ".2f"})
+    text += "\nSmallest, largest: metres gained on cars ahead (overtake) or behind (defend) at that weight; "
+    text += "apart: whether their 95 % intervals are. Metres, places: rank correlation of "
+    text += "the weight with them. Contacts: time in contact at the largest weight over that at the smallest.\n\n"
+    formats = {"sweep": "", "start": "", "savers": "", "weight": "g", "overtake": "+.1f", "defend": "+.1f"}
+    return text + markdown_table(rows, formats | {"places_gained": "+.2f", "contact": ".2%", "off": ".2%"})
 
 
 def draw_traffic(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """Draw the metres and places gained over the weight that asks for them, with 95 % intervals.
 
     Args:
-        rows: One row per weight, with metres and places and the ends of their 95 % intervals.
+        rows: Rows of `race_in_traffic`.
         path: Image file to write.
     """
     titles = {"overtake": "on cars ahead, starting last", "defend": "on cars behind, starting first"}
+    kinds = list(dict.fromkeys((row["start"], row["savers"]) for row in rows))
     with drawing(path, 2, len(SLOTS), size=(9.5, 6.4), sharex=True) as panels:
         for column, name in zip(panels.T, SLOTS, strict=True):
-            own = [row for row in rows if row["sweep"] == name]
-            weights = [row["weight"] for row in own]
-            for axes, measure, unit in zip(column, (name, "places_gained"), ("metres", "places"), strict=True):
-                low, high = ([row[f"{measure}_{end}"] for row in own] for end in ("low", "high"))
-                axes.plot(weights, [row[measure] for row in own], marker="o")
-                axes.fill_between(weights, low, high, alpha=0.2)
+            for start, savers in kinds:
+                own = [row for row in rows if (row["sweep"], row["start"], row["savers"]) == (name, start, savers)]
+                weights = [row["weight"] for row in own]
+                color = shade(TRAFFIC_STARTS.index(start), len(TRAFFIC_STARTS))
+                style = {"color": color, "ls": "--" if savers == "all" else "-"}
+                for axes, measure in zip(column, (name, "places_gained"), strict=True):
+                    low, high = ([row[f"{measure}_{end}"] for row in own] for end in ("low", "high"))
+                    label = f"{start}, {savers} saving"
+                    axes.plot(weights, [row[measure] for row in own], marker="o", ms=3, label=label, **style)
+                    axes.fill_between(weights, low, high, alpha=0.15, color=color)
+            for axes, unit in zip(column, ("metres", "places"), strict=True):
                 axes.set(ylabel=f"{unit} gained in a minute")
             column[0].set(title=titles[name])
             column[1].set(xlabel=f"weight of {name}")
+        panels[0, 0].legend(fontsize=8)

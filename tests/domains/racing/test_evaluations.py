@@ -10,14 +10,14 @@ import pytest
 import torch
 
 from coachable.domain import load_domain
-from coachable.domains.racing import laps, traffic
+from coachable.domains.racing import laps, stints, traffic
 from coachable.domains.racing.drifts import evaluate_drift
 from coachable.domains.racing.families import family_style
 from coachable.domains.racing.laps import circuits_report, circuits_summary, drive_circuits
 from coachable.domains.racing.metrics import whole_turns
 from coachable.domains.racing.races import _count, _overtakes, _pair_results, evaluate_aggressiveness
 from coachable.domains.racing.stints import _stint, evaluate_resources, range_at
-from coachable.domains.racing.traffic import race_in_traffic, traffic_report, traffic_response
+from coachable.domains.racing.traffic import draw_traffic, race_in_traffic, traffic_report, traffic_response
 from coachable.envs.racing.circuit.circuits import load_track, load_tracks
 from coachable.envs.racing.circuit.track import Track
 from coachable.envs.racing.physics.cars import load_car
@@ -32,18 +32,20 @@ def read(path):
         return list(csv.DictReader(file))
 
 
-def scripted(family, car, drives="ring", **settings):
+def scripted(family, car, **settings):
     """A domain on the ring and an "agent" that looks at the simulator instead of the observation."""
     domain = load_domain(f"racing_{family}", {"env": {"track": "ring", "car": car, **settings}})
-    driver, envs = LineFollower(load_tracks(drives), load_car(car), grip=0.8), []
+    made = []
 
     def make_env(**options):
-        envs.append(domain.make_env(**options))
-        return envs[-1]
+        driver = LineFollower(load_tracks(options.get("track", "ring")), load_car(car), grip=0.8)
+        made.append((domain.make_env(**options), driver))
+        return made[-1][0]
 
     class Policy(torch.nn.Module):
         def forward(self, data):
-            return data.set("action", driver(envs[-1].field, data["observation"]))
+            env, driver = made[-1]
+            return data.set("action", driver(env.field, data["observation"]))
 
     agent = LoadedPolicy(Policy(), family_style(family)[0], {"env": {"track": "ring", "car": car}}, {})
     return replace(domain, make_env=make_env), agent
@@ -114,19 +116,19 @@ def test_whoever_is_ahead_by_a_length_after_being_behind_has_overtaken():
 
 def test_a_race_ends_when_the_first_car_does():
     distance = np.array([[90.0, 80.0, 70.0], [101.0, 95.0, 99.0], [110.0, 140.0, 150.0]])
-    race = {"distance": distance, "contact": np.eye(3), "beside": np.eye(3), "off": np.zeros((3, 3))}
+    race = dict.fromkeys(("contact", "beside", "in_line"), np.eye(3)) | {"distance": distance, "off": np.zeros((3, 3))}
     result = _pair_results(race, np.array([2, 0, 1]), np.array([True, False, True]), 100.0)
     assert result["top_two"].tolist() == [1.0, 1.0]
     assert result["won"].tolist() == [1.0, 0.0]
     assert result["places_gained"].tolist() == [2.0, 0.0]
     assert result["contacts"].tolist() == [1.0, 0.0]  # the last one came after the end
-    assert result["beside"].tolist() == [0.5, 0.0]
+    assert result["beside"].tolist() == result["in_line"].tolist() == [0.5, 0.0]
 
 
 def test_places_of_the_first_minute_count_apart():
     steps = np.arange(700.0)
     distance = np.stack([40 * steps, 41 * steps - 25, 20 * steps + 13_100], axis=1)  # the third is passed at 655, 625
-    race = {name: np.zeros((700, 3)) for name in ("contact", "beside", "off")}
+    race = {name: np.zeros((700, 3)) for name in ("contact", "beside", "in_line", "off")}
     result = _pair_results({"distance": distance, **race}, np.array([1, 2, 0]), np.array([True, True, False]), 1e9)
     assert result["places_gained"].tolist() == [0.0, 2.0]
     assert result["places_later"].tolist() == [1.0, 1.0]
@@ -141,14 +143,20 @@ def test_wilson_interval():
 
 
 @pytest.mark.slow
-def test_stints_of_the_scripted_driver(tmp_path, one_circuit):
+def test_stints_of_the_scripted_driver(tmp_path, one_circuit, monkeypatch):
+    monkeypatch.setattr(stints, "UNSEEN", "oval")
     domain, agent = scripted("resources", "gt3")
     report = evaluate_resources(domain, agent, tmp_path, EvaluationSettings(episodes=1, steps=800, progress=False))
     rows = read(tmp_path / "stints.csv")
-    assert [row["resource"] for row in rows] == ["fuel"] * 5 + ["tyre"] * 5
-    assert all(float(row["range_gain"]) == pytest.approx(0.0, abs=0.1) for row in rows)  # it knows no style
-    assert all(15 < float(row["lap_time"]) < 30 and float(row["clean_laps"]) >= 0.5 for row in rows)
-    trial = json.loads((tmp_path / "summary.json").read_text())["trial"]
+    places = [(track, resource) for track in ("ring", "oval") for resource in ("fuel", "tyre") for _ in range(5)]
+    assert [(row["circuit"], row["resource"]) for row in rows] == places
+    ring, oval = rows[:10], rows[10:]
+    assert all(float(row["range_gain"]) == pytest.approx(0.0, abs=0.1) for row in ring)  # it knows no style
+    assert all(15 < float(row["lap_time"]) < 30 and float(row["clean_laps"]) >= 0.5 for row in ring)
+    assert all(int(row["laps"]) == 1 and float(row["clean_laps"]) == 1.0 for row in oval)  # it is longer
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    trial = summary["trial"]
+    assert {"fuel", "tyre"} == set(summary["ring"]) == set(summary["oval"])
     assert trial["laps"] >= 10 and 0.0 < trial["over_estimate"] < 0.3
     assert "above it; clean laps" in report
     assert {path.name for path in tmp_path.glob("*.png")} == {"stints.png", "tradeoff.png"}
@@ -171,7 +179,7 @@ def test_laps_on_shipped_held_out_and_own_circuits(tmp_path, monkeypatch):
     np.savetxt(tmp_path / "own.csv", points, delimiter=",")
     monkeypatch.setattr(laps, "DRIVEN", ("ring", "oval"))
     tracks = [load_track("ring"), load_track("oval"), Track.from_csv(tmp_path / "own.csv")]
-    domain, agent = scripted("resources", "gt3", drives=tracks)
+    domain, agent = scripted("resources", "gt3")
     settings = EvaluationSettings(episodes=2, steps=1100, progress=False, env_options={"track": tracks[-1]})
     rows = drive_circuits(domain, agent, settings)
     assert [(row["circuit"], row["trained"]) for row in rows] == [("ring", "yes"), ("oval", "no"), ("own", "no")]
@@ -190,9 +198,12 @@ def test_races_of_the_scripted_driver(tmp_path, one_circuit):
     settings = EvaluationSettings(episodes=1, steps=40, seed=1, progress=False)
     report = evaluate_aggressiveness(domain, agent, tmp_path, settings)
     rows = read(tmp_path / "races.csv")
-    assert len(rows) == 10 and {row["races"] for row in rows} == {"8"}
+    assert len(rows) == 20 and {row["races"] for row in rows} == {"8"}
+    kinds = [(row["margin"], row["setting"]) for row in rows[::5]]
+    assert kinds == [(margin, setting) for margin in ("lateral", "longitudinal") for setting in ("pursuer", "leader")]
     # It knows no style, and the races of all margins start alike.
-    assert all(row | {"lateral": "0"} in (rows[0], rows[5]) for row in rows)
+    alike = {"margin": "lateral", "requested": "0"}
+    assert all(row | alike in (rows[0], rows[5]) for row in rows)
     # In four seconds nobody overtakes: the leaders stay in front, the pursuers behind.
     by_setting = {row["setting"]: row for row in rows}
     assert float(by_setting["leader"]["win_rate"]) > 0.9
@@ -202,18 +213,36 @@ def test_races_of_the_scripted_driver(tmp_path, one_circuit):
     assert "races per row, 4 laps" in report and (tmp_path / "radar.png").exists()
 
 
-def test_traffic_of_the_scripted_driver(monkeypatch):
+def test_traffic_of_the_scripted_driver(tmp_path, monkeypatch):
     monkeypatch.setattr(traffic, "RACES", 32)
     domain, agent = scripted("resources", "x2019", cars=3)
     rows = race_in_traffic(domain, agent, EvaluationSettings(episodes=1, steps=20, progress=False))
+    kinds = [(start, savers) for start in ("passing", "slipstream", "rolling") for savers in ("nobody", "all")]
+    assert [(row["start"], row["savers"]) for row in rows[::10]] == kinds
     assert [(row["sweep"], row["weight"]) for row in rows[4:6]] == [("overtake", 2.0), ("defend", 0.0)]
     # It knows no style, and the races of all weights start alike.
-    for sweep in (rows[:5], rows[5:]):
-        assert all(row | {"weight": 0.0} == sweep[0] for row in sweep)
+    for first in range(0, len(rows), 5):
+        assert all(row | {"weight": 0.0} == rows[first] for row in rows[first : first + 5])
+    assert rows[10]["overtake"] == rows[0]["overtake"]  # neither does it save
+    assert len({rows[first]["defend"] for first in (5, 25, 45)}) == 3  # the starts differ
     # Whoever starts last has nobody behind, whoever starts first nobody ahead.
     assert rows[0]["defend"] == 0.0 and rows[5]["overtake"] == 0.0 and rows[0]["overtake"] != 0.0
-    follows = [row | {row["sweep"]: row["weight"] ** 2, "places_gained": -row["weight"]} for row in rows]
-    response = traffic_response(follows)
-    each = {"metres": pytest.approx(1.0), "places": pytest.approx(-1.0)}
-    assert response == {"overtake": each, "defend": each}
-    assert "of defend 1.00 in metres, -1.00 in places.\n" in traffic_report(rows, response)
+    draw_traffic(rows, tmp_path / "traffic.png")
+    assert (tmp_path / "traffic.png").stat().st_size > 10_000
+
+
+def test_traffic_response():
+    rows = []
+    for sweep in ("overtake", "defend"):
+        for weight in (0.0, 0.5, 1.0, 1.5, 2.0):
+            gained = weight**2 if sweep == "overtake" else -weight
+            row = {"sweep": sweep, "start": "rolling", "savers": "all", "weight": weight, "races": 9, "off": 0.0}
+            row |= {"overtake": gained, "defend": gained, "places_gained": -gained, "contact": 0.01 + weight / 100}
+            rows.append(row | {f"{sweep}_low": gained - 1.0, f"{sweep}_high": gained + 1.0})
+    overtake, defend = response = traffic_response(rows)
+    assert (overtake["smallest"], overtake["largest"], overtake["apart"]) == (0.0, 4.0, "yes")
+    assert (overtake["metres"], overtake["places"]) == (pytest.approx(1.0), pytest.approx(-1.0))
+    assert overtake["contacts"] == pytest.approx(3.0)
+    assert (defend["largest"], defend["apart"], defend["metres"]) == (-2.0, "no", pytest.approx(-1.0))
+    text = traffic_report(rows, response)
+    assert "| overtake | rolling | all | +0.0 | +4.0 | yes | 1.00 | -1.00 | 3.00 |" in text

@@ -11,7 +11,7 @@ from coachable.domains.racing.styles import (
     resource_style_reward,
     resource_style_space,
 )
-from coachable.envs.racing.race.features import GAPS, anyone_beside, corner_drift
+from coachable.envs.racing.race.features import GAPS, anyone_beside, anyone_in_line, corner_drift
 from coachable.styles import Shared, StyleSpace
 
 N = 40000
@@ -136,9 +136,11 @@ def test_margin_reward_by_hand():
         aggressiveness_style_reward(space, apart=2)
 
 
-def test_beside_is_alongside_within_so_many_metres():
-    """Two opponents each: one 0.6 m beside; one ahead; one beside but not near."""
+def test_beside_and_in_line_are_within_so_many_metres():
+    """Two opponents each: one 0.6 m beside; one 0.5 m ahead; one beside but not near."""
     far = [3.0, 2.0, 0.0]
     features = torch.tensor([[0.0] * GAPS + far + gaps for gaps in ([0.0, 0.6, 1.0], [0.5, 0.0, 1.0], [0.0, 0.6, 0.0])])
     assert anyone_beside(features, within=1.0).tolist() == [True, False, False]
     assert not anyone_beside(features, within=0.5).any()
+    assert anyone_in_line(features, within=2.0).tolist() == [False, True, False]
+    assert not anyone_in_line(features, within=0.4).any()
