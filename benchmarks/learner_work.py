@@ -44,21 +44,9 @@ def make_batch(size=B):
     style = torch.rand(size, STYLE, generator=gen)
     done = torch.zeros(size, 1, dtype=torch.bool)
     done[::50] = True
-    return TensorDict(
-        {
-            "observation": normal(OBS),
-            "style": style,
-            "action": torch.tanh(normal(ACT)),
-            "next": {
-                "observation": normal(OBS),
-                "style": style,
-                "reward": normal(1),
-                "done": done,
-                "terminated": done,
-            },
-        },
-        [size],
-    )
+    batch = {"observation": normal(OBS), "style": style, "action": torch.tanh(normal(ACT))}
+    following = {"observation": normal(OBS), "style": style, "reward": normal(1), "done": done, "terminated": done}
+    return TensorDict(batch | {"next": following}, [size])
 
 
 class ScaledStyle:

@@ -11,18 +11,8 @@ from coachable.defaults import EnvPictures, RewardMeasures, simulation_of, steps
 from coachable.domain import Domain
 from coachable.gl import RenderingError
 from coachable.keys import STYLE, STYLE_FEATURES
-from coachable.styles import (
-    Choice,
-    ChoiceTolerance,
-    Setpoint,
-    SetpointTolerance,
-    StyleReward,
-    StyleSpace,
-    Term,
-    Weight,
-    WeightedFeature,
-    WeightedSum,
-)
+from coachable.styles import Choice, Setpoint, StyleReward, StyleSpace, Weight
+from coachable.styles.terms import ChoiceTolerance, SetpointTolerance, Term, WeightedFeature, WeightedSum
 from coachable.transforms import StyleFeatures
 from tests.echo import StyleEchoEnv, echo_space
 

@@ -9,7 +9,6 @@ from typing import Any, Unpack
 import torch
 from matplotlib.patches import Rectangle
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from coachable.domain import Domain
@@ -19,8 +18,7 @@ from coachable.evaluation.figures import drawing
 from coachable.evaluation.style_grid import markdown_table, write_csv
 from coachable.evaluation.wording import readable
 from coachable.networks.plain import ActionOutputs
-from coachable.styles import StyleSpace
-from coachable.training.weights import domain_of, load_policy
+from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
 __all__ = ["explain", "record_states"]
 
@@ -53,7 +51,7 @@ def explain(
     domain = domain_of(agent)
     outputs = ActionOutputs(agent.actor).eval()
     groups = input_groups(domain, agent.space, outputs.observation_dim)
-    trajectories = record_states(domain, agent.actor, agent.space, episodes=episodes, states=states, **options)
+    trajectories = record_states(domain, agent, episodes=episodes, states=states, **options)
     seed = options.get("seed", 0)
     rankings = rank_groups(outputs, trajectories, groups, seed=seed, progress=options.get("progress", True))
     out.mkdir(parents=True, exist_ok=True)
@@ -67,23 +65,11 @@ def explain(
 
 
 def record_states(
-    domain: Domain,
-    policy: TensorDictModuleBase,
-    space: StyleSpace,
-    *,
-    episodes: int = 100,
-    states: int = 16,
-    **options: Unpack[RolloutOptions],
+    domain: Domain, agent: LoadedPolicy, *, episodes: int = 100, states: int = 16, **options: Unpack[RolloutOptions]
 ) -> list[Tensor]:
     """Record inputs of the network along episodes of the policy, each with a style from the training distribution.
 
-    Args:
-        domain: Domain in which the policy acts.
-        policy: Policy that reads `observation` and `style`.
-        space: Its style space.
-        episodes: Number of trajectories, at least 2.
-        states: Largest number of evenly spaced states per trajectory.
-        **options: See `RolloutOptions`.
+    `episodes`, `states` and the options are those of `explain`.
 
     Returns:
         Observation and encoded style (S, observation + theta) of each trajectory.
@@ -93,12 +79,14 @@ def record_states(
     """
     if episodes < 2 or states < 1:
         raise ValueError(f"expected at least 2 episodes and 1 state of each, got {episodes=}, {states=}")
-    theta = space.sample((episodes,), torch.Generator().manual_seed(options.get("seed", 0)))
+    theta = agent.space.sample((episodes,), torch.Generator().manual_seed(options.get("seed", 0)))
     recorder = _Observations(max(1, (options.get("steps") or domain.episode_steps) // _RECORDED))
-    record = record_styles(domain, policy, space, theta, f"{episodes} episodes", measures=recorder, **options)
+    record = record_styles(
+        domain, agent.actor, agent.space, theta, f"{episodes} episodes", measures=recorder, **options
+    )
     observed = torch.stack(recorder.observations)  # (T', N, observation)
     lengths = record.alive[:: recorder.every].sum(0).tolist()
-    encoded = space.encode(theta)
+    encoded = agent.space.encode(theta)
     trajectories = []
     for row, length in enumerate(lengths):
         chosen = torch.linspace(0, length - 1, min(states, length)).round().long()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -116,13 +117,14 @@ def write_report(
         formats = _formats(styles, domain)
         titles = _titles(domain, agent.space, styles, formats)
         page = Page(f"{domain.name}: requested and measured style", _lead(agents, runs, episodes))
-        _styles(page, styles, formats, agent, folder, titles)
-        _requests(page, styles, agent, runs, folder)
-        _switches(page, domain, runs, switch_episodes, formats, folder, titles)
-        _tradeoffs(page, styles, runs, formats, folder, titles)
+        sections = _Sections(page, domain, agent, runs, styles, formats, titles, folder)
+        sections.add_styles()
+        sections.add_requests()
+        sections.add_switches(switch_episodes)
+        sections.add_tradeoffs()
         if domain.evaluation is not None:
             settings = EvaluationSettings(episodes, switch_episodes, sweeps=runs[0].sweeps, **options)
-            _own(page, domain, agent, folder, settings)
+            sections.add_own(settings)
         command = f"coachable report {' '.join(agents)} --seed {seed} --episodes {episodes}"
         command += f" --switch-episodes {switch_episodes} --sweep-points {sweep_points}"
         command += f" --seeds {seeds}" if len(agents) == 1 else ""
@@ -161,122 +163,115 @@ def _lead(agents: Mapping[str, LoadedPolicy], runs: Sequence[Run], episodes: int
     )
 
 
-def _styles(
-    page: Page,
-    styles: StyleTable,
-    formats: Mapping[str, str],
-    agent: LoadedPolicy,
-    out: Path,
-    titles: Mapping[str, str],
-) -> None:
-    metrics = list(formats)
-    by_column = {styles.column(name): form for name, form in formats.items()}
-    summary, rows = styles.summary(metrics), styles.rows(metrics)
-    write_csv([flat_row(row) for row in summary], out / "summary.csv")
-    write_csv([flat_row(row) for row in styles.rows(list(styles.scores))], out / "styles.csv")
-    free = [name for name in metrics if name not in styles.cells[0]] or metrics
-    draw_metrics(styles, agent.space, free, by_column, out / "styles.png", titles)
-    page.section("Summary", table(summary, by_column, titles=titles))
-    figure = picture(out / "styles.png", "metrics per style, with intervals")
-    page.section("Every style", figure, table(rows, by_column, colour=True, titles=titles))
+@dataclass(frozen=True)
+class _Sections:
+    """What the sections of a report are made of, and the page to which they are added."""
 
+    page: Page
+    domain: Domain
+    agent: LoadedPolicy
+    runs: Sequence[Run]
+    styles: StyleTable
+    formats: Mapping[str, str]
+    titles: Mapping[str, str]
+    out: Path
 
-def _requests(page: Page, styles: StyleTable, agent: LoadedPolicy, runs: Sequence[Run], out: Path) -> None:
-    requested = [p.name for p in agent.space.parameters if isinstance(p, Setpoint) and p.name in styles.cells[0]]
-    measured = [name for name in requested if not np.isnan(styles.scores.get(name, np.nan)).all()]
-    if not measured:
-        return
-    draw_requests(styles, agent.space, measured, out / "requests.png")
-    parts = [picture(out / "requests.png", "requested against measured values")]
-    rows = response_rows(runs, agent.space)
-    if rows:
-        write_csv([flat_row(row) for row in rows], out / "requests.csv")
-        parts.append(paragraph("Slope and rank correlation of the measured over the requested value; 1 is ideal."))
-        parts.append(table(rows, {"slope": ".2f", "rank_correlation": ".2f", "mean_error": ".3f"}))
-    page.section("Requested and measured", *parts)
+    def add_styles(self) -> None:
+        """Add the tables and the figure of the metrics in every style."""
+        metrics = list(self.formats)
+        by_column = {self.styles.column(name): form for name, form in self.formats.items()}
+        summary, rows = self.styles.summary(metrics), self.styles.rows(metrics)
+        write_csv([flat_row(row) for row in summary], self.out / "summary.csv")
+        write_csv([flat_row(row) for row in self.styles.rows(list(self.styles.scores))], self.out / "styles.csv")
+        free = [name for name in metrics if name not in self.styles.cells[0]] or metrics
+        draw_metrics(self.styles, self.agent.space, free, by_column, self.out / "styles.png", self.titles)
+        self.page.section("Summary", table(summary, by_column, titles=self.titles))
+        figure = picture(self.out / "styles.png", "metrics per style, with intervals")
+        self.page.section("Every style", figure, table(rows, by_column, colour=True, titles=self.titles))
 
+    def add_requests(self) -> None:
+        """Add measured over requested values of the set-points, if any are measured."""
+        setpoints = [p.name for p in self.agent.space.parameters if isinstance(p, Setpoint)]
+        requested = [name for name in setpoints if name in self.styles.cells[0]]
+        measured = [name for name in requested if not np.isnan(self.styles.scores.get(name, np.nan)).all()]
+        if not measured:
+            return
+        draw_requests(self.styles, self.agent.space, measured, self.out / "requests.png")
+        parts = [picture(self.out / "requests.png", "requested against measured values")]
+        rows = response_rows(self.runs, self.agent.space)
+        if rows:
+            write_csv([flat_row(row) for row in rows], self.out / "requests.csv")
+            parts.append(paragraph("Slope and rank correlation of the measured over the requested value; 1 is ideal."))
+            parts.append(table(rows, {"slope": ".2f", "rank_correlation": ".2f", "mean_error": ".3f"}))
+        self.page.section("Requested and measured", *parts)
 
-def _switches(
-    page: Page,
-    domain: Domain,
-    runs: Sequence[Run],
-    episodes: int,
-    formats: Mapping[str, str],
-    out: Path,
-    titles: Mapping[str, str],
-) -> None:
-    period = SWITCH_PERIOD * domain.control_step
-    draw_switches(runs, period, out / "switches.png")
-    waits = [run.switching.comply_seconds for run in runs]
-    row: dict[str, Any] = {
-        "complied": estimate([run.switching.complied for run in runs]),
-        "median_seconds": estimate([wait.median().item() if len(wait) else np.nan for wait in waits]),
-        **{name: estimate([run.switching.metrics[name] for run in runs]) for name in runs[0].switching.metrics},
-    }
-    switches = sum(run.switching.switches for run in runs)
-    write_csv([flat_row(row | {"switches": switches})], out / "switches.csv")
-    page.section(
-        "Styles that change while the agent acts",
-        paragraph(
-            f"{counted(episodes, 'episode')} per run, another style every {period:g} s, "
-            f"{switches} {'switch' if switches == 1 else 'switches'}. "
-            "Complied: the agent did what was asked before the next switch."
-        ),
-        picture(out / "switches.png", "share of switches complied with over time"),
-        table([row], {**formats, "complied": ".0%", "median_seconds": ".2f"}, titles=titles),
-    )
-
-
-def _tradeoffs(
-    page: Page,
-    styles: StyleTable,
-    runs: Sequence[Run],
-    formats: Mapping[str, str],
-    out: Path,
-    titles: Mapping[str, str],
-) -> None:
-    if not runs[0].sweeps:
-        return
-    success = _success(runs, formats)
-    draw_tradeoffs(runs, success, formats.get(success, ""), out / "tradeoffs.png", titles)
-    rows = [
-        {"weight": sweeps[0].weight, "value": float(value), "style": sweep_estimate(sweeps, sweeps[0].score, i)}
-        | {name: sweep_estimate(sweeps, name, i) for name in sweeps[0].episodes}
-        for sweeps in zip(*(run.sweeps for run in runs), strict=True)
-        for i, value in enumerate(sweeps[0].values)
-    ]
-    write_csv([flat_row(row) for row in rows], out / "tradeoffs.csv")
-    kept = ("weight", "value", "style", *(name for name in formats if name in rows[0]))
-    page.section(
-        "What a style costs",
-        paragraph(
-            "Each weight from neutral to its maximum, the other parameters at their defaults. Style is what the domain "
-            "measures under the weight's name, or else what the weight rewards per step, at weight 1; task success is "
-            f"{readable(success)}."
-        ),
-        picture(out / "tradeoffs.png", "task success against style score along each weight"),
-        table([{name: row[name] for name in kept} for row in rows], formats, titles=titles),
-    )
-
-
-def _own(page: Page, domain: Domain, agent: LoadedPolicy, out: Path, settings: EvaluationSettings) -> None:
-    """Add the tables and figures that the domain's own evaluation writes for the first agent."""
-    assert domain.evaluation is not None
-    folder = out / domain.name
-    domain.evaluation(domain, agent, folder, settings)
-    for file in sorted(folder.glob("*.csv")):
-        with file.open(newline="", encoding="utf-8") as lines:
-            rows = [{name: _number(value) for name, value in row.items()} for row in csv.DictReader(lines)]
-        figure = file.with_suffix(".png")
-        parts = [picture(figure, f"{readable(file.stem)}, a figure")] if figure.is_file() else []
-        columns = {name: [value for row in rows if isinstance(value := row[name], float)] for name in rows[0]}
-        large = [name for name, values in columns.items() if values and max(values) >= 1000]
-        parts.append(
-            table(rows, dict.fromkeys(large, ".0f"))
-            if len(rows) <= _LONGEST_TABLE
-            else paragraph(f"{len(rows)} rows: {file.relative_to(out)}")
+    def add_switches(self, episodes: int) -> None:
+        """Add how fast the agent complies after switches of the style, in `episodes` episodes per run."""
+        period = SWITCH_PERIOD * self.domain.control_step
+        draw_switches(self.runs, period, self.out / "switches.png")
+        tests = [run.switching for run in self.runs]
+        waits = [test.comply_seconds for test in tests]
+        row: dict[str, Any] = {
+            "complied": estimate([test.complied for test in tests]),
+            "median_seconds": estimate([wait.median().item() if len(wait) else np.nan for wait in waits]),
+            **{name: estimate([test.metrics[name] for test in tests]) for name in tests[0].metrics},
+        }
+        switches = sum(test.switches for test in tests)
+        write_csv([flat_row(row | {"switches": switches})], self.out / "switches.csv")
+        self.page.section(
+            "Styles that change while the agent acts",
+            paragraph(
+                f"{counted(episodes, 'episode')} per run, another style every {period:g} s, "
+                f"{switches} {'switch' if switches == 1 else 'switches'}. "
+                "Complied: the agent did what was asked before the next switch."
+            ),
+            picture(self.out / "switches.png", "share of switches complied with over time"),
+            table([row], {**self.formats, "complied": ".0%", "median_seconds": ".2f"}, titles=self.titles),
         )
-        page.section(readable(file.stem).capitalize(), *parts)
+
+    def add_tradeoffs(self) -> None:
+        """Add task success over the amount of style along each weight, if there are weights."""
+        if not self.runs[0].sweeps:
+            return
+        success = _success(self.runs, self.formats)
+        draw_tradeoffs(self.runs, success, self.formats.get(success, ""), self.out / "tradeoffs.png", self.titles)
+        rows = [
+            {"weight": sweeps[0].weight, "value": float(value), "style": sweep_estimate(sweeps, sweeps[0].score, i)}
+            | {name: sweep_estimate(sweeps, name, i) for name in sweeps[0].episodes}
+            for sweeps in zip(*(run.sweeps for run in self.runs), strict=True)
+            for i, value in enumerate(sweeps[0].values)
+        ]
+        write_csv([flat_row(row) for row in rows], self.out / "tradeoffs.csv")
+        kept = ("weight", "value", "style", *(name for name in self.formats if name in rows[0]))
+        self.page.section(
+            "What a style costs",
+            paragraph(
+                "Each weight from neutral to its maximum, the other parameters at their defaults. Style is what the "
+                "domain measures under the weight's name, or else what the weight rewards per step, at weight 1; task "
+                f"success is {readable(success)}."
+            ),
+            picture(self.out / "tradeoffs.png", "task success against style score along each weight"),
+            table([{name: row[name] for name in kept} for row in rows], self.formats, titles=self.titles),
+        )
+
+    def add_own(self, settings: EvaluationSettings) -> None:
+        """Add the tables and figures that the domain's own evaluation writes for the first agent."""
+        assert self.domain.evaluation is not None
+        folder = self.out / self.domain.name
+        self.domain.evaluation(self.domain, self.agent, folder, settings)
+        for file in sorted(folder.glob("*.csv")):
+            with file.open(newline="", encoding="utf-8") as lines:
+                rows = [{name: _number(value) for name, value in row.items()} for row in csv.DictReader(lines)]
+            figure = file.with_suffix(".png")
+            parts = [picture(figure, f"{readable(file.stem)}, a figure")] if figure.is_file() else []
+            columns = {name: [value for row in rows if isinstance(value := row[name], float)] for name in rows[0]}
+            large = [name for name, values in columns.items() if values and max(values) >= 1000]
+            parts.append(
+                table(rows, dict.fromkeys(large, ".0f"))
+                if len(rows) <= _LONGEST_TABLE
+                else paragraph(f"{len(rows)} rows: {file.relative_to(self.out)}")
+            )
+            self.page.section(readable(file.stem).capitalize(), *parts)
 
 
 def _number(text: str) -> float | str:

@@ -85,7 +85,7 @@ def evaluate_run(
         label,
         evaluate_grid(domain, agent.actor, agent.space, episodes=episodes, **options),
         evaluate_switching(domain, agent.actor, agent.space, episodes=switch_episodes, period=SWITCH_PERIOD, **options),
-        sweep_weights(domain, agent.actor, agent.space, points=sweep_points, episodes=episodes, **options),
+        sweep_weights(domain, agent, points=sweep_points, episodes=episodes, **options),
     )
 
 

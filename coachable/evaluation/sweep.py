@@ -9,13 +9,13 @@ from typing import Unpack
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from coachable.domain import Domain, StyleMeasures
 from coachable.evaluation.episode_records import RolloutOptions, record_styles
 from coachable.keys import STYLE_FEATURES
-from coachable.styles import StyleReward, StyleSpace, Weight
+from coachable.styles import StyleReward, Weight
+from coachable.training.weights import LoadedPolicy
 
 __all__ = ["UNIT_REWARD", "WeightSweep", "sweep_weights"]
 
@@ -44,20 +44,13 @@ class WeightSweep:
 
 
 def sweep_weights(
-    domain: Domain,
-    policy: TensorDictModuleBase,
-    space: StyleSpace,
-    *,
-    points: int = 5,
-    episodes: int = 4,
-    **options: Unpack[RolloutOptions],
+    domain: Domain, agent: LoadedPolicy, *, points: int = 5, episodes: int = 4, **options: Unpack[RolloutOptions]
 ) -> list[WeightSweep]:
     """Run `episodes` episodes at `points` values of every `Weight` of the space, all of them in one batch.
 
     Args:
-        domain: Domain in which the policy acts.
-        policy: Policy that reads `observation` and `style`.
-        space: Its style space.
+        domain: Domain in which the agent acts.
+        agent: The policy and its styles.
         points: Number of values from 0 to the upper end of the weight's evaluation range, or the lower end if the
             upper one is 0.
         episodes: Number of episodes per value.
@@ -66,6 +59,7 @@ def sweep_weights(
     Returns:
         One sweep per weight; an empty list if there are no weights or fewer than 2 points.
     """
+    space = agent.space
     weights = [p for p in space.parameters if isinstance(p, Weight)]
     if not weights or points < 2:
         return []
@@ -80,7 +74,7 @@ def sweep_weights(
         unit[row, space.slices[name]] = 1.0
     measures = _WithUnitReward(domain.measures, reward, unit.repeat_interleave(episodes, 0))
     label = f"{len(weights)} weights x {points} values"
-    record = record_styles(domain, policy, space, theta, label, measures=measures, reward=reward, **options)
+    record = record_styles(domain, agent.actor, space, theta, label, measures=measures, reward=reward, **options)
     values = {"survived": record.survived.float(), "task_return": record.task_return}
     values |= measures.summarise(record.measures, record.alive)
     shape = (len(weights), points, episodes)

@@ -155,66 +155,29 @@ class Acceleration(Backend):
         return nullcontext()
 
     def both(self, losses: LossFunctions, batch: TensorDictBase, trained: Sequence[str]) -> Any:
-        """Evaluate all losses and set their gradients, see :meth:`Backend.both`.
-
-        Args:
-            losses: The functions of the loss.
-            batch: Transitions, into which `td_error` is written.
-            trained: Names of the losses to differentiate.
-
-        Returns:
-            The losses and further results by name.
-        """
+        """Evaluate all losses and set their gradients, see :meth:`Backend.both`."""
         direct = self._direct_for(batch)
         return direct.both(batch) if direct else super().both(losses, batch, trained)
 
     def actor(self, losses: LossFunctions, batch: TensorDictBase) -> tuple[Tensor, Any]:
-        """Evaluate the policy's loss and set its gradients.
-
-        Args:
-            losses: The functions of the loss.
-            batch: Transitions.
-
-        Returns:
-            The loss and its metadata.
-        """
+        """Evaluate the policy's loss and set its gradients, see :meth:`Backend.actor`."""
         direct = self._direct_for(batch)
         return direct.actor(batch) if direct else super().actor(losses, batch)
 
     def critic(self, losses: LossFunctions, batch: TensorDictBase) -> tuple[Tensor, Any]:
-        """Evaluate the critics' loss and set its gradients.
-
-        Args:
-            losses: The functions of the loss.
-            batch: Transitions, into which `td_error` is written.
-
-        Returns:
-            The loss and its metadata.
-        """
+        """Evaluate the critics' loss and set its gradients, see :meth:`Backend.critic`."""
         direct = self._direct_for(batch)
         return direct.critic(batch) if direct else super().critic(losses, batch)
 
     def make_optimizer(self, name: str, params: list[nn.Parameter], lr: float, eps: float) -> torch.optim.Adam:
-        """Return `FlatAdam` for the policy and the critics, `torch.optim.Adam` for the temperature.
-
-        Args:
-            name: `"actor"`, `"critic"` or `"alpha"`.
-            params: The trained parameters of that name.
-            lr: Learning rate.
-            eps: Adam's epsilon.
-        """
+        """Return `FlatAdam` for the policy and the critics, `torch.optim.Adam` for the temperature."""
         if name == "alpha":
             return super().make_optimizer(name, params, lr, eps)
         flat, target = (self._actor, None) if name == "actor" else (self._critic, self._target)
         return FlatAdam(params, flat, target, 1.0 - self.target_updater.eps, lr=lr, eps=eps)
 
     def gradient_norm(self, name: str, params: list[nn.Parameter]) -> Tensor:
-        """Return the 2-norm of the gradient; it is zero without a backward pass.
-
-        Args:
-            name: `"actor"`, `"critic"` or `"alpha"`.
-            params: The trained parameters of that name.
-        """
+        """Return the 2-norm of the gradient, see :meth:`Backend.gradient_norm`; it is zero without a backward pass."""
         if name == "alpha":
             return super().gradient_norm(name, params)
         plans, flat = (self._actor_plans, self._actor) if name == "actor" else (self._critic_plans, self._critic)

@@ -58,12 +58,7 @@ class Workspace:
             self._parts.append([_MemberSpace(kernels, layers, m, x, keep) for m, x in zip(own, inputs, strict=True)])
 
     def forward(self, inputs: Sequence[Tensor], out: Sequence[Tensor]) -> None:
-        """Evaluate the members.
-
-        Args:
-            inputs: Parts of the common input, (rows, d_i) each.
-            out: Outputs to write, (rows, o) for each member.
-        """
+        """Evaluate the members; see `TorchPasses.forward`."""
         for slot, value in zip(self._slots, inputs, strict=True):
             slot.copy_(value)
         share_out(
@@ -75,17 +70,7 @@ class Workspace:
         )
 
     def backward(self, grads: Tensor, trained: bool, add: bool, columns: slice | None) -> Tensor | None:
-        """Run the backward pass of all members.
-
-        Args:
-            grads: Gradients of their outputs, `(K, rows, o)`.
-            trained: Whether to write their parameters' gradients.
-            add: Add them to those present instead of replacing them.
-            columns: Columns of the concatenated inputs whose gradient is wanted, `None` for none.
-
-        Returns:
-            Gradient of the inputs, summed over the members, `(rows, columns)`; `None` without `columns`.
-        """
+        """Run the backward pass of all members; see `TorchPasses.backward`."""
         step = 1 if self._parts[0][0].products() is not None else 0
         dx = None if columns is None else grads.new_empty(len(grads), self.rows, columns.stop - columns.start)
 

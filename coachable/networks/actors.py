@@ -112,9 +112,9 @@ class GaussianPolicy(StyleNetwork):
         obs_dim: int,
         action_dim: int,
         space: StyleEncoding | None,
-        widths: Sequence[int] = (512, 512, 512),
+        widths: Sequence[int],
         *,
-        log_scale_range: tuple[float, float] = (-5.0, 2.0),
+        log_scale_range: tuple[float, float],
         **trunk: Any,
     ) -> None:
         super().__init__(space, obs_dim, 2 * action_dim, widths, **trunk)

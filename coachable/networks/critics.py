@@ -14,28 +14,9 @@ from coachable.networks.actors import StyleEncoding, StyleNetwork, TensorModule
 class StyleCritic(StyleNetwork):
     """Network of an action value, its quantiles, or logits over its bins.
 
-    The trunk's input is `cat(observation, encode(theta), action)`.
-
-    Args:
-        obs_dim: Width of the observation.
-        action_dim: Width of the action.
-        space: Style space that encodes theta; None for a critic without style.
-        widths: Widths of the residual layers.
-        num_outputs: Width of the head: 1 for a scalar value, else the number of quantiles or bins.
-        **trunk: Further arguments of :class:`~coachable.networks.residual.ResidualMLP`.
+    The trunk's input is `cat(observation, encode(theta), action)`. The head has one output for a scalar value, else one
+    for each quantile or bin.
     """
-
-    def __init__(
-        self,
-        obs_dim: int,
-        action_dim: int,
-        space: StyleEncoding | None,
-        widths: Sequence[int] = (512, 512, 512),
-        *,
-        num_outputs: int = 1,
-        **trunk: Any,
-    ) -> None:
-        super().__init__(space, obs_dim + action_dim, num_outputs, widths, **trunk)
 
     def forward(self, observation: Tensor, action: Tensor, style: Tensor | None = None) -> Tensor:
         """Return the critic's output.
@@ -46,7 +27,7 @@ class StyleCritic(StyleNetwork):
             style: Raw style `(..., d)`, encoded here; None without a style space.
 
         Returns:
-            Output `(..., num_outputs)` float32.
+            Output `(..., outputs)` float32.
 
         Raises:
             ValueError: If the network has a style space and `style` is None.
@@ -83,5 +64,5 @@ def make_critic(
     Returns:
         A `ValueOperator` that reads `observation`, `action` and `style` and writes `state_action_value`.
     """
-    critic = StyleCritic(obs_dim, action_dim, space, widths, num_outputs=num_outputs, **trunk)
+    critic = StyleCritic(space, obs_dim + action_dim, num_outputs, widths, **trunk)
     return CriticModule(critic, in_keys=critic.in_keys("observation", "action"), out_keys=["state_action_value"])

@@ -36,7 +36,7 @@ class MixedPolicy(StyleNetwork):
         obs_dim: int,
         heads: ActionHeads,
         space: StyleEncoding | None,
-        widths: Sequence[int] = (512, 512, 512),
+        widths: Sequence[int],
         **trunk: Any,
     ) -> None:
         super().__init__(space, obs_dim, heads.num_parameters, widths, **trunk)

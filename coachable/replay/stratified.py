@@ -81,6 +81,7 @@ class _Plan:
     size: Tensor  # (B,) float64, live records of it
 
 
+@dataclass(eq=False, repr=False)
 class StratifiedSampler(Sampler):
     """Sampler that draws the same share of every batch from each table (paper, Stratified Sampling; Kompella 2023).
 
@@ -93,21 +94,14 @@ class StratifiedSampler(Sampler):
         eps: Number added to priorities, so that none is 0.
     """
 
-    def __init__(
-        self,
-        regions: Regions,
-        proportions: np.ndarray,
-        prioritized: bool = False,
-        alpha: float = 0.6,
-        beta: float = 0.4,
-        eps: float = 1e-8,
-    ) -> None:
-        self.regions = regions
-        self.proportions = proportions
-        self.prioritized = prioritized
-        self.alpha = alpha
-        self.beta = beta
-        self.eps = eps
+    regions: Regions
+    proportions: np.ndarray
+    prioritized: bool = False
+    alpha: float = 0.6
+    beta: float = 0.4
+    eps: float = 1e-8
+
+    def __post_init__(self) -> None:
         self._plans: dict[tuple[int, torch.device], tuple[int, _Plan]] = {}
         self._tree: SumTree | None = None
         self._largest: Tensor | None = None

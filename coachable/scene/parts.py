@@ -47,6 +47,9 @@ class Batch:
 class Parts:
     """Growing collection of primitives.
 
+    `box`, `ball`, `cylinder` and `sector` add one primitive. They take the position of its centre (3,) [m], its sizes
+    along its own axes (3,) [m], its colour (red, green and blue, 0 to 255) and its rotation as a unit quaternion (4,).
+
     Example:
         >>> wheel = Parts().cylinder((0.0, 0.0, 0.3), (0.6, 0.6, 0.2), (34, 37, 43))
         >>> len(Parts().figure(wheel, (2.0, 0.0, 0.0)).figure(wheel, (4.0, 0.0, 0.0)))
@@ -60,60 +63,27 @@ class Parts:
         return sum(len(batch) for batches in self._rows.values() for batch in batches)
 
     def box(self, position: Numbers, size: Numbers, colour: Colour, wxyz: Numbers = _UPRIGHT) -> Parts:
-        """Add a box and return this collection.
-
-        Args:
-            position: Centre (3,) [m].
-            size: Sizes along its own axes (3,) [m].
-            colour: Red, green and blue, 0 to 255.
-            wxyz: Rotation as unit quaternion (4,).
-        """
+        """Add a box and return this collection."""
         return self._add(BOX, position, size, colour, wxyz)
 
     def ball(self, position: Numbers, size: Numbers, colour: Colour, wxyz: Numbers = _UPRIGHT) -> Parts:
-        """Add an ellipsoid and return this collection.
-
-        Args:
-            position: Centre (3,) [m].
-            size: Diameters along its own axes (3,) [m].
-            colour: Red, green and blue, 0 to 255.
-            wxyz: Rotation as unit quaternion (4,).
-        """
+        """Add an ellipsoid, whose sizes are its diameters, and return this collection."""
         return self._add(BALL, position, size, colour, wxyz)
 
     def cylinder(self, position: Numbers, size: Numbers, colour: Colour, wxyz: Numbers = _UPRIGHT) -> Parts:
-        """Add a cylinder along its z axis and return this collection.
-
-        Args:
-            position: Centre (3,) [m].
-            size: Sizes along its own axes (3,) [m].
-            colour: Red, green and blue, 0 to 255.
-            wxyz: Rotation as unit quaternion (4,).
-        """
+        """Add a cylinder along its z axis and return this collection."""
         return self._add(CYLINDER, position, size, colour, wxyz)
 
     def sector(self, position: Numbers, size: Numbers, colour: Colour, wxyz: Numbers = _UPRIGHT) -> Parts:
         """Add a flat sector of a disc, which opens along its x axis, and return this collection.
 
-        Films show it only among the translucent primitives.
-
-        Args:
-            position: Tip of the sector, and middle of the disc (3,) [m].
-            size: Diameters of the disc, and its height (3,) [m].
-            colour: Red, green and blue, 0 to 255.
-            wxyz: Rotation as unit quaternion (4,).
+        Its position is its tip, which is the middle of the disc, and its sizes are the diameters of the disc and its
+        height. Films show it only among the translucent primitives.
         """
         return self._add(SECTOR, position, size, colour, wxyz)
 
     def capsule(self, start: Numbers, end: Numbers, radius: float, colour: Colour) -> Parts:
-        """Add a cylinder between two points with a ball at each end, and return this collection.
-
-        Args:
-            start: First point (3,) [m].
-            end: Second point (3,) [m].
-            radius: Radius [m].
-            colour: Red, green and blue, 0 to 255.
-        """
+        """Add a `rod` with a ball at each end, and return this collection."""
         self.rod(start, end, radius, colour)
         for point in (start, end):
             self.ball(point, (2 * radius,) * 3, colour)

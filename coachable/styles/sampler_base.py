@@ -77,16 +77,7 @@ class Sampler:
     def sample_independent(
         self, shape: Sequence[int] = (), generator: Generator | None = None, device: torch.device | str | None = None
     ) -> Tensor:
-        """Draw styles that are all independent, unlike the rows of a batch of `Shared`.
-
-        Args:
-            shape: Batch shape.
-            generator: Generator to draw from; None for torch's global one.
-            device: Device of the result; None for that of the generator, or without one the CPU.
-
-        Returns:
-            Styles `(*shape, dim)`, float32.
-        """
+        """Draw styles that are all independent, unlike the rows of a batch of `Shared`; see `sample`."""
         return self.sample((*shape, 1), generator, device).squeeze(-2)
 
     def _draw(self, shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:

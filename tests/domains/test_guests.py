@@ -15,6 +15,8 @@ from coachable.domain import domain_names, load_domain
 pytest.importorskip("gymnasium")
 
 GUESTS = {"leaning_pendulum": "lean", "placed_cartpole": "place"}  # by name: the parameter of its style
+OBS_DIM = {"leaning_pendulum": 3, "placed_cartpole": 5}
+TRAINING = "sac_training"
 SOURCES = Path(__file__).parent / "guests"
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
@@ -31,7 +33,8 @@ def install(site, *, package, domain):
 def guest(request, tmp_path_factory):
     """Name of a domain of a package that is installed in a temporary folder."""
     name, site = request.param, tmp_path_factory.mktemp("site")
-    (site / f"{name}.py").write_text((SOURCES / f"{name}.py").read_text())
+    for module in (name, TRAINING):
+        (site / f"{module}.py").write_text((SOURCES / f"{module}.py").read_text())
     install(site, package=name, domain=name)
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(site)
@@ -42,7 +45,7 @@ def guest(request, tmp_path_factory):
 def run(guest, tmp_path_factory):
     """Folder of a short training."""
     folder = tmp_path_factory.mktemp("runs") / guest
-    importlib.import_module(guest).train(folder, frames=240)
+    importlib.import_module(TRAINING).train(load_domain(guest), OBS_DIM[guest], folder, frames=240)
     return str(folder)
 
 
@@ -129,7 +132,7 @@ def test_without_its_package_the_domain_is_named(run, guest, tmp_path, monkeypat
     assert f"unknown domain '{guest}': expected one of ['combat'," in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", GUESTS)
+@pytest.mark.parametrize("name", [*GUESTS, TRAINING])
 def test_the_documentation_shows_the_files_as_they_are(name):
     source = (SOURCES / f"{name}.py").read_text()
     assert any(f"```python\n{source}```" in page.read_text() for page in DOCS.rglob("*.md"))

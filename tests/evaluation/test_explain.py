@@ -104,9 +104,8 @@ def test_groups_are_the_domains_and_one_per_style_parameter():
 
 def test_recorded_states_come_from_living_agents():
     agent = load_policy("humanoid")
-    recorded = record_states(
-        load_domain("humanoid"), agent.actor, agent.space, episodes=3, states=4, steps=20, num_threads=1, progress=False
-    )
+    options = {"steps": 20, "num_threads": 1, "progress": False}
+    recorded = record_states(load_domain("humanoid"), agent, episodes=3, states=4, **options)
     assert [trajectory.shape for trajectory in recorded] == [(4, 86)] * 3
     for trajectory in recorded:
         assert (trajectory[:, 82:] == trajectory[0, 82:]).all()  # one style per trajectory

@@ -100,7 +100,7 @@ def test_requests_are_followed_under_a_red_hat(folder):
 
 
 def test_a_weight_buys_style_with_survival():
-    (sweep,) = sweep_weights(DOMAIN, AGENT.actor, SPACE, points=5, episodes=2, progress=False)
+    (sweep,) = sweep_weights(DOMAIN, AGENT, points=5, episodes=2, progress=False)
     assert sweep.weight == "bold"
     np.testing.assert_allclose(sweep.values, [0, 1, 2, 3, 4])  # from neutral, not from the lowest
     # The default style asks for a speed of 1 under a red hat. Scale 2 per unit of the feature, whatever the weight.
@@ -115,14 +115,14 @@ def test_a_domain_may_measure_a_weight_itself():
             return {**super().step(transition), "bold": transition["action"].squeeze(-1)}
 
     domain = Domain(**{**vars(DOMAIN), "measures": Measures()})
-    (sweep,) = sweep_weights(domain, AGENT.actor, SPACE, points=2, episodes=1, progress=False)
+    (sweep,) = sweep_weights(domain, AGENT, points=2, episodes=1, progress=False)
     assert sweep.score == "bold"
     np.testing.assert_allclose(sweep.episodes["bold"][:, 0], [1.0, 2.0])
 
 
 def test_without_weights_there_is_no_sweep(tmp_path):
     space = StyleSpace([Setpoint("speed", 0.0, 2.0)])
-    assert sweep_weights(DOMAIN, AGENT.actor, space, progress=False) == []
+    assert sweep_weights(DOMAIN, AGENT._replace(space=space), progress=False) == []
 
 
 def test_the_page_is_one_file(folder):

@@ -30,6 +30,11 @@ def ones(*shape):
     return slanted(torch.ones(shape))
 
 
+@pytest.fixture(autouse=True)
+def seeded():
+    torch.manual_seed(0)
+
+
 @pytest.fixture
 def fresh():
     native.load_kernels.cache_clear()
@@ -42,7 +47,6 @@ def fresh():
 @pytest.mark.parametrize("rows", [1, 3, 257])
 @pytest.mark.parametrize("n", [1, 17, 63, 64, 200, 255, 512])
 def test_layer_forward(n, rows, dtype):
-    torch.manual_seed(0)
     width, start, to = max(n // 2, 1), 3, n - max(n // 2, 1)
     z, skip = rounded(rows, n, dtype=dtype), rounded(rows, n + 3, dtype=dtype)
     bias, gamma, beta = (normal(n) for _ in range(3))
@@ -66,7 +70,6 @@ def test_layer_forward(n, rows, dtype):
 )
 @pytest.mark.parametrize("n", [1, 17, 63, 200, 255, 512])
 def test_layer_backward(n, count, rows, dtype):
-    torch.manual_seed(0)
     z = rounded(count, n, dtype=dtype)
     bias, gamma, beta = (normal(n) for _ in range(3))
     index = None if rows is None else slanted(torch.tensor(rows))
@@ -96,7 +99,6 @@ def test_layer_backward(n, count, rows, dtype):
 @pytest.mark.parametrize("rows", [1, 3, 257])
 @pytest.mark.parametrize("n", [1, 17, 63, 255, 512])
 def test_small_head(n, rows, dtype):
-    torch.manual_seed(0)
     x, weight, bias, grad = rounded(rows, n, dtype=dtype), normal(3, n), normal(3), normal(rows, 3)
     y, dx, dweight, dbias, scratch = ones(rows, 3), rounded(rows, n, dtype=dtype), ones(3, n), ones(3), ones(n)
     address, functions = [t.data_ptr() for t in (x, weight, bias)], kernels[dtype]
@@ -120,7 +122,6 @@ needs_products = pytest.mark.skipif(products is None, reason="no bfloat16 produc
     [(1, 2, 1), (7, 33, 70), (13, 109, 128), (64, 128, 200), (1, 1, 17), (3, 17, 255), (257, 255, 1)],
 )
 def test_product_of_the_forward_pass(rows, inner, n):
-    torch.manual_seed(0)
     stride = inner + inner % 2
     x, weight, z, out = (rounded(*shape) for shape in ((rows, stride), (n, inner), (rows, n), (rows, n)))
     x[:, inner:] = 0
@@ -142,7 +143,6 @@ def test_product_of_the_forward_pass(rows, inner, n):
 )
 def test_products_of_the_backward_pass(rows, inner, n, to):
     """Gradient of some columns of the input, and of the weight."""
-    torch.manual_seed(0)
     dz, weight, grad, x = rounded(rows, inner), rounded(inner, n), rounded(rows, inner), rounded(rows, n)
     width = min(inner - to, n)
     skip = F.pad(grad[:, to : to + width].float(), (0, n - width))
@@ -164,7 +164,6 @@ def test_products_of_the_backward_pass(rows, inner, n, to):
     [(1, 1, 5), (7, 70, 13), (33, 512, 42), (13, 128, 255), (3, 17, 17), (257, 255, 5), (257, 1, 255)],
 )
 def test_head_of_many_outputs(rows, n, outputs):
-    torch.manual_seed(0)
     x, weight, bias, grad = rounded(rows, n), normal(outputs, n), normal(outputs), normal(rows, outputs)
     y, dx, dweight, dbias = ones(rows, outputs), rounded(rows, n), ones(outputs, n), ones(outputs)
     address, last = [t.data_ptr() for t in (x, weight, bias)], [t.data_ptr() for t in (dx, dweight, dbias)]

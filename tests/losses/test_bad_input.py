@@ -13,16 +13,7 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor
 from coachable.losses import CategoricalSACLoss, CatRACLoss, QRSACLoss, RACLoss
 from coachable.networks import make_critic
 from coachable.networks.mixed import make_mixed_actor
-from tests.losses.cases import (
-    AXES,
-    BINS,
-    BUTTONS,
-    CASES,
-    MIXED,
-    OBS,
-    PlainSpace,
-    make_batch,
-)
+from tests.losses.cases import AXES, BINS, BUTTONS, CASES, MIXED, OBS, PlainSpace, make_batch
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 

@@ -11,17 +11,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from coachable.networks import make_critic, make_gaussian_actor
 from coachable.networks.mixed import make_mixed_actor
-from tests.losses.cases import (
-    AXES,
-    HEADS,
-    OBS,
-    OWN,
-    Case,
-    PlainSpace,
-    constant_loss,
-    critic_loss,
-    make_batch,
-)
+from tests.losses.cases import AXES, HEADS, OBS, OWN, Case, PlainSpace, constant_loss, critic_loss, make_batch
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 

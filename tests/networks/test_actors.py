@@ -41,7 +41,7 @@ def test_networks_have_the_papers_widths_unless_told_otherwise():
 
 
 def test_style_is_encoded_inside():
-    policy = GaussianPolicy(5, 2, ScaledStyle(), (16, 16))
+    policy = GaussianPolicy(5, 2, ScaledStyle(), (16, 16), log_scale_range=(-5.0, 2.0))
     td = _batch(4)
     loc, _ = policy(td["observation"], td["style"])
     expected = policy.trunk(torch.cat((td["observation"], td["style"] / 2), -1))[:, :2]
@@ -85,6 +85,6 @@ def test_entropy_estimate_agrees_with_quadrature():
 
 def test_missing_style_and_bad_range_raise():
     with pytest.raises(ValueError, match="conditioned on a style"):
-        GaussianPolicy(5, 2, ScaledStyle(), (16,))(torch.zeros(1, 5))
+        GaussianPolicy(5, 2, ScaledStyle(), (16,), log_scale_range=(-5.0, 2.0))(torch.zeros(1, 5))
     with pytest.raises(ValueError, match="low < high"):
         GaussianPolicy(5, 2, None, (16,), log_scale_range=(2.0, -2.0))

@@ -23,7 +23,7 @@ def test_keys_and_shapes(num_outputs, shape):
 
 
 def test_input_is_observation_encoded_style_action():
-    critic = StyleCritic(6, 2, ScaledStyle(), (16, 16))
+    critic = StyleCritic(ScaledStyle(), 6 + 2, 1, (16, 16))
     obs, action, style = torch.randn(4, 6), torch.randn(4, 2), torch.randn(4, 3)
     expected = critic.trunk(torch.cat((obs, style / 2, action), -1))
     torch.testing.assert_close(critic(obs, action, style), expected, rtol=0, atol=0)

@@ -105,19 +105,6 @@ def test_mistakes_are_named_with_the_valid_choices(argument, message):
 
 
 @pytest.mark.parametrize(
-    "argument, message",
-    [
-        ("train.batch_size=1.5", r"train.batch_size=1.5: expected a whole number of at least 1"),
-        ("learner.compile=2", r"learner.compile=2: expected true or false"),
-        ("network.actor.widths=512", r"network.actor.widths=512: expected a list"),
-    ],
-)
-def test_so_are_values_that_only_we_refuse(argument, message):
-    with pytest.raises(ValueError, match=message):
-        _compose(argument)
-
-
-@pytest.mark.parametrize(
     "text, message",
     [
         ("alphaa: 0.1", r"alphaa does not exist: .* Did you mean alpha\? Valid: .*train"),

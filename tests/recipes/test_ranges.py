@@ -126,7 +126,10 @@ def test_what_a_target_checks_itself_is_refused_before_anything_is_written(argum
         ("alpha=-0.1", r"alpha=-0.1: expected a number above 0"),
         ("learner.tau=2", r"learner.tau=2.0: expected a number in \(0, 1\]"),
         ("train.batch_size=0", r"train.batch_size=0: expected a whole number of at least 1"),
+        ("train.batch_size=1.5", r"train.batch_size=1.5: expected a whole number of at least 1"),
+        ("learner.compile=2", r"learner.compile=2: expected true or false"),
         ("mirror=1.2", r"mirror=1.2: expected a number in \[0, 1\]"),
+        ("network.actor.widths=512", r"network.actor.widths=512: expected a list"),
         ("network.actor.widths=[32,0]", r"network.actor.widths=0: expected a whole number of at least 1"),
         (
             "network.critic.widths=[]",

@@ -5,22 +5,9 @@ from dataclasses import dataclass
 import pytest
 import torch
 
-from coachable.styles import (
-    Choice,
-    ContinuousOneHot,
-    Mixture,
-    OneHot,
-    PointMass,
-    Product,
-    Sampler,
-    Setpoint,
-    Shared,
-    StyleSpace,
-    Uniform,
-    UniformChoice,
-    Weight,
-)
+from coachable.styles import Choice, Sampler, Setpoint, Shared, StyleSpace, Weight
 from coachable.styles.mixtures import style_mixture, with_extremes, with_requests
+from coachable.styles.samplers import ContinuousOneHot, Mixture, OneHot, PointMass, Product, Uniform, UniformChoice
 
 N = 200_000
 

@@ -132,19 +132,17 @@ def fight_grid(
     opponents: Sequence[tuple[str, ...]],
     *,
     fights: int,
-    seed: int,
-    progress: str | None = None,
+    **options: Any,
 ) -> dict[str, np.ndarray]:
     """Run fights in every style against every opponent at every site (paper).
 
     Args:
-        domain: Domain combat, as the agent was trained in.
-        agent: Policy.
+        domain: See `run_fights`.
+        agent: See `run_fights`.
         cells: Styles.
         opponents: Types of the one or two machines of each opponent.
         fights: Number of fights per style, opponent and site.
-        seed: Seed of fights and actions.
-        progress: Label of the progress bar, or None for no bar.
+        **options: Seed and further keyword arguments of `run_fights`.
 
     Returns:
         Results of `run_fights`, (styles, opponents, sites * fights, ...).
@@ -152,6 +150,6 @@ def fight_grid(
     theta = agent.space.make_all(cells)
     grid = list(product(range(len(cells)), opponents, SITES, range(fights)))
     rows, faced, places = zip(*((i, machines, site) for i, machines, site, _ in grid), strict=True)
-    found = run_fights(domain, agent, theta[list(rows)], faced, places, seed=seed, progress=progress)
+    found = run_fights(domain, agent, theta[list(rows)], faced, places, **options)
     shape = (len(cells), len(opponents), len(SITES) * fights)
     return {name: value.reshape(*shape, *value.shape[1:]) for name, value in found.items()}

@@ -89,7 +89,7 @@ def evaluate_fights(domain: Domain, agent: LoadedPolicy, out: Path, settings: Ev
     unseen = [one | two for one, two in zip(_win_rows(alone, labels, list(UNSEEN_MACHINES)), twice, strict=True)]
     sweeps = settings.sweeps
     if sweeps is None:
-        sweeps = sweep_weights(domain, agent.actor, agent.space, points=7, **options)
+        sweeps = sweep_weights(domain, agent, points=7, **options)
     sweep = _sweep_rows(sweeps)
     tables = {"damage": damage, "wins": wins, "unseen": unseen, "outcomes": outcomes, "sweep": sweep}
     coached = None

@@ -66,22 +66,11 @@ class CombatStage:
         self._begin()
 
     def backdrop(self, env: EnvBase, row: int = 0) -> Backdrop:
-        """Return what does not move; see `Stage.backdrop`.
-
-        Args:
-            env: The base environment.
-            row: Row of the batch.
-        """
+        """Return what does not move; see `Stage.backdrop`."""
         return arena(int(_combat(env).state.site[row]))
 
     def frame(self, env: EnvBase, row: int = 0, asked: Mapping[str, float | str] | None = None) -> Frame:
-        """Return what is visible now; see `Stage.frame`.
-
-        Args:
-            env: The base environment.
-            row: Row of the batch.
-            asked: Style in force by name, if known.
-        """
+        """Return what is visible now; see `Stage.frame`."""
         env = _combat(env)
         s = {name: value[..., row].cpu().numpy() for name, value in env.state.tensors().items()}
         steps, machines = float(s["steps"]), tuple(s["machine"].tolist())

@@ -10,19 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from coachable.domains.humanoid.styles import POSES, pose_bounds_deg
-from coachable.envs.humanoid.features import (
-    CLEARANCE,
-    COMPLETED,
-    DURATION,
-    FOOT,
-    FORCE,
-    LENGTH,
-    NUM_ARM_JOINTS,
-    PITCH,
-    POWER,
-    SWING_KNEE,
-    WALK,
-)
+from coachable.envs.humanoid import features as layout
 from coachable.envs.humanoid.observation import OBSERVATION_GROUPS
 from coachable.keys import STYLE, STYLE_FEATURES
 
@@ -62,25 +50,25 @@ class HumanoidMeasures:
         theta = transition.get(STYLE)
         features = transition.get(("next", STYLE_FEATURES))
         pose = theta[:, : len(POSES)].argmax(-1)
-        arms = features[:, :NUM_ARM_JOINTS]
+        arms = features[:, : layout.NUM_ARM_JOINTS]
         held = ((arms >= self.lower[pose]) & (arms <= self.upper[pose])).all(-1)
-        struck = features[:, COMPLETED] > 0
-        length = torch.where(struck, features[:, LENGTH], torch.nan)
+        struck = features[:, layout.COMPLETED] > 0
+        length = torch.where(struck, features[:, layout.LENGTH], torch.nan)
         observation = transition.get(("next", "observation"))
-        walk = transition.get(("next", WALK))
+        walk = transition.get(("next", layout.WALK))
         at_strike = torch.where(struck[:, None], walk, torch.nan)
-        knee = -at_strike[:, SWING_KNEE].rad2deg()
-        right = at_strike[:, FOOT] == 0
+        knee = -at_strike[:, layout.SWING_KNEE].rad2deg()
+        right = at_strike[:, layout.FOOT] == 0
         return {
             "forward_speed": observation[:, FORWARD_SPEED],
             "sideways_speed": observation[:, FORWARD_SPEED + 1],
             "pose_held": held.float(),
             "step_length": length,
             "step_length_error": (length - theta[:, len(POSES)]).abs(),
-            "power": walk[:, POWER],
-            "strike_force": at_strike[:, FORCE],
-            "clearance": at_strike[:, CLEARANCE],
-            "strike_pitch": at_strike[:, PITCH].rad2deg(),
+            "power": walk[:, layout.POWER],
+            "strike_force": at_strike[:, layout.FORCE],
+            "clearance": at_strike[:, layout.CLEARANCE],
+            "strike_pitch": at_strike[:, layout.PITCH].rad2deg(),
             "right_knee": torch.where(right, knee, torch.nan),
             "left_knee": torch.where(right, torch.nan, knee),
         }
@@ -119,7 +107,7 @@ class GaitMeasures(HumanoidMeasures):
         """
         found = super().step(transition)
         requested = transition.get(STYLE)[:, len(POSES) + 1]
-        duration = transition.get(("next", STYLE_FEATURES))[:, DURATION]
+        duration = transition.get(("next", STYLE_FEATURES))[:, layout.DURATION]
         error = (found["step_length"] / duration - requested).abs()
         return {"speed": found.pop("forward_speed"), "speed_error": error, **found}
 

@@ -61,12 +61,7 @@ class HumanoidStage:
         self._begin()
 
     def backdrop(self, env: EnvBase, row: int = 0) -> Backdrop:
-        """Return what does not move; see `Stage.backdrop`.
-
-        Args:
-            env: The base environment.
-            row: Row of the batch.
-        """
+        """Return what does not move; see `Stage.backdrop`."""
         ground = plain("floor", (-_HALF, -_HALF), (_HALF, _HALF), 0.0, 3.0, _GROUND)
         lines = Parts()
         for index in range(round(-_HALF / _MARK), round(_HALF / _MARK) + 1):
@@ -77,13 +72,7 @@ class HumanoidStage:
         return Backdrop((ground,), lines, travels=True)
 
     def frame(self, env: EnvBase, row: int = 0, asked: Mapping[str, float | str] | None = None) -> Frame:
-        """Return what is visible now; see `Stage.frame`.
-
-        Args:
-            env: The base environment.
-            row: Row of the batch.
-            asked: Style in force by name, if known.
-        """
+        """Return what is visible now; see `Stage.frame`."""
         while not isinstance(env, HumanoidEnv):
             env = cast(EnvBase, env.base_env)
         self._data.qpos[:] = env.simulation.positions[row]

@@ -9,18 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from coachable.envs.humanoid.features import (
-    BEARING,
-    COMPLETED,
-    DURATION,
-    KNEE_MAX,
-    KNEE_MIN,
-    LENGTH,
-    NUM_ARM_JOINTS,
-    SPEED,
-    STRIDE_FRACTION,
-    TIMED_OUT,
-)
+from coachable.envs.humanoid import features as layout
 from coachable.envs.humanoid.model import CONTROL_STEP
 from coachable.envs.humanoid.rewards import WALK_SPEED
 from coachable.ranges import Range
@@ -128,26 +117,26 @@ def humanoid_style_reward(
 
     def arms(margin_deg: float, sigmoid: str, value_at_margin: float) -> ChoiceTolerance:
         """Return the mean closeness of the six arm joints to the requested bounds."""
-        joints, margin = slice(0, NUM_ARM_JOINTS), math.radians(margin_deg)
+        joints, margin = slice(0, layout.NUM_ARM_JOINTS), math.radians(margin_deg)
         return ChoiceTolerance("pose", joints, bounds[..., 0], bounds[..., 1], margin, sigmoid, value_at_margin)
 
     def balance(features: Tensor) -> Tensor:
         """Return 1 where both feet contribute to the stride, falling to 0 where one of them does not."""
         return tolerance(
-            features[..., STRIDE_FRACTION], *STRIDE_FRACTION_BOUNDS, _STRIDE_FRACTION_MARGIN, "linear", 0.0
+            features[..., layout.STRIDE_FRACTION], *STRIDE_FRACTION_BOUNDS, _STRIDE_FRACTION_MARGIN, "linear", 0.0
         )
 
     def gait(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
-        length, target = features[..., LENGTH], style["step_length"]
+        length, target = features[..., layout.LENGTH], style["step_length"]
         score = tolerance(length, target, target, LENGTH_MARGIN, "long_tail") * balance(features)
         knee_low, knee_high = (math.radians(angle) for angle in KNEE_RANGE_DEG)
         knee_margin = math.radians(_KNEE_MARGIN_DEG)
-        score = score * tolerance(features[..., KNEE_MIN], knee_low, math.inf, knee_margin, "linear", 0.0)
-        score = score * tolerance(features[..., KNEE_MAX], -math.inf, knee_high, knee_margin, "linear", 0.0)
-        return _per_control_step(features, score, step_discount) - timeout_penalty * features[..., TIMED_OUT]
+        score = score * tolerance(features[..., layout.KNEE_MIN], knee_low, math.inf, knee_margin, "linear", 0.0)
+        score = score * tolerance(features[..., layout.KNEE_MAX], -math.inf, knee_high, knee_margin, "linear", 0.0)
+        return _per_control_step(features, score, step_discount) - timeout_penalty * features[..., layout.TIMED_OUT]
 
     def gait_guide(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
-        error = (features[..., LENGTH] - style["step_length"]).abs()
+        error = (features[..., layout.LENGTH] - style["step_length"]).abs()
         # Without the balance a long step and a short one in turn would earn more than two of medium length.
         near = tolerance(error, margin=_NEAR_MARGIN, sigmoid="long_tail") * balance(features)
         # Negative values penalise a gallop, in which one foot is always behind the other.
@@ -155,13 +144,13 @@ def humanoid_style_reward(
         return _per_control_step(features, 0.5 * (near + far), step_discount)
 
     def speed(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
-        stepped = features[..., LENGTH] / features[..., DURATION].clamp(min=CONTROL_STEP)
+        stepped = features[..., layout.LENGTH] / features[..., layout.DURATION].clamp(min=CONTROL_STEP)
         score = tolerance(stepped, style["speed"], style["speed"], SPEED_MARGIN, "long_tail")
         return _per_control_step(features, score, step_discount)
 
     def speed_guide(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
-        difference = (features[..., SPEED] - style["speed"]).abs()
-        return -features[..., BEARING] * (difference - SPEED_SLACK).clamp(min=0.0, max=_MOST_SPEED)
+        difference = (features[..., layout.SPEED] - style["speed"]).abs()
+        return -features[..., layout.BEARING] * (difference - SPEED_SLACK).clamp(min=0.0, max=_MOST_SPEED)
 
     terms: dict[str, StyleTerm] = {
         "pose": arms(POSE_MARGIN_DEG, "long_tail", 0.1),
@@ -182,8 +171,8 @@ def _per_control_step(features: Tensor, score: Tensor, discount: float) -> Tenso
     With a discount below 1 this is `score * sum_(k=0)^(D-1) discount^(-k)`, whose discounted value at the beginning of
     the step is that of `score` in every control step, and D counts for two seconds at most.
     """
-    steps = features[..., DURATION] / CONTROL_STEP
+    steps = features[..., layout.DURATION] / CONTROL_STEP
     if discount < 1.0:
         rate = -math.log(discount)
         steps = ((steps.clamp(max=_MOST_STEPS) * rate).exp() - 1) / math.expm1(rate)
-    return features[..., COMPLETED] * steps * score
+    return features[..., layout.COMPLETED] * steps * score

@@ -6,14 +6,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
-from coachable.domains.racing.styles import (
-    aggressiveness_style_reward,
-    aggressiveness_style_space,
-    drift_style_reward,
-    drift_style_space,
-    resource_style_reward,
-    resource_style_space,
-)
+from coachable.domains.racing import styles
 from coachable.envs.racing.circuit.circuits import SETS, load_tracks
 from coachable.envs.racing.circuit.track import Track
 from coachable.envs.racing.env import RacingEnv
@@ -82,7 +75,7 @@ def rival_env(num_envs: int = AGENTS * 21, **options: Any) -> RacingEnv:
         **options: Options of `RacingEnv`.
     """
     tracks, driver = _line_follower(options, HOME["aggressiveness"], CAR["aggressiveness"])
-    space = aggressiveness_style_space()
+    space = styles.aggressiveness_style_space()
     defaults: dict[str, Any] = {
         "cars": CARS,
         "controlled": AGENTS if num_envs % AGENTS == 0 else 1,
@@ -108,9 +101,11 @@ class Family(NamedTuple):
 
 
 _FAMILIES = {
-    "drift": Family(drift_env, drift_style_space, drift_style_reward),
-    "resources": Family(resource_env, resource_style_space, resource_style_reward),
-    "aggressiveness": Family(rival_env, partial(aggressiveness_style_space, AGENTS), aggressiveness_style_reward),
+    "drift": Family(drift_env, styles.drift_style_space, styles.drift_style_reward),
+    "resources": Family(resource_env, styles.resource_style_space, styles.resource_style_reward),
+    "aggressiveness": Family(
+        rival_env, partial(styles.aggressiveness_style_space, AGENTS), styles.aggressiveness_style_reward
+    ),
 }
 FAMILIES = tuple(_FAMILIES)
 

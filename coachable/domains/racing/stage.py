@@ -57,22 +57,11 @@ class RacingStage:
         self._outline = np.zeros((0, 2))
 
     def backdrop(self, env: EnvBase, row: int = 0) -> Backdrop:
-        """Return what does not move; see `Stage.backdrop`.
-
-        Args:
-            env: The base environment.
-            row: Row of the batch.
-        """
+        """Return what does not move; see `Stage.backdrop`."""
         return circuit(_track(_racing(env), row))
 
     def frame(self, env: EnvBase, row: int = 0, asked: Mapping[str, float | str] | None = None) -> Frame:
-        """Return what is visible now; see `Stage.frame`.
-
-        Args:
-            env: The base environment.
-            row: Row of the batch.
-            asked: Style in force by name, if known.
-        """
+        """Return what is visible now; see `Stage.frame`."""
         env = _racing(env)
         state = env.state.cpu().numpy()
         columns, track = mates(env, row), _track(env, row)

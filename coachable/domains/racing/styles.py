@@ -17,20 +17,8 @@ from coachable.envs.racing.race.features import (
     TIRE,
     gap_columns,
 )
-from coachable.styles import (
-    Mixture,
-    PointMass,
-    Product,
-    Sampler,
-    Setpoint,
-    Shared,
-    StyleReward,
-    StyleSpace,
-    Term,
-    Uniform,
-    Weight,
-    WeightedSum,
-)
+from coachable.styles import Setpoint, StyleReward, StyleSpace, Term, Weight, WeightedSum
+from coachable.styles.samplers import Mixture, PointMass, Product, Sampler, Shared, Uniform
 
 _DRIFT_BOUNDS = (-0.4, 5.0)
 _TIRE_BOUNDS = (-60.0, 12000.0)

@@ -59,9 +59,7 @@ def bearing_reward(
 ) -> np.ndarray:
     """Return the factors of `move_reward` without that of the speed.
 
-    It is the task reward where the style sets the speed. The arguments are those of `move_reward`.
-
-    It is the task reward if the style sets the speed. The arguments are those of `move_reward`.
+    It is the task reward if the style sets the speed.
 
     Args:
         head_height: (N,) height of the head [m].

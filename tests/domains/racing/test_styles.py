@@ -3,14 +3,7 @@
 import pytest
 import torch
 
-from coachable.domains.racing.styles import (
-    aggressiveness_style_reward,
-    aggressiveness_style_space,
-    drift_style_reward,
-    drift_style_space,
-    resource_style_reward,
-    resource_style_space,
-)
+from coachable.domains.racing import styles
 from coachable.envs.racing.race.features import GAPS, anyone_beside, anyone_in_line, corner_drift
 from coachable.styles import Shared, StyleSpace
 
@@ -28,7 +21,7 @@ def within(values, expected):
 
 def test_drift_weights_follow_the_paper():
     """0.5 δ(0) + 0.25 U(-0.4, 0) + 0.25 U(0, 5): mean 0.575, second moment 2.096667."""
-    weights = draws(drift_style_space())
+    weights = draws(styles.drift_style_space())
     for column in weights.T:
         within(column, 0.575)
         within(column**2, 2.096667)
@@ -40,7 +33,7 @@ def test_drift_weights_follow_the_paper():
 
 
 def test_resource_weights_follow_the_paper():
-    overtake, defend, tire, fuel = draws(resource_style_space()).T
+    overtake, defend, tire, fuel = draws(styles.resource_style_space()).T
     for column in (overtake, defend):
         within(column, 1.0)
         assert column.min() >= 0 and column.max() <= 2
@@ -56,7 +49,7 @@ def test_resource_weights_follow_the_paper():
 
 
 def test_margins_follow_the_paper_and_are_shared():
-    space = aggressiveness_style_space(cars=5)
+    space = styles.aggressiveness_style_space(cars=5)
     long, lat = draws(space).T
     assert long.min() >= 0 and long.max() <= 2 and lat.min() >= 0 and lat.max() <= 1
     by_car = space.sample((10,), generator=torch.Generator().manual_seed(0)).reshape(5, 2, 2)
@@ -65,29 +58,29 @@ def test_margins_follow_the_paper_and_are_shared():
 
 
 def test_the_shared_sampler_survives_serialisation():
-    space = aggressiveness_style_space(cars=5)
+    space = styles.aggressiveness_style_space(cars=5)
     again = StyleSpace.from_dict(space.to_dict())
     assert again == space
     assert isinstance(again.sampler, Shared)
 
 
 def test_drift_reward_by_hand():
-    space = drift_style_space()
+    space = styles.drift_style_space()
     features = torch.tensor([[0.1, 0.5, 0.2, 0.3, 9.0, 9.0, 9.0, 9.0, 0.7]])
-    reward = drift_style_reward(space)(features, torch.tensor([[1.0, 2.0, -0.4, 5.0]]))
+    reward = styles.drift_style_reward(space)(features, torch.tensor([[1.0, 2.0, -0.4, 5.0]]))
     assert reward.item() == pytest.approx(0.1 + 1.0 - 0.08 + 1.5)
 
 
 def test_drifts_in_corners_replace_a_requested_rear_angle():
-    space = drift_style_space()
+    space = styles.drift_style_space()
     features = torch.tensor([[0.1, 0.5, 0.2, 0.3, 9.0, 9.0, 9.0, 9.0, 0.7]] * 2)
     theta = torch.tensor([[1.0, 2.0, -0.4, 5.0], [1.0, -0.2, -0.4, 5.0]])
-    reward = drift_style_reward(space, in_corners=1.0)(features, theta)
+    reward = styles.drift_style_reward(space, in_corners=1.0)(features, theta)
     assert reward[:, 0].tolist() == pytest.approx([0.1 + 2 * 0.7 - 0.08 + 1.5, 0.1 - 0.2 * 0.5 - 0.08 + 1.5])
-    half = drift_style_reward(space, in_corners=0.5)(features, theta)
+    half = styles.drift_style_reward(space, in_corners=0.5)(features, theta)
     assert half[:, 0].tolist() == pytest.approx([0.1 + 2 * 0.6 - 0.08 + 1.5, 0.1 - 0.2 * 0.5 - 0.08 + 1.5])
     with pytest.raises(ValueError, match="in_corners is 2: expected a share"):
-        drift_style_reward(space, in_corners=2)
+        styles.drift_style_reward(space, in_corners=2)
 
 
 @pytest.mark.parametrize(
@@ -112,28 +105,28 @@ def test_what_counts_as_a_drift_in_a_corner(degrees, radius, pace, expected):
 
 def test_resource_reward_by_hand():
     features = torch.tensor([[9.0, 9.0, 9.0, 9.0, 3.0, -1.0, -8e-5, -0.01, 9.0]])
-    space, theta = resource_style_space(), torch.tensor([[2.0, 0.5, 12000.0, 105.0]])
-    assert resource_style_reward(space)(features, theta).item() == pytest.approx(6.0 - 0.5 - 0.96 - 1.05)
-    more = resource_style_reward(space, gained=4.0)
+    space, theta = styles.resource_style_space(), torch.tensor([[2.0, 0.5, 12000.0, 105.0]])
+    assert styles.resource_style_reward(space)(features, theta).item() == pytest.approx(6.0 - 0.5 - 0.96 - 1.05)
+    more = styles.resource_style_reward(space, gained=4.0)
     assert more(features, theta).item() == pytest.approx(4 * 5.5 - 0.96 - 1.05)
-    apart = resource_style_reward(space, gained=2.0, defended=8.0)
+    apart = styles.resource_style_reward(space, gained=2.0, defended=8.0)
     assert apart(features, theta).item() == pytest.approx(2 * 6.0 - 8 * 0.5 - 0.96 - 1.05)
     assert more.is_linear, "n-step transitions can be relabelled"
 
 
 def test_margin_reward_by_hand():
     """Gaps (3, 2) and (0.5, 0.25) m, margins (2, 1): -1.5 - 0.75 = -2.25. A far car costs nothing."""
-    space = aggressiveness_style_space()
+    space = styles.aggressiveness_style_space()
     features = torch.tensor([[0.0] * GAPS + [3.0, 2.0, 1.0, 0.5, 0.25, 1.0, 0.0, 0.0, 0.0]])
     theta = torch.tensor([[2.0, 1.0]])
-    assert aggressiveness_style_reward(space)(features, theta).item() == pytest.approx(-2.25)
-    assert aggressiveness_style_reward(space, weight=4.0)(features, theta).item() == pytest.approx(-9.0)
+    assert styles.aggressiveness_style_reward(space)(features, theta).item() == pytest.approx(-2.25)
+    assert styles.aggressiveness_style_reward(space, weight=4.0)(features, theta).item() == pytest.approx(-9.0)
     ahead = torch.tensor([[0.0] * GAPS + [1.0, 0.0, 1.0]])
-    assert aggressiveness_style_reward(space)(ahead, theta).item() == pytest.approx(-2.0)
-    assert aggressiveness_style_reward(space, apart=0.0)(ahead, theta).item() == pytest.approx(-1.0)
-    assert aggressiveness_style_reward(space, apart=0.1)(ahead, theta).item() == pytest.approx(-1.1)
+    assert styles.aggressiveness_style_reward(space)(ahead, theta).item() == pytest.approx(-2.0)
+    assert styles.aggressiveness_style_reward(space, apart=0.0)(ahead, theta).item() == pytest.approx(-1.0)
+    assert styles.aggressiveness_style_reward(space, apart=0.1)(ahead, theta).item() == pytest.approx(-1.1)
     with pytest.raises(ValueError, match="apart is 2: expected a share"):
-        aggressiveness_style_reward(space, apart=2)
+        styles.aggressiveness_style_reward(space, apart=2)
 
 
 def test_beside_and_in_line_are_within_so_many_metres():

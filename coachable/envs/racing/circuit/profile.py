@@ -20,7 +20,7 @@ _LAPS = 2  # so that the end of the lap fits its start
 
 @dataclass(frozen=True)
 class Envelope:
-    """Largest accelerations of a car as a point mass [m/s²]; the methods take arrays of speeds [m/s].
+    """Accelerations of a car as a point mass, (n,) [m/s²] at speeds (n,) [m/s].
 
     Attributes:
         car: Parameters of one car, as numbers.
@@ -44,38 +44,18 @@ class Envelope:
 
         It is μ N / m with the load N of weight and downforce ½ ρ A v², and a friction coefficient μ that falls with the
         load.
-
-        Args:
-            speed: (n,) [m/s].
-
-        Returns:
-            (n,) [m/s²].
         """
         load = self.mass * GRAVITY + 0.5 * AIR_DENSITY * self.car.lift_area * speed**2
         coefficient = self.car.grip + self.car.grip_per_load * 1e-3 * (load / 4 - self.car.reference_load)
         return LOAD_TRANSFER * self.grip * coefficient * load / self.mass
 
     def drag(self, speed: np.ndarray) -> np.ndarray:
-        """Return the deceleration ½ ρ A v² / m + c g by air drag and rolling resistance.
-
-        Args:
-            speed: (n,) [m/s].
-
-        Returns:
-            (n,) [m/s²].
-        """
+        """Return the deceleration ½ ρ A v² / m + c g by air drag and rolling resistance."""
         air = 0.5 * AIR_DENSITY * self.car.drag_area * speed**2 / self.mass
         return air + self.car.rolling_resistance * GRAVITY
 
     def engine(self, speed: np.ndarray) -> np.ndarray:
-        """Return the acceleration at full throttle in the best gear, with the inertia of wheels and engine.
-
-        Args:
-            speed: (n,) [m/s].
-
-        Returns:
-            (n,) [m/s²].
-        """
+        """Return the acceleration at full throttle in the best gear, with the inertia of wheels and engine."""
         car = self.car
         wheel = np.maximum(speed, 3.0) / car.wheel_radius  # [rad/s]
         wheels = 2 * (car.wheel_inertia_front + car.wheel_inertia_rear)
@@ -91,14 +71,7 @@ class Envelope:
         return best
 
     def traction(self, speed: np.ndarray) -> np.ndarray:
-        """Return the largest acceleration that the tyres of the driven axle allow, after the load transfer.
-
-        Args:
-            speed: (n,) [m/s].
-
-        Returns:
-            (n,) [m/s²].
-        """
+        """Return the largest acceleration that the tyres of the driven axle allow, after the load transfer."""
         car = self.car
         share = car.front_axle / (car.front_axle + car.rear_axle)
         driven = (1 - car.drive_share_front) * share + car.drive_share_front * (1 - share)
