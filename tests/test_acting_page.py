@@ -56,7 +56,7 @@ def build(tmp_path):
         environment = {**os.environ, "PYTHONPATH": str(ROOT)}
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, done.stderr
-        return tmp_path / "site", done.stdout
+        return tmp_path / "site", done.stderr
 
     return run
 

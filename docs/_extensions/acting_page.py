@@ -14,6 +14,7 @@ and everywhere if the build cannot get the files of other projects that the page
 """
 
 import shutil
+import sys
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -61,7 +62,7 @@ def write_pages(app: Sphinx, env: Any) -> None:
                 size = export_page(agent, folder, home=uri)
             except OSError as error:  # npm is missing, or has no connection
                 shutil.rmtree(folder, ignore_errors=True)
-                print(f"The site shows a picture instead of the page of {agent}: {error}")
+                sys.stderr.write(f"The site shows a picture instead of the page of {agent}: {error}\n")
             else:
                 LOGGER.info("wrote the page of %s (%.1f MB)", agent, size / 1e6)
 

@@ -121,7 +121,7 @@ def traffic_report(rows: Sequence[dict[str, Any]], response: dict[str, dict[str,
     )
     text += "![traffic](traffic.png)\n\n"
     formats = {"sweep": "", "weight": "g", "overtake": "+.1f", "defend": "+.1f", "places_gained": "+.2f"}
-    text += markdown_table(rows, formats | {"contact": ".2%", "off": ".2%"})
+    text += markdown_table(rows, formats | {"contact": ".2%", "off": ".2%"}, {"overtake": "m", "defend": "m"})
     text += "\nOvertake, defend: metres gained on cars ahead and on cars behind. Rank correlation with the weight of "
     found = [f"{name} {v['metres']:.2f} in metres, {v['places']:.2f} in places" for name, v in response.items()]
     return text + "; of ".join(found) + ".\n"
