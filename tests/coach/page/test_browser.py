@@ -21,6 +21,7 @@ PATIENCE = 240.0  # [s], for a condition: software rendering beside other work
 
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.browser,
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed"),
     pytest.mark.filterwarnings("ignore"),  # of the browser's driver
 ]

@@ -12,7 +12,7 @@ import time
 
 import pytest
 
-pytestmark = pytest.mark.slow  # a browser without a graphics card draws for a minute
+pytestmark = [pytest.mark.slow, pytest.mark.browser]  # a browser without a graphics card draws for a minute
 
 LENGTHS = (0.30, 0.475, 0.65)
 OFFSET = 0.03  # [m], by which the shipped agent misses a request at most, see docs/domains/humanoid.md
@@ -176,6 +176,10 @@ def test_recordings_follow_their_sliders_and_ask_no_other_site(browser, recorded
             announced = f"document.getElementById('announcement').textContent.startsWith('{asked}')"
             wait_for(lambda announced=announced: browser.evaluate(announced), 60)
         assert "fuel=105" in browser.evaluate("location.hash")
+        shown = "[...document.querySelectorAll('#gauges div')].filter(gauge => gauge.offsetHeight > 10).length"
+        assert browser.evaluate(shown) == 6
+        edges = "['scene', 'gauges'].map(id => document.getElementById(id).getBoundingClientRect())"
+        assert browser.evaluate(f"(([scene, gauges]) => scene.bottom <= gauges.top)({edges})")
         browser.evaluate(
             "(() => { document.getElementById('pause').click(); const slider = document.getElementById('moment');"
             " slider.value = 0.5; slider.dispatchEvent(new Event('input')); })()"
