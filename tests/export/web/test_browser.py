@@ -109,6 +109,8 @@ def test_the_page_follows_its_sliders_and_asks_no_other_site(browser, address):
     wait_for(lambda: seconds(browser) > 0, 120)
     print(f"acts after {time.monotonic() - begin:.1f} s, at a load of {os.getloadavg()[0]:.1f}")  # shown by pytest -s
     assert browser.evaluate("document.querySelector('input[value=t_pose]').checked")
+    home = "(a => a.checkVisibility() && a.textContent + ' ' + a.getAttribute('href'))"
+    assert browser.evaluate(f"{home}(document.getElementById('documentation'))") == "Documentation ../index.html"
     measured = []
     for length in LENGTHS:
         browser.evaluate(
@@ -185,6 +187,7 @@ def test_recordings_follow_their_sliders_and_ask_no_other_site(browser, recorded
             " slider.value = 0.5; slider.dispatchEvent(new Event('input')); })()"
         )
         wait_for(lambda: seconds(browser) == 0.5, 60)
+        assert browser.evaluate("document.querySelector('.brand').innerText") == "coachable"  # no address is known
         assert browser.evaluate("document.documentElement.scrollWidth") <= 360
         assert browser.evaluate(SMALL) == []
         sent = [e["params"]["request"]["url"] for e in browser.events if e.get("method") == "Network.requestWillBeSent"]
