@@ -38,7 +38,8 @@ class Browser:
         port_file = folder / "DevToolsActivePort"
         wait_for(lambda: port_file.is_file() and "\n" in port_file.read_text(), 60)
         port, path = port_file.read_text().split()[:2]
-        self.socket = client.connect(f"ws://127.0.0.1:{port}{path}", max_size=None)
+        self.connection = client.connect(f"ws://127.0.0.1:{port}{path}", max_size=None)
+        self.socket = self.connection.__enter__()  # newer versions connect only as a context manager
         self.number, self.events, self.session = 0, [], None
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         self.session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
@@ -62,7 +63,7 @@ class Browser:
         return result["result"].get("value")
 
     def close(self):
-        self.socket.close()
+        self.connection.__exit__(None, None, None)
         self.process.terminate()
         self.process.wait(30)
 

@@ -205,6 +205,24 @@ def test_requests_links_and_readouts():
     run_in_node(SCRIPT, "request", "readout")
 
 
+def test_browsers_that_draw_by_software_are_known():
+    script = """
+    import assert from "node:assert";
+    const { drawnBySoftware } = await import(VIEW);
+    const named = (name, masked) => ({ getContext: () => ({
+      RENDERER: 1,
+      getExtension: () => (masked ? null : { UNMASKED_RENDERER_WEBGL: 2 }),
+      getParameter: (which) => (which === 2 || masked ? name : "WebKit WebGL"),
+    }) });
+    const swift = "ANGLE (Google, Vulkan 1.3.0 (SwiftShader Device (Subzero) (0x0000C0DE)), SwiftShader driver)";
+    assert.equal(drawnBySoftware(named(swift)), true);
+    assert.equal(drawnBySoftware(named("llvmpipe (LLVM 15.0.6, 256 bits)", true)), true);
+    assert.equal(drawnBySoftware(named("ANGLE (Intel, Mesa Intel(R) UHD Graphics 620, OpenGL 4.6)")), false);
+    assert.equal(drawnBySoftware(named("WebKit WebGL", true)), false);
+    """
+    run_in_node(script, "view")
+
+
 def run_in_node(script, *modules):
     """Run a script in which the upper-case names of modules stand for their addresses."""
     node = shutil.which("node")
