@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from coachable import __version__
-from coachable.coach.sources import SOURCE_HELP, located, require_agent
+from coachable.coach.sources import SOURCE_HELP, require_agent
 from coachable.gl import RenderingError, choose_gl_backend
 
 __all__ = ["main"]
@@ -72,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
         parser = commands.add_parser(name, help=text)
         parser.set_defaults(run=run)
         if source:
-            parser.add_argument("source", type=located, help=source)
+            parser.add_argument("source", help=source)
         return parser
 
     train = command("train", _train, "train an agent with a recipe, as python recipes/RECIPE.py does")
@@ -117,7 +117,7 @@ def _parser() -> argparse.ArgumentParser:
 
     report = command("report", _report, "write all measurements of an agent on one page")
     text = f"{SOURCE_HELP}; several: one per training seed"
-    report.add_argument("sources", nargs="+", type=located, metavar="source", help=text)
+    report.add_argument("sources", nargs="+", metavar="source", help=text)
     _add_out(report, "report", "folder")
     _add_number(report, "--seeds", 5, "runs of a single agent")
     _add_number(report, "--episodes", 4, "per run and style")
@@ -291,7 +291,6 @@ def _verify(options: argparse.Namespace) -> int:
 
 
 def _coach(options: argparse.Namespace) -> int:
-    options.source = located(options.source)
     require_agent(options.source)  # before the page's address is announced
     from coachable.coach.page.command import serve
 

@@ -17,7 +17,19 @@ FILES = {
 }
 
 # Small modules at the top level that know no room.
-BASE = {"code_version", "extras", "files", "finite", "gl", "keys", "object_state", "offscreen", "ranges", "signals"}
+BASE = {
+    "code_version",
+    "extras",
+    "files",
+    "finite",
+    "gl",
+    "keys",
+    "object_state",
+    "offscreen",
+    "ranges",
+    "shipped",
+    "signals",
+}
 
 # Of each room, the rooms below it that it may import; what these may import it may, too.
 ROOMS = {

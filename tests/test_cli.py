@@ -12,6 +12,8 @@ from omegaconf import OmegaConf
 
 from coachable import __version__, doctor
 from coachable.cli import main
+from coachable.files import CheckpointError
+from coachable.training.weights import load_policy
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -119,18 +121,17 @@ def test_the_page_is_opened_for_an_agent(source, monkeypatch, tmp_path):
     assert opened == [source]
 
 
-def test_a_shipped_agent_goes_before_a_folder_that_is_no_run(monkeypatch, tmp_path):
-    opened = []
-    monkeypatch.setattr("coachable.coach.page.command.serve", lambda **settings: opened.append(settings["source"]))
+def test_a_shipped_agent_goes_before_a_folder_that_is_no_run(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "humanoid").mkdir()
     (tmp_path / "humanoid" / "notes.txt").write_text("of my own")
-    assert main(["coach", "humanoid"]) == 0
-    assert Path(opened.pop()).parts[-3:] == ("pretrained", "humanoid", "weights.pt")
+    assert Path(load_policy("humanoid").metadata["source"]).parts[-3:] == ("pretrained", "humanoid", "weights.pt")
     assert main(["export", "humanoid", "--out", "humanoid.onnx"]) == 0
-    (tmp_path / "humanoid" / "checkpoints").mkdir()  # a run goes before the shipped agent
-    assert main(["coach", "humanoid"]) == 0
-    assert opened == ["humanoid"]
+    (tmp_path / "humanoid" / "checkpoints").mkdir()  # a run goes before the shipped agent, even if it is not complete
+    with pytest.raises(CheckpointError, match="humanoid"):
+        load_policy("humanoid")
+    assert main(["export", "humanoid", "--out", "again.onnx"]) == 2
+    assert "humanoid" in capsys.readouterr().err
 
 
 def test_another_file_is_no_agent(capsys, monkeypatch, tmp_path):

@@ -21,10 +21,11 @@ from coachable.evaluation.style_grid import (
     mean_of,
     policy_sentence,
     published,
+    with_unit,
     write_results,
 )
 from coachable.evaluation.switching import SwitchReport, evaluate_switching
-from coachable.evaluation.wording import counted
+from coachable.evaluation.wording import counted, units_of
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
 
@@ -171,7 +172,7 @@ def _report(
     text = f"# {domain.name}: requested and measured style\n\n"
     text += f"{policy_sentence(agent)}; {counted(int(rows[0]['episodes']), 'episode')} of "
     text += f"{grid.steps} steps per style, seed {grid.seed}.\n\n![style grid](grid.png)\n\n"
-    text += markdown_table(rows, columns)
+    text += markdown_table(rows, columns, units_of(domain, agent.space, columns))
     if medians:
         text += f"\n## Median of the {len(rows)} styles, and its target\n\n"
         numbers = ("median", "lowest", "highest")
@@ -180,7 +181,11 @@ def _report(
     if response:
         text += "\n## Response to the request\n\n"
         numbers = ("slope", "rank_correlation", "mean_error")
-        text += markdown_table(response, {name: ".3f" if name in numbers else "" for name in response[0]})
+        units = units_of(domain, agent.space, dict.fromkeys(agent.space.names, ""))
+        shown = [row | {"parameter": with_unit(row["parameter"], units)} for row in response]
+        formats = {name: ".3f" if name in numbers else "" for name in response[0]}
+        text += markdown_table(shown, formats, units_of(domain, agent.space, formats))
+        text += "\nThe mean error is in the unit of the parameter.\n"
     if trials:
         text += "\n## Trials in the default style\n\n"
         text += markdown_table(
@@ -191,7 +196,8 @@ def _report(
     times = switching.comply_seconds
     median = f"{times.median():.2f} s" if len(times) else "never"
     text += f"\n## Style switched at random every 100 steps ({counted(switch_episodes, 'episode')})\n\n"
-    text += markdown_table([switching.metrics], dict.fromkeys(switching.metrics, ".3f"))
+    formats = {name: ".0%" if domain.columns.get(name, "").endswith("%") else ".3f" for name in switching.metrics}
+    text += markdown_table([switching.metrics], formats, units_of(domain, agent.space, formats))
     if not switching.switches:
         return text + "\nThe episodes are too short for a switch.\n"
     text += f"\nComplied before the next switch: {switching.complied:.0%} of {switching.switches} switches; "

@@ -154,16 +154,37 @@ def write_results(
     return report
 
 
-def markdown_table(rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> str:
+def markdown_table(
+    rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str], units: Mapping[str, str] | None = None
+) -> str:
     """Return rows as a Markdown table.
 
     Args:
         rows: Values by column name.
         columns: Format specification by column name; "" prints the value as it is.
+        units: Units by column name, for the headings of columns that have one.
+
+    Example:
+        >>> print(markdown_table([{"pose": "t_pose", "speed": 1.234}], {"pose": "", "speed": ".2f"}, {"speed": "m/s"}))
+        | pose | speed [m/s] |
+        |--|--|
+        | t_pose | 1.23 |
+        <BLANKLINE>
     """
-    lines = ["| " + " | ".join(columns) + " |", "|" + "--|" * len(columns)]
+    headings = [with_unit(name, units or {}) for name in columns]
+    lines = ["| " + " | ".join(headings) + " |", "|" + "--|" * len(columns)]
     lines += ["| " + " | ".join(format(row[c], spec) for c, spec in columns.items()) + " |" for row in rows]
     return "\n".join(lines) + "\n"
+
+
+def with_unit(name: str, units: Mapping[str, str]) -> str:
+    """Return a name with its unit, such as "speed [m/s]", or without if it has none.
+
+    Args:
+        name: The name.
+        units: Units by name.
+    """
+    return f"{name} [{units[name]}]" if units.get(name) else name
 
 
 def training_counts(agent: LoadedPolicy) -> str:

@@ -71,6 +71,19 @@ def unit_of(domain: Domain, space: StyleSpace, name: str) -> str:
     return domain.units.get(name) or (getattr(space[parameter], "unit", "") if parameter in space else "")
 
 
+def units_of(domain: Domain, space: StyleSpace, columns: Mapping[str, str]) -> dict[str, str]:
+    """Return the units of a table's columns, without those that have none.
+
+    Args:
+        domain: The domain.
+        space: The style space.
+        columns: Formats by the name of the column, which may begin with `measured_`; shares have no unit.
+    """
+    names = [name for name, form in columns.items() if not form.endswith("%")]
+    units = {name: unit_of(domain, space, name.removeprefix("measured_")) for name in names}
+    return {name: unit for name, unit in units.items() if unit}
+
+
 def heading_of(domain: Domain, space: StyleSpace, column: str, form: str = "") -> str:
     """Return the heading of a published column with its unit, such as "power [W]".
 
@@ -82,7 +95,7 @@ def heading_of(domain: Domain, space: StyleSpace, column: str, form: str = "") -
     """
     name = column.removeprefix("measured_")
     text = f"measured {domain.words.name(name)}" if name != column else domain.words.name(name)
-    unit = "" if form.endswith("%") else unit_of(domain, space, name)
+    unit = units_of(domain, space, {column: form}).get(column)
     return f"{text} [{unit}]" if unit else text
 
 

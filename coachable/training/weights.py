@@ -19,6 +19,7 @@ from coachable.networks import make_gaussian_actor, make_mixed_actor
 from coachable.networks.mixed import MixedPolicy
 from coachable.networks.plain import policy_network
 from coachable.networks.residual import with_new_inputs
+from coachable.shipped import located, shipped_agents
 from coachable.styles import Choice, StyleSpace
 from coachable.training.checkpoint import SCHEMA_VERSION, CheckpointError, check_fits, find_checkpoint, read_state
 
@@ -33,7 +34,6 @@ __all__ = [
     "widths_of",
 ]
 
-_PRETRAINED = Path(__file__).resolve().parent.parent / "pretrained"
 _CRITICS = "qvalue_network_params."
 _PATHS = ("run_dir", "resume", "init_from")  # describe the machine that trained, not the agent
 _AGENT = {"domain": str, "space": dict, "config": dict, "network": dict, "actor": dict, "critics": dict}
@@ -98,7 +98,7 @@ def load_policy(path_or_domain: Path | str, device: torch.device | str = "cpu") 
 
     Args:
         path_or_domain: A run's folder, a checkpoint, a weights file, an exported model (`.onnx`), or the name of a
-            domain that ships with weights.
+            domain that ships with weights, see `coachable.shipped.located`.
         device: Device of the actor; exported models run on the CPU.
 
     Raises:
@@ -306,17 +306,13 @@ def _essentials(description: Mapping[str, Any]) -> StyleSpace:
 
 
 def _locate(path_or_domain: Path | str) -> Path:
-    path = Path(path_or_domain).expanduser()
+    path = located(path_or_domain)
     if path.is_file():
         return path
-    shipped = _PRETRAINED / str(path_or_domain) / "weights.pt"
-    if not path.exists() and shipped.is_file():
-        return shipped
     try:
         return find_checkpoint(path)
     except CheckpointError as error:
-        domains = sorted(p.parent.name for p in _PRETRAINED.glob("*/weights.pt"))
-        raise CheckpointError(f"{error}; domains with weights: {', '.join(domains) or 'none'}") from None
+        raise CheckpointError(f"{error}; domains with weights: {', '.join(shipped_agents()) or 'none'}") from None
 
 
 def _read_agent(source: Path, device: torch.device | str = "cpu") -> dict[str, Any]:

@@ -106,6 +106,8 @@ def test_trials_and_medians_are_reported(tmp_path):
     settings = EvaluationSettings(episodes=5, switch_episodes=2, progress=False)
     report, grid = evaluate_styles(domain, agent, tmp_path, settings)
     assert len(grid.cells) == 6
+    assert "| hat | speed [m/s] | survived | measured_speed [m/s] | error [m/s] |" in report
+    assert "| speed [m/s] | " in report and "\n| survived | speed [m/s] | error [m/s] |" in report
     assert "| calm | 9 | 9 | 70% | 100% |" in report
     assert "| gale | 9 | 7 | 45% | 94% |" in report
     assert "| error | m/s | 0.00 | 0.00 | 1.00 | 0.2 | yes |" in report  # 0, 0, 0, 1, 0, 1

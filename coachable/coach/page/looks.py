@@ -12,7 +12,8 @@ from websockets.http11 import Response
 from coachable.scene.look import FONT, TITLE, icon_link, stylesheet
 from coachable.scene.palette import INK, WHITE, css
 
-# viser shows the page in dark colours if the address says so. The browser's own setting decides here.
+# viser shows the page in dark colours if the address says so. The browser's own setting decides here. The scene, which
+# all browsers share, is dimmed in the browsers that are dark.
 _SCRIPT = """
 (() => {
   const asked = new URLSearchParams(location.search);
@@ -21,11 +22,15 @@ _SCRIPT = """
     asked.set("darkMode", "");
     history.replaceState(null, "", "?" + asked);
   }
+  document.documentElement.classList.toggle("dark", asked.has("darkMode"));
 })();
 """
 
 _STYLE = (
     """
+:root { --mantine-font-family: FONT !important; --mantine-font-family-headings: FONT !important; }
+body { font-family: FONT !important; }
+.dark canvas:not(.u-wrap *) { filter: brightness(0.6) contrast(1.1); }
 .gauges {
   position: fixed; left: 12px; bottom: 12px; z-index: 5; pointer-events: none; min-width: 15em; padding: 6px 10px;
   border-radius: 8px; background: INKc7; color: WHITE; font: 13px/1.6 FONT;

@@ -276,7 +276,7 @@ def _report(
     scores = ["" if row["style_score"] is None else f"{row['style_score']:.2f}" for row in tables["damage"]]
     table = [{**row, "score": score} for row, score in zip(tables["damage"], scores, strict=True)]
     columns = {"style": "", "won": ".0%", "score": "", "damage_per_fight": ".0f", "seconds": ".0f"}
-    text += markdown_table(table, columns | dict.fromkeys(PARTS, ".2f"))
+    text += markdown_table(table, columns | dict.fromkeys(PARTS, ".2f"), {"damage_per_fight": "HP", "seconds": "s"})
     text += "\nScore: share of the damage that counts for the requested style. Parts: units removed per fight.\n"
     for name, title in {"wins": "Wins by machine", "unseen": "Wins against what no training has"}.items():
         columns = {column: "" if column == "style" else ".0%" for column in tables[name][0]}
@@ -295,7 +295,7 @@ def _switch_report(coached: CoachedFights, rows: Sequence[Mapping[str, Any]]) ->
     text += f"ended, {ends['won']} of them won.\n\n"
     if rows:
         formats = {"style": "", "switches": "", "complied": ".0%", "median_seconds": ".1f", "share": ".0%"}
-        text += markdown_table(rows, formats)
+        text += markdown_table(rows, formats, {"median_seconds": "s"})
     return text + (
         "\nComplied: damage that counts for the style was done before the next switch. Median: seconds from the "
         "switch to the first of it (not complied: infinite). Share: of the damage between the switch and the next one. "

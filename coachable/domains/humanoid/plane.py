@@ -110,4 +110,5 @@ def _section(rows: Sequence[Mapping[str, Any]]) -> str:
         return text
     numbers = {"step_length": ".3g", "speed": ".3g", "steps_per_second": ".1f", "survived": ".0%"}
     numbers |= {"measured_speed": ".2f", "measured_length": ".3f"}
-    return text + "\nThese were not walked:\n\n" + markdown_table(missed, {"pose": "", **numbers})
+    units = {"step_length": "m", "speed": "m/s", "measured_speed": "m/s", "measured_length": "m"}
+    return text + "\nThese were not walked:\n\n" + markdown_table(missed, {"pose": "", **numbers}, units)

@@ -131,11 +131,12 @@ def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Map
     formats = {"sweep": "", "weight": "g", "sideslip_corners": ".1f", "sideslip_straights": ".1f"}
     formats |= {"drift_corners": ".0%", "drift_straights": ".0%", "slip_angle_rear": ".1f", "pace": ".1f"}
     formats |= {"pace_kept": ".0%", "off": ".1%", "turned_per_km": ".2f", "backwards": ".0%", "turns": ".1f"}
-    text += markdown_table(rows, formats | {"most_turns": ".0f", "survived": ".0%"})
-    text += "\nSideslip: mean angle between heading and velocity [deg], 180 when driving backwards. Drift: share of "
+    units = dict.fromkeys((ANGLE, "sideslip_straights", "slip_angle_rear"), "deg") | {"pace": "m/s"}
+    text += markdown_table(rows, formats | {"most_turns": ".0f", "survived": ".0%"}, units)
+    text += "\nSideslip: mean angle between heading and velocity, 180 when driving backwards. Drift: share of "
     text += f"the time with {DRIFT_DEG[0]:g} to {DRIFT_DEG[1]:g} degrees of it above {DRIFT_SPEED:g} m/s. Corners: "
-    text += f"where the track's radius is at most {CORNER_RADIUS:g} m. Rear slip angle in degrees (0 below 5 m/s), "
-    text += "pace in m/s along the track. Turned per km: how often the car turned to face backwards; backwards: share "
+    text += f"where the track's radius is at most {CORNER_RADIUS:g} m. Rear slip angle: 0 below 5 m/s. "
+    text += "Pace: along the track. Turned per km: how often the car turned to face backwards; backwards: share "
     text += "of the time that it faced so. Turns: largest rotation against the track in one direction, in whole turns, "
     text += "mean and most over episodes.\n\n"
     ranks = ", ".join(f"{sweep} {summary[sweep]['rank_correlation']:.2f}" for sweep in SWEEPS)

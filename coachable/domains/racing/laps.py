@@ -28,6 +28,8 @@ SOLO = (Scenario("solo", 1.0, "solo"),)
 _SHOWN = {"circuit": "", "trained": "", "kilometres": ".1f", "laps": "", "clean_laps": ".0%", "mean_lap": ".2f"}
 _SHOWN |= {"quasi_steady_state": ".2f", "over": "+.1%", "off": ".2%", "retired": ".0%"}
 
+_UNITS = {"mean_lap": "s", "quasi_steady_state": "s"}
+
 
 def cut_laps(distance: np.ndarray, off: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Cut a drive into laps.
@@ -120,9 +122,9 @@ def circuits_report(rows: Sequence[Mapping[str, Any]]) -> str:
     Args:
         rows: Result of `drive_circuits`.
     """
-    text = "\n## Circuits\n\nAlone, in the default style, on half a tank.\n\n" + markdown_table(rows, _SHOWN)
+    text = "\n## Circuits\n\nAlone, in the default style, on half a tank.\n\n" + markdown_table(rows, _SHOWN, _UNITS)
     text += "\nTrained: whether the agent was trained on the circuit. Laps: completed ones; clean if never three "
-    text += "wheels were off the track. Mean lap: after the first one [s]; over: above the quasi-steady state of a "
+    text += "wheels were off the track. Mean lap: after the first one; over: above the quasi-steady state of a "
     text += "point mass. "
     return text + "Off: share of the time off the track. Retired: share of the cars that stood, drove back or left.\n"
 

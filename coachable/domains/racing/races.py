@@ -294,7 +294,8 @@ def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Map
     text += "![radar](radar.png)\n\n"
     formats = {"margin": "", "setting": "", "requested": "g", "win_rate": ".0%", "either_won": ".0%"}
     formats |= {"places_gained": "+.2f", "places_later": "+.2f", "overtakes": ".1f", "contacts": ".1f"}
-    text += markdown_table(rows, formats | {"beside": ".1%", "in_line": ".1%", "off": ".1%", "kilometres": ".1f"})
+    formats |= {"beside": ".1%", "in_line": ".1%", "off": ".1%", "kilometres": ".1f"}
+    text += markdown_table(rows, formats, {"requested": "m"})
     text += "\nWin rate: share of the pair that ends among the first two. Overtakes, contacts: per car and race; a "
     text += f"car has overtaken another when it is {_PASSED:g} m ahead; contacts within a second count once. "
     text += "Places later: gained after the first minute. "

@@ -317,7 +317,8 @@ def _report(
     formats = {"circuit": "", "resource": "", "weight": ".0f", "range_km": ".1f", "range_gain": "+.0%"}
     formats |= {"lap_time": ".2f"}
     formats |= {"seconds_lost": "+.2f", "frontier_km": ".1f", "laps": "", "clean_laps": ".0%"}
-    text += markdown_table(rows, formats)
+    units = {"range_km": "km", "lap_time": "s", "seconds_lost": "s", "frontier_km": "km"}
+    text += markdown_table(rows, formats, units)
     text += f"\nRange: until the tank is empty, or until the tyres are worn by {WORN:.0%} on average, at the mean use. "
     text += f"Lap time: mean of {COMPARED} laps from the second one on. Frontier: range of a point mass on a fixed "
     text += "line at the same lap time (nan where it has none so slow). Clean: never three wheels off the track.\n\n"

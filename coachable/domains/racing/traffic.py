@@ -143,20 +143,20 @@ def traffic_report(rows: Sequence[dict[str, Any]], response: Sequence[dict[str, 
         rows: Result of `race_in_traffic`.
         response: Result of `traffic_response`.
     """
-    text = (
-        f"\n## Among others\n\n{CARS} copies, on tyres and fuel of any state, for a minute; {rows[0]['races']} races "
-    )
-    text += "per weight, the same starts for each. The weight of overtaking of the last car rises, or that of "
+    text = f"\n## Among others\n\n{CARS} copies, on tyres and fuel of any state, for a minute; "
+    text += f"{rows[0]['races']} races per weight, the same starts for each. The weight of overtaking of the last car rises, or that of "
     text += f"defending of the first; all others are {OTHERS_WEIGHT:g}. Starts: close together on a straight with "
     text += "some cars faster (passing), in a line there (slipstream), or rolling up to the line. Savers: cars that "
     text += "save tyres and fuel as much as they can.\n\n![traffic](traffic.png)\n\n"
     formats = {"sweep": "", "start": "", "savers": "", "smallest": "+.1f", "largest": "+.1f", "apart": ""}
-    text += markdown_table(response, formats | {"metres": ".2f", "places": ".2f", "contacts": ".2f"})
+    formats |= {"metres": ".2f", "places": ".2f", "contacts": ".2f"}
+    text += markdown_table(response, formats, {"smallest": "m", "largest": "m"})
     text += "\nSmallest, largest: metres gained on cars ahead (overtake) or behind (defend) at that weight; "
     text += "apart: whether their 95 % intervals are. Metres, places: rank correlation of "
     text += "the weight with them. Contacts: time in contact at the largest weight over that at the smallest.\n\n"
     formats = {"sweep": "", "start": "", "savers": "", "weight": "g", "overtake": "+.1f", "defend": "+.1f"}
-    return text + markdown_table(rows, formats | {"places_gained": "+.2f", "contact": ".2%", "off": ".2%"})
+    formats |= {"places_gained": "+.2f", "contact": ".2%", "off": ".2%"}
+    return text + markdown_table(rows, formats, {"overtake": "m", "defend": "m"})
 
 
 def draw_traffic(rows: Sequence[dict[str, Any]], path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, metadata
@@ -27,9 +28,10 @@ _OUTPUTS = ("observation", "measured", "mark", "memory_after", "terminated")
 _MODELS = {"dynamics": "dynamics.xml", "kinematics": "kinematics.xml"}
 _GRAPHS = {"policy": "policy.onnx", "features": "features.onnx"}
 _VENDORED = "third_party"
+_PRELOADS = "<!-- preloads -->"
 
 
-def export_page(source: str | Path, out: Path, assets: Path | None = None) -> int:
+def export_page(source: str | Path, out: Path, assets: Path | None = None, *, home: str | None = None) -> int:
     """Write the page of an agent.
 
     The folder contains the page's own files, the physics as XML, the policy and the features as ONNX, `manifest.json`
@@ -39,6 +41,7 @@ def export_page(source: str | Path, out: Path, assets: Path | None = None) -> in
         source: Checkpoint, run folder, weights file, or the name of a domain that ships with weights.
         out: Folder to write into; files of the same names are replaced.
         assets: Folder with the files of other projects, see `coachable.export.web.pinned_files.provide`.
+        home: Address of the documentation, to which the page links; by default the one that `home_page` finds.
 
     Returns:
         Size of all files of the page [byte].
@@ -63,7 +66,8 @@ def export_page(source: str | Path, out: Path, assets: Path | None = None) -> in
     (out / _GRAPHS["features"]).write_bytes(features.SerializeToString())
     for name, text in (("dynamics", part.dynamics), ("kinematics", part.kinematics)):
         (out / _MODELS[name]).write_text(text, encoding="utf-8")
-    return finish_page(out, manifest_of(agent, part), [*_MODELS.values(), *_GRAPHS.values()], vendored)
+    manifest = manifest_of(agent, part) | ({} if home is None else {"home": home})
+    return finish_page(out, manifest, [*_MODELS.values(), *_GRAPHS.values()], vendored)
 
 
 def copy_page(out: Path, vendored: Mapping[str, Path], licence: str = "") -> None:
@@ -104,7 +108,25 @@ def finish_page(out: Path, manifest: dict[str, Any], data: Sequence[str], vendor
         {"name": p.name, "version": p.version, "license": p.license, "home": p.home} for p in _used(vendored)
     ]
     (out / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")
+    _name_preloads(out, manifest, vendored)
     return sum(file.stat().st_size for file in out.rglob("*") if file.is_file())
+
+
+def _name_preloads(out: Path, manifest: Mapping[str, Any], vendored: Mapping[str, Path]) -> None:
+    """Name in `index.html` what its scripts will ask for, so that the browser fetches everything at once."""
+    modules = ["recorded.js" if manifest["kind"] == "recordings" else "simulated.js"]
+    for name in modules:  # which grows
+        imported = re.findall(r'"\./(\w+\.js)"', (out / name).read_text(encoding="utf-8"))
+        modules += [other for other in dict.fromkeys(imported) if other not in modules]
+    theirs = [f"{_VENDORED}/{name}" for name in vendored]
+    modules += [name for name in theirs if name.endswith(("js", "mjs"))]
+    files = [name for name in theirs if name.endswith(".wasm")]
+    files += [name for kind in ("models", "graphs") for name in manifest.get(kind, {}).values()]
+    links = [f'<link rel="modulepreload" href="{name}" />' for name in modules]
+    links += [f'<link rel="preload" href="{name}" as="fetch" crossorigin="anonymous" />' for name in files]
+    page = out / "index.html"
+    text = page.read_text(encoding="utf-8")
+    page.write_text(text.replace(_PRELOADS, "\n    ".join(links)), encoding="utf-8")
 
 
 def about(agent: LoadedPolicy) -> dict[str, Any]:

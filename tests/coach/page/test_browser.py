@@ -21,6 +21,7 @@ PATIENCE = 240.0  # [s], for a condition: software rendering beside other work
 
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.browser,
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed"),
     pytest.mark.filterwarnings("ignore"),  # of the browser's driver
 ]
@@ -43,8 +44,9 @@ def visit(browser):
         outside.append(route.request.url)
         route.abort()
 
-    def visit(page, width=900):
-        context = browser.new_context(viewport={"width": width, "height": 640})  # small, because drawing is slow
+    def visit(page, width=900, scheme="light"):
+        size = {"width": width, "height": 640}  # small, because drawing is slow
+        context = browser.new_context(viewport=size, color_scheme=scheme)
         context.route(lambda url: not url.startswith(("http://127.0.0.1", "data:", "blob:")), stop)
         tab = context.new_page()
         tab.set_default_timeout(1000 * PATIENCE)
@@ -84,6 +86,15 @@ def wait_for(condition):
     while not condition():
         assert time.monotonic() < end, "timed out"
         time.sleep(0.05)
+
+
+@pytest.mark.parametrize(("scheme", "filtered"), [("light", False), ("dark", True)])
+def test_the_scene_is_dimmed_where_the_browser_is_dark(echo_page, visit, scheme, filtered):
+    tab = visit(echo_page, scheme=scheme)
+    assert ("darkMode" in tab.url) == filtered
+    dimmed = "[...document.querySelectorAll('canvas')].filter(c => getComputedStyle(c).filter !== 'none')"
+    assert tab.evaluate(f"{dimmed}.length > 0") == filtered
+    assert not tab.evaluate(f"{dimmed}.some(canvas => canvas.closest('.u-wrap'))"), "charts keep their colours"
 
 
 def slider(tab, label):

@@ -19,7 +19,11 @@ from tests.coach.echo_domain import echo_session  # noqa: E402
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 PATIENCE = 120.0  # [s]
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed")]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.browser,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium is installed"),
+]
 
 # A gamepad as the browser reports it: axis 1 is half forward, and button 5 is pressed.
 GAMEPAD = """

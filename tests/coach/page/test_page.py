@@ -12,7 +12,7 @@ viser = pytest.importorskip("viser")
 
 from coachable.coach.page import film as film_module  # noqa: E402
 from coachable.coach.page.server import make_server  # noqa: E402
-from coachable.scene.look import icon_link  # noqa: E402
+from coachable.scene.look import FONT, icon_link  # noqa: E402
 from tests.coach.page.driving import do, say, wait_for  # noqa: E402
 
 
@@ -196,6 +196,7 @@ def test_the_page_has_its_own_title_and_icon(server):
         head = text[: text.index("</title>")]
         assert head.endswith("<title>coachable") and icon_link() in head and "Viser" not in head
         assert "prefers-color-scheme: dark" in text and ".gauges {" in text
+        assert ".dark canvas:not(.u-wrap *) {" in text and f"body {{ font-family: {FONT} !important; }}" in text
 
 
 def test_a_push_reaches_the_agent_and_the_recording(walker):

@@ -25,7 +25,7 @@ def site(tmp_path_factory):
     except OSError as error:
         pytest.skip(str(error))
     folder = tmp_path_factory.mktemp("page") / "site"
-    export_page("humanoid", folder)
+    export_page("humanoid", folder, home="../index.html")
     return folder
 
 

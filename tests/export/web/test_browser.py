@@ -12,7 +12,7 @@ import time
 
 import pytest
 
-pytestmark = pytest.mark.slow  # a browser without a graphics card draws for a minute
+pytestmark = [pytest.mark.slow, pytest.mark.browser]  # a browser without a graphics card draws for a minute
 
 LENGTHS = (0.30, 0.475, 0.65)
 OFFSET = 0.03  # [m], by which the shipped agent misses a request at most, see docs/domains/humanoid.md
@@ -38,7 +38,8 @@ class Browser:
         port_file = folder / "DevToolsActivePort"
         wait_for(lambda: port_file.is_file() and "\n" in port_file.read_text(), 60)
         port, path = port_file.read_text().split()[:2]
-        self.socket = client.connect(f"ws://127.0.0.1:{port}{path}", max_size=None)
+        self.connection = client.connect(f"ws://127.0.0.1:{port}{path}", max_size=None)
+        self.socket = self.connection.__enter__()  # newer versions connect only as a context manager
         self.number, self.events, self.session = 0, [], None
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         self.session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
@@ -62,7 +63,7 @@ class Browser:
         return result["result"].get("value")
 
     def close(self):
-        self.socket.close()
+        self.connection.__exit__(None, None, None)
         self.process.terminate()
         self.process.wait(30)
 
@@ -109,6 +110,8 @@ def test_the_page_follows_its_sliders_and_asks_no_other_site(browser, address):
     wait_for(lambda: seconds(browser) > 0, 120)
     print(f"acts after {time.monotonic() - begin:.1f} s, at a load of {os.getloadavg()[0]:.1f}")  # shown by pytest -s
     assert browser.evaluate("document.querySelector('input[value=t_pose]').checked")
+    home = "(a => a.checkVisibility() && a.textContent + ' ' + a.getAttribute('href'))"
+    assert browser.evaluate(f"{home}(document.getElementById('documentation'))") == "Documentation ../index.html"
     measured = []
     for length in LENGTHS:
         browser.evaluate(
@@ -176,11 +179,16 @@ def test_recordings_follow_their_sliders_and_ask_no_other_site(browser, recorded
             announced = f"document.getElementById('announcement').textContent.startsWith('{asked}')"
             wait_for(lambda announced=announced: browser.evaluate(announced), 60)
         assert "fuel=105" in browser.evaluate("location.hash")
+        shown = "[...document.querySelectorAll('#gauges div')].filter(gauge => gauge.offsetHeight > 10).length"
+        assert browser.evaluate(shown) == 6
+        edges = "['scene', 'gauges'].map(id => document.getElementById(id).getBoundingClientRect())"
+        assert browser.evaluate(f"(([scene, gauges]) => scene.bottom <= gauges.top)({edges})")
         browser.evaluate(
             "(() => { document.getElementById('pause').click(); const slider = document.getElementById('moment');"
             " slider.value = 0.5; slider.dispatchEvent(new Event('input')); })()"
         )
         wait_for(lambda: seconds(browser) == 0.5, 60)
+        assert browser.evaluate("document.querySelector('.brand').innerText") == "coachable"  # no address is known
         assert browser.evaluate("document.documentElement.scrollWidth") <= 360
         assert browser.evaluate(SMALL) == []
         sent = [e["params"]["request"]["url"] for e in browser.events if e.get("method") == "Network.requestWillBeSent"]

@@ -4,6 +4,7 @@ import base64
 import gzip
 import json
 import math
+import re
 import shutil
 import subprocess
 from importlib.resources import files
@@ -17,6 +18,7 @@ from coachable.domain import load_domain
 from coachable.domains.humanoid.metrics import FORWARD_SPEED
 from coachable.domains.humanoid.stage import HumanoidStage
 from coachable.export.web import pinned_files
+from coachable.export.web.simulated_page import home_page
 from coachable.scene.frame import Frame, Gauge
 from coachable.scene.parts import Parts
 from coachable.scene.recorded import encode_frames
@@ -34,6 +36,23 @@ def test_the_page_is_small_and_names_no_folder_of_this_machine(site):
     manifest = json.loads((site / "manifest.json").read_text())
     for download in manifest["downloads"]:
         assert (site / download["file"]).stat().st_size == download["bytes"]
+
+
+def test_the_page_names_early_what_its_scripts_ask_for(site, recorded_site):
+    for folder, first, other in ((site, "simulated.js", "recorded.js"), (recorded_site, "recorded.js", "simulated.js")):
+        page = (folder / "index.html").read_text()
+        named = re.findall(r'<link rel="(?:module)?preload" href="([^"]+)"', page)
+        assert all((folder / name).is_file() for name in named) and len(named) == len(set(named))
+        assert {first, "dom.js", "page.js", "view.js", "third_party/three/build/three.module.min.js"} <= set(named)
+        assert other not in named and "<!-- preloads -->" not in page
+    assert {"policy.onnx", "features.onnx", "third_party/@mujoco/mujoco/mujoco.wasm"} <= set(
+        re.findall(r'<link rel="preload" href="([^"]+)" as="fetch"', (site / "index.html").read_text())
+    )
+
+
+def test_the_page_links_to_a_documentation_that_is_known(site, recorded_site):
+    assert json.loads((site / "manifest.json").read_text())["home"] == "../index.html"
+    assert json.loads((recorded_site / "manifest.json").read_text())["home"] == home_page()
 
 
 def test_a_walker_with_a_styled_speed_measures_it():
@@ -184,6 +203,24 @@ def test_recordings_are_decoded_and_found():
 
 def test_requests_links_and_readouts():
     run_in_node(SCRIPT, "request", "readout")
+
+
+def test_browsers_that_draw_by_software_are_known():
+    script = """
+    import assert from "node:assert";
+    const { drawnBySoftware } = await import(VIEW);
+    const named = (name, masked) => ({ getContext: () => ({
+      RENDERER: 1,
+      getExtension: () => (masked ? null : { UNMASKED_RENDERER_WEBGL: 2 }),
+      getParameter: (which) => (which === 2 || masked ? name : "WebKit WebGL"),
+    }) });
+    const swift = "ANGLE (Google, Vulkan 1.3.0 (SwiftShader Device (Subzero) (0x0000C0DE)), SwiftShader driver)";
+    assert.equal(drawnBySoftware(named(swift)), true);
+    assert.equal(drawnBySoftware(named("llvmpipe (LLVM 15.0.6, 256 bits)", true)), true);
+    assert.equal(drawnBySoftware(named("ANGLE (Intel, Mesa Intel(R) UHD Graphics 620, OpenGL 4.6)")), false);
+    assert.equal(drawnBySoftware(named("WebKit WebGL", true)), false);
+    """
+    run_in_node(script, "view")
 
 
 def run_in_node(script, *modules):

@@ -4,10 +4,10 @@ import { at, megabytes } from "./dom.js";
 
 async function start() {
   const manifest = await (await fetch("manifest.json")).json();
-  document.title = manifest.title;
+  document.title = `${manifest.title} – coachable`;
   at("title").textContent = manifest.title;
   at("summary").textContent = manifest.summary;
-  if (manifest.home) at("home").href = manifest.home;
+  if (manifest.home) Object.assign(at("documentation"), { href: manifest.home, hidden: false });
   tellLoads(manifest);
   const kind = await import(manifest.kind === "recordings" ? "./recorded.js" : "./simulated.js");
   await kind.start(manifest);

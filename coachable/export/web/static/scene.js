@@ -2,7 +2,7 @@
 
 import * as THREE from "./third_party/three/build/three.module.min.js";
 
-import { aim, fitting, orbit } from "./view.js";
+import { aim, drawnBySoftware, fitting, orbit } from "./view.js";
 
 // Light and sky; everything else has the colours of the manifest.
 const LIGHTS = {
@@ -41,7 +41,7 @@ export class Scene {
     const { azimuth, elevation, distance, height } = looks.viewpoint;
     this.view = { azimuth: azimuth * DEGREE, elevation: elevation * DEGREE, distance };
     this.sun = new THREE.DirectionalLight("#fff4e2", 2);
-    this.sun.castShadow = true;
+    this.sun.castShadow = !drawnBySoftware(this.renderer); // whose shaders for shadows take long to compile
     this.sun.shadow.mapSize.set(1024, 1024);
     Object.assign(this.sun.shadow.camera, { left: -2.5, right: 2.5, top: 2.5, bottom: -2.5, near: 1, far: 12 });
     this.sun.shadow.radius = 4;

@@ -23,22 +23,16 @@ class SimulatedPage extends Page {
     const engines = [`${MUJOCO}.wasm`, `${ONNX}/ort-wasm-simd-threaded.wasm`];
     const files = download([...own, ...engines], manifest.downloads);
     // Each engine starts as soon as its own files are here.
-    const physics = Promise.all([import(`./${MUJOCO}.js`), files.get(engines[0])]).then(([mujoco, wasmBinary]) =>
-      mujoco.default({ wasmBinary }),
+    const mujoco = Promise.all([import(`./${MUJOCO}.js`), files.get(engines[0])]).then(([{ default: load }, wasmBinary]) =>
+      load({ wasmBinary }),
     );
-    const graphs = Promise.all([import(`./${ONNX}/ort.wasm.min.mjs`), files.get(engines[1])]).then(([ort, wasmBinary]) => {
+    const ort = Promise.all([import(`./${ONNX}/ort.wasm.min.mjs`), files.get(engines[1])]).then(([ort, wasmBinary]) => {
       ort.env.wasm.numThreads = 1; // more need headers that a static host does not send
       ort.env.wasm.wasmBinary = wasmBinary;
       return ort;
     });
-    const [mujoco, ort, drawing, ...contents] = await Promise.all([
-      physics,
-      graphs,
-      import("./scene.js"),
-      ...own.map((name) => files.get(name)),
-    ]);
-    const parts = new Map(own.map((name, i) => [name, contents[i]]));
-    this.simulator = await createSimulator({ mujoco, ort, manifest, files: parts });
+    const [simulator, drawing] = await Promise.all([createSimulator({ mujoco, ort, manifest, files }), import("./scene.js")]);
+    this.simulator = simulator;
     try {
       this.scene = new drawing.Scene(at("scene"), this.simulator.kinematics, manifest.followed, manifest.scene);
     } catch (error) {

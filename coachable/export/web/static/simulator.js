@@ -2,24 +2,33 @@
 // It runs in a browser and in Node.
 
 /**
- * Load the models and the graphs.
+ * Load the models and the graphs, each as soon as its engine and its file are here.
  *
  * @param {object} parts
- * @param {object} parts.mujoco  The loaded module of @mujoco/mujoco.
- * @param {object} parts.ort  The module of onnxruntime-web.
+ * @param {object | Promise} parts.mujoco  The loaded module of @mujoco/mujoco.
+ * @param {object | Promise} parts.ort  The module of onnxruntime-web.
  * @param {object} parts.manifest  Content of manifest.json.
- * @param {Map<string, Uint8Array>} parts.files  Content of the manifest's `models` and `graphs` by file name.
+ * @param {Map<string, Uint8Array | Promise>} parts.files  Content of the manifest's `models` and `graphs` by file name.
  * @returns {Promise<Simulator>}
  */
 export async function createSimulator({ mujoco, ort, manifest, files }) {
-  const sessions = ["policy", "features"].map((name) => ort.InferenceSession.create(files.get(manifest.graphs[name])));
-  const text = new TextDecoder();
-  const [dynamics, kinematics] = ["dynamics", "kinematics"].map((name) => {
-    const model = mujoco.MjModel.from_xml_string(text.decode(files.get(manifest.models[name])));
-    return { model, data: new mujoco.MjData(model) };
-  });
-  const [policy, features] = await Promise.all(sessions);
-  return new Simulator({ mujoco, ort, manifest, dynamics, kinematics, policy, features });
+  const session = async (name, options) => {
+    const graph = await files.get(manifest.graphs[name]);
+    return (await ort).InferenceSession.create(graph, options);
+  };
+  const state = async (name) => {
+    const xml = new TextDecoder().decode(await files.get(manifest.models[name]));
+    const { MjModel, MjData } = await mujoco;
+    const model = MjModel.from_xml_string(xml);
+    return { model, data: new MjData(model) };
+  };
+  const [policy, features, dynamics, kinematics] = await Promise.all([
+    session("policy"),
+    session("features", { graphOptimizationLevel: "disabled" }), // hundreds of small operators: there is little to gain
+    state("dynamics"),
+    state("kinematics"),
+  ]);
+  return new Simulator({ mujoco: await mujoco, ort: await ort, manifest, dynamics, kinematics, policy, features });
 }
 
 export class Simulator {

@@ -60,6 +60,13 @@ export function orbit(canvas, view, limits) {
   });
 }
 
+/** Whether the browser draws without a graphics card. */
+export function drawnBySoftware(renderer) {
+  const context = renderer.getContext();
+  const named = context.getExtension("WEBGL_debug_renderer_info")?.UNMASKED_RENDERER_WEBGL ?? context.RENDERER;
+  return /swiftshader|llvmpipe|software/i.test(context.getParameter(named));
+}
+
 /** Put a camera at a view of a target. */
 export function aim(camera, target, { azimuth, elevation, distance }) {
   const flat = distance * Math.cos(elevation);
