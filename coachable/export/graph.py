@@ -52,7 +52,9 @@ def graph_of(function: nn.Module, example: Mapping[str, Tensor], outputs: Sequen
         ((graph, values),) = found
         program = torch.export.export(_Captured(graph, values, inputs), inputs).run_decompositions()
         names: dict[str, Any] = {"input_names": list(example), "output_names": list(outputs)}
-        written: Any = torch.onnx.export(program, dynamo=True, external_data=False, verbose=False, **names)
+        options: dict[str, Any] = {"dynamo": True, "external_data": False, "verbose": False, "optimize": False}
+        written: Any = torch.onnx.export(program, **options, **names)
+        _simplify(written.model)
     exported = written.model_proto
     for node in exported.graph.node:  # where in the source it comes from, which names folders
         node.doc_string = ""
@@ -61,6 +63,18 @@ def graph_of(function: nn.Module, example: Mapping[str, Tensor], outputs: Sequen
     del exported.graph.value_info[:]
     onnx.checker.check_model(exported)
     return exported
+
+
+def _simplify(model: Any) -> None:
+    """Inline functions and compute constants, in place.
+
+    The exporter's own optimisation also drops summands below 1e-8, of which some keep a division by 0 away.
+    """
+    from onnxscript import optimizer
+
+    optimizer.inline(model)
+    optimizer.fold_constants(model)
+    optimizer.remove_unused_nodes(model)
 
 
 def _replace_cosines(onnx: Any, graph: Any) -> None:

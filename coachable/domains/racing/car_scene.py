@@ -106,7 +106,7 @@ def wheel_slip(state: np.ndarray, places: np.ndarray, radius: float, peak_ratio:
         peak_ratio: Slip ratio of the largest force.
         peak_angle: Slip angle of the largest force [rad].
     """
-    yaw_rate, steer = state[ROW["yaw_rate"]], state[ROW["steer"]] * np.array([1.0, 1.0, 0.0, 0.0], state.dtype)
+    yaw_rate, steer = state[ROW["yaw_rate"]], state[ROW["steer"]] * np.array([1.0, 1.0, 0.0, 0.0], np.float32)
     forward = state[ROW["vx"]] - yaw_rate * places[:, 1]
     sideways = state[ROW["vy"]] + yaw_rate * places[:, 0]
     along = forward * np.cos(steer) + sideways * np.sin(steer)

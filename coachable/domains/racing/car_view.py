@@ -54,8 +54,8 @@ class CarSize(NamedTuple):
     """What the picture of a car depends on.
 
     Attributes:
-        offsets: Places of the wheels relative to the centre of gravity (4, 2) [m].
-        middle: Distance of the body's middle ahead of the centre of gravity [m].
+        places: Places of the body's middle and of the wheels relative to the point of the road below the centre of
+            gravity, (5, 3) [m].
         length: Length [m].
         width: Width [m].
         radius: Radius of the wheels [m].
@@ -64,8 +64,7 @@ class CarSize(NamedTuple):
         peak_angle: Slip angle of the largest force [rad].
     """
 
-    offsets: np.ndarray
-    middle: float
+    places: np.ndarray
     length: float
     width: float
     radius: float
@@ -87,13 +86,14 @@ class CarSize(NamedTuple):
             return round(float(value[column]) if hasattr(value, "shape") else float(value), 4)
 
         front, rear = number("front_axle"), number("rear_axle")
-        places = wheel_places(front, rear, number("track_front"), number("track_rear")).astype(np.float32)
+        radius = number("wheel_radius")
+        wheels = np.insert(wheel_places(front, rear, number("track_front"), number("track_rear")), 2, radius, axis=1)
+        places = np.concatenate([[((front - rear) / 2, 0.0, 0.0)], wheels]).astype(np.float32)
         return cls(
             places,
-            (front - rear) / 2,
             number("length"),
             number("width"),
-            number("wheel_radius"),
+            radius,
             kind_of(number("lift_area")),
             number("peak_slip_ratio"),
             number("peak_slip_angle"),
@@ -101,7 +101,7 @@ class CarSize(NamedTuple):
 
     def slip(self, state: np.ndarray) -> np.ndarray:
         """Return the slip of the wheels (4,) in a state (29,), as `wheel_slip`."""
-        return wheel_slip(state, self.offsets, self.radius, self.peak_ratio, self.peak_angle)
+        return wheel_slip(state, self.places[1:, :2], self.radius, self.peak_ratio, self.peak_angle)
 
 
 def rolled_further(state: np.ndarray, rolled: np.ndarray) -> np.ndarray:
@@ -123,9 +123,7 @@ def car_poses(state: np.ndarray, rolled: np.ndarray, size: CarSize) -> np.ndarra
         rolled: Angles by which the wheels have rolled forward (4,) [rad].
         size: Size of the car.
     """
-    ahead = np.array([size.middle, *size.offsets[:, 0]], np.float32)
-    aside = np.array([0.0, *size.offsets[:, 1]], np.float32)
-    height = np.array([0.0, *[size.radius] * 4], np.float32)
+    ahead, aside, height = size.places[:, 0], size.places[:, 1], size.places[:, 2]
     yaw = state[ROW["yaw"]]
     cos, sin = np.cos(yaw), np.sin(yaw)
     x = state[ROW["x"]] + cos * ahead - sin * aside
@@ -190,7 +188,7 @@ def gauge_values(state: np.ndarray, slip: np.ndarray) -> np.ndarray:
         slip: Slip of its wheels (4,).
     """
     vx, vy, wear = state[ROW["vx"]], state[ROW["vy"]], state[WEARS]
-    worn = np.max(wear)
+    worn = np.max(wear, axis=0)
     return np.stack(
         [
             3.6 * np.sqrt(vx * vx + vy * vy),
@@ -198,10 +196,10 @@ def gauge_values(state: np.ndarray, slip: np.ndarray) -> np.ndarray:
             100.0 * state[ROW["throttle"]],
             100.0 * state[ROW["brake"]],
             np.abs(travel_angle(state)) * (180.0 / math.pi),
-            (np.max(slip) > SLIDING).astype(state.dtype),
+            (np.max(slip, axis=0) > SLIDING).astype(np.float32),
             state[ROW["fuel"]],
-            *(100.0 * wear),
+            *(100.0 * wear[wheel] for wheel in range(4)),
             worn,
-            (worn > _WORN).astype(state.dtype),
+            (worn > _WORN).astype(np.float32),
         ]
     )

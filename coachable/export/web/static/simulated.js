@@ -14,26 +14,31 @@ const BEHIND = 0.25; // [s] that a frame catches up at most; beyond this the age
 const AFTER_FALL = 1200; // [ms] before the next episode
 const ANNOUNCE = 4; // [s] after a request, what was measured is read out
 
-class SimulatedPage extends Page {
+export const RUNTIME = `${ONNX}/ort-wasm-simd-threaded.wasm`;
+
+/** Return the module of onnxruntime-web, once its WebAssembly is here. */
+export async function runtimeOf(bytes) {
+  const [ort, wasmBinary] = await Promise.all([import(`./${ONNX}/ort.wasm.min.mjs`), bytes]);
+  ort.env.wasm.numThreads = 1; // more need headers that a static host does not send
+  ort.env.wasm.wasmBinary = wasmBinary;
+  return ort;
+}
+
+export class SimulatedPage extends Page {
   resting = "Go on";
 
   async load() {
     const { manifest } = this;
     const own = [...Object.values(manifest.models), ...Object.values(manifest.graphs)];
-    const engines = [`${MUJOCO}.wasm`, `${ONNX}/ort-wasm-simd-threaded.wasm`];
+    const engines = [`${MUJOCO}.wasm`, RUNTIME];
     const files = download([...own, ...engines], manifest.downloads);
     // Each engine starts as soon as its own files are here.
     const physics = Promise.all([import(`./${MUJOCO}.js`), files.get(engines[0])]).then(([mujoco, wasmBinary]) =>
       mujoco.default({ wasmBinary }),
     );
-    const graphs = Promise.all([import(`./${ONNX}/ort.wasm.min.mjs`), files.get(engines[1])]).then(([ort, wasmBinary]) => {
-      ort.env.wasm.numThreads = 1; // more need headers that a static host does not send
-      ort.env.wasm.wasmBinary = wasmBinary;
-      return ort;
-    });
     const [mujoco, ort, drawing, ...contents] = await Promise.all([
       physics,
-      graphs,
+      runtimeOf(files.get(RUNTIME)),
       import("./scene.js"),
       ...own.map((name) => files.get(name)),
     ]);
@@ -42,9 +47,18 @@ class SimulatedPage extends Page {
     try {
       this.scene = new drawing.Scene(at("scene"), this.simulator.kinematics, manifest.followed, manifest.scene);
     } catch (error) {
-      console.error(error);
-      this.tell("This browser cannot draw in 3-D: the numbers go on.");
+      this.cannotDraw(error);
     }
+  }
+
+  cannotDraw(error) {
+    console.error(error);
+    this.tell("This browser cannot draw in 3-D: the numbers go on.");
+  }
+
+  /** What buttons and keys do. */
+  get actions() {
+    return { push: () => this.push(), again: () => this.again() };
   }
 
   start() {
@@ -52,7 +66,7 @@ class SimulatedPage extends Page {
     this.entries = entriesOf(manifest);
     at("scene").setAttribute("aria-label", `${manifest.picture}. Arrow keys turn the camera.`);
     this.explain(manifest.legend);
-    this.readout = new Readout(manifest.measures);
+    this.readout = new Readout(manifest.measures, manifest.window);
     this.panel = new Panel(at("requests"), at("others"), this.entries, manifest.measures, (name, value) =>
       this.ask({ ...this.request, [name]: value }),
     );
@@ -61,7 +75,7 @@ class SimulatedPage extends Page {
     this.ask(this.request);
     this.again();
     addEventListener("hashchange", () => this.ask(fromFragment(this.entries, location.hash, this.request)));
-    this.listen({ push: () => this.push(), again: () => this.again() });
+    this.listen(this.actions);
     this.pause(matchMedia("(prefers-reduced-motion: reduce)").matches);
     at("loading").hidden = true;
     this.before = performance.now();
