@@ -83,7 +83,7 @@ class RacingStage:
         slips = [self._car(parts, env, state[:, column], column, index) for index, column in enumerate(columns)]
         own = state[:, row]
         aim = aimed(own)
-        self._heading = float(aim if self._heading is None else turned_camera(np.float32(self._heading), aim))
+        self._heading = float(aim if self._heading is None else turned_camera(np.asarray(self._heading, np.float32), aim))
         marks = Parts()
         for x, y, length, direction in self._marks:
             marks.box((x, y, SKID_HEIGHT), (length, *SKID_SIZE), SKID, about_z(direction))
@@ -94,7 +94,9 @@ class RacingStage:
             heading=self._heading,
             place=id(track),
             marks=marks,
-            gauges=[form.gauge(dict(zip(VALUES, gauge_values(own, slips[0]).tolist(), strict=True))) for form in GAUGES],
+            gauges=[
+                form.gauge(dict(zip(VALUES, gauge_values(own, slips[0]).tolist(), strict=True))) for form in GAUGES
+            ],
             map=Map(self._outline, places, CARS),
             episode=self._episode,
         )

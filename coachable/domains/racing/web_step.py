@@ -50,7 +50,9 @@ _COMMON = (
 )
 MEASURES = {
     "drift": (
-        Measure("slip_angle_front", "slip_angle_front", "slip angle of the front tyres", "deg", comparable=False, digits=0),
+        Measure(
+            "slip_angle_front", "slip_angle_front", "slip angle of the front tyres", "deg", comparable=False, digits=0
+        ),
         Measure("sideslip_corners", "slip_angle_rear", "sideslip in corners", "deg", comparable=False, digits=0),
         Measure("sideslip_straights", "slip_angle_rear", "sideslip on straights", "deg", comparable=False, digits=0),
         Measure("slip_ratio_front", "slip_ratio_front", "slip ratio of the front tyres", comparable=False),
@@ -212,7 +214,7 @@ def _see(state: np.ndarray, seen: np.ndarray, size: CarSize) -> tuple[np.ndarray
 
     Args:
         state: State (29,) after the step.
-        seen: What the picture remembers (17,): angles and slips of the wheels, their places, and the camera's direction.
+        seen: What the picture remembers (17,): angles, slips and places of the wheels, and the camera's direction.
         size: Size of the car.
     """
     rolled = rolled_further(state, seen[:4])

@@ -15,8 +15,8 @@ from coachable.domains.racing.car_scene import (
     wheel_places,
     wheel_slip,
 )
-from coachable.domains.racing.circuit_scene import circuit, outline
 from coachable.domains.racing.car_view import SLIDING, CarSize, car_poses
+from coachable.domains.racing.circuit_scene import circuit, outline
 from coachable.domains.racing.stage import CARS, SKID, RacingStage
 from coachable.envs.racing import RacingEnv
 from coachable.envs.racing.circuit.circuits import load_track

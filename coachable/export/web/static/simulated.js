@@ -10,7 +10,6 @@ import { createSimulator } from "./simulator.js";
 const THIRD_PARTY = "third_party";
 const MUJOCO = `${THIRD_PARTY}/@mujoco/mujoco/mujoco`;
 const ONNX = `${THIRD_PARTY}/onnxruntime-web/dist`;
-const BEHIND = 0.25; // [s] that a frame catches up at most; beyond this the agent acts slower than real time
 const AFTER_FALL = 1200; // [ms] before the next episode
 const ANNOUNCE = 4; // [s] after a request, what was measured is read out
 
@@ -26,6 +25,7 @@ export async function runtimeOf(bytes) {
 
 export class SimulatedPage extends Page {
   resting = "Go on";
+  behind = 0.25; // [s] that a frame catches up at most; beyond this the agent acts slower than real time
 
   async load() {
     const { manifest } = this;
@@ -136,7 +136,7 @@ export class SimulatedPage extends Page {
     this.before = now;
     const { control_step: step } = this.manifest.physics;
     if (!this.paused && this.fell === null) {
-      this.pending += Math.min(elapsed, BEHIND);
+      this.pending += Math.min(elapsed, this.behind);
       let steps = 0;
       for (; this.pending >= step && this.fell === null; steps++) {
         await this.advance();

@@ -7,7 +7,11 @@ import { decode } from "./recording.js";
 import { RUNTIME, SimulatedPage, runtimeOf } from "./simulated.js";
 import { createStepSimulator } from "./step_simulator.js";
 
+const SLOW = 200; // [ms] between pictures, from which on fewer details are drawn
+
 class SteppedPage extends SimulatedPage {
+  behind = 1; // a control step takes much less time than it simulates, so slow pictures need not slow the agent
+
   async load() {
     const { manifest } = this;
     const [graphs, shapes] = [Object.values(manifest.graphs), [manifest.figures, manifest.backdrop]];
@@ -33,6 +37,12 @@ class SteppedPage extends SimulatedPage {
 
   get actions() {
     return { again: () => this.again() };
+  }
+
+  async frame() {
+    if (performance.now() - this.before > SLOW) this.slow = (this.slow ?? 0) + 1;
+    if (this.slow > 5) this.scene?.spare();
+    await super.frame();
   }
 
   again() {
