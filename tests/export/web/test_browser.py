@@ -159,6 +159,7 @@ def test_nothing_is_wider_than_the_window_and_everything_has_a_name(browser, add
 
 def test_a_car_follows_its_sliders_and_asks_no_other_site(browser, stepped_site):
     """Gripping first, then sliding."""
+    browser.call("Emulation.setDeviceMetricsOverride", width=240, height=320, deviceScaleFactor=1, mobile=False)
     with served(stepped_site) as address:
         browser.call("Page.navigate", url=f"{address}#slip_angle_rear=0&slip_ratio_rear=0")
         wait_for(lambda: browser.evaluate("document.getElementById('loading')?.hidden === true"), 120)

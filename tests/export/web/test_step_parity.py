@@ -15,8 +15,8 @@ from coachable.training.weights import domain_of, load_policy
 STYLES = ([0.0, 0.0, 0.0, 0.0], [0.0, 5.0, 0.0, 5.0], [-0.4, -0.4, 0.0, 0.0], [5.0, 5.0, 5.0, 5.0])
 STEPS = 1000
 SEEN = 17  # entries of the whole state that only the picture needs
-STEP_TOLERANCE = 5e-4  # after one step from the same state, relative to values above 1
-FREE_STEPS, FREE_TOLERANCE = 50, 0.05  # [m], of the place of a car that is left to itself
+STEP_TOLERANCE = 1e-4  # after one step from the same state, relative to values above 1
+FREE_STEPS, FREE_TOLERANCE = 100, 0.01  # [m], of the place of a car that is left to itself
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,8 @@ def test_each_of_1000_steps_is_that_of_the_environment(drive, graph):
         found["memory_after"] = found["memory_after"][:, :-SEEN]
         assert found["terminated"].item() == step["terminated"]
         worst = {name: max(value, apart(found[name], expected[name])) for name, value in worst.items()}
-    assert max(worst.values()) < STEP_TOLERANCE, worst
+    print(worst)  # shown by pytest -s
+    assert max(worst.values()) < STEP_TOLERANCE
 
 
 def test_a_car_that_is_left_to_itself_stays_where_it_is_in_python(drive, graph):
