@@ -239,7 +239,7 @@ class Domain:
         make_renderer: `(width, height) -> Renderer`; by default `EnvPictures`, the environment's own pictures.
         make_stage: `() -> coachable.scene.frame.Stage`, the scene that the page shows in 3-D; None shows the renderer's
             pictures.
-        make_web: `(space) -> coachable.export.web.part.WebPart`, for a page on which the agent acts in the browser;
+        make_web: `(space) -> coachable.export.web.part.PagePart`, for a page on which the agent acts in the browser;
             None if the simulation cannot run there, so that the page plays recordings.
         recorded: What such a page plays.
         grid: Values of each style parameter, of which the evaluation grid has all combinations, or a list of styles by

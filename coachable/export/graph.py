@@ -52,21 +52,39 @@ def graph_of(function: nn.Module, example: Mapping[str, Tensor], outputs: Sequen
         ((graph, values),) = found
         program = torch.export.export(_Captured(graph, values, inputs), inputs).run_decompositions()
         names: dict[str, Any] = {"input_names": list(example), "output_names": list(outputs)}
-        written: Any = torch.onnx.export(program, dynamo=True, external_data=False, verbose=False, **names)
+        options: dict[str, Any] = {"dynamo": True, "external_data": False, "verbose": False, "optimize": False}
+        written: Any = torch.onnx.export(program, **options, **names)
+        _simplify(written.model)
     exported = written.model_proto
     for node in exported.graph.node:  # where in the source it comes from, which names folders
         node.doc_string = ""
         del node.metadata_props[:]
-    del exported.graph.value_info[:]
     _replace_cosines(onnx, exported.graph)
+    del exported.graph.value_info[:]
+    onnx.checker.check_model(exported)
     return exported
+
+
+def _simplify(model: Any) -> None:
+    """Inline functions and compute constants, in place.
+
+    The exporter's own optimisation also drops summands below 1e-8, of which some keep a division by 0 away.
+    """
+    from onnxscript import optimizer
+
+    optimizer.inline(model)
+    optimizer.fold_constants(model)
+    optimizer.remove_unused_nodes(model)
 
 
 def _replace_cosines(onnx: Any, graph: Any) -> None:
     """Compute cosines as sines, because the runtime of browsers has no cosine in float64."""
-    cosines = [node for node in graph.node if node.op_type == "Cos"]
+    double = onnx.TensorProto.DOUBLE
+    known = (*graph.value_info, *graph.input, *graph.output)
+    angles = {value.name for value in known if value.type.tensor_type.elem_type == double}
+    cosines = [node for node in graph.node if node.op_type == "Cos" and node.output[0] in angles]
     if cosines:
-        quarter = onnx.helper.make_tensor("quarter_turn", onnx.TensorProto.DOUBLE, (), [math.pi / 2])
+        quarter = onnx.helper.make_tensor("quarter_turn", double, (), [math.pi / 2])
         graph.initializer.append(quarter)
     for node in cosines:
         (angle,), shifted = node.input, f"{node.name}_shifted"

@@ -18,7 +18,7 @@ from coachable.scene.frame import Backdrop, Frame
 from coachable.scene.palette import css
 from coachable.scene.parts import SHAPES, Batch, Parts
 
-__all__ = ["encode_backdrop", "encode_frames"]
+__all__ = ["encode_backdrop", "encode_figures", "encode_frames"]
 
 _RIGID = 2e-3  # [m] and of quaternions: primitives that differ less from a rigid figure belong to it
 _DIGITS = 3  # of the places and sizes of marks [m]
@@ -84,6 +84,24 @@ def encode_backdrop(backdrop: Backdrop) -> bytes:
     surfaces = [{"name": surface.name, "colour": css(surface.colour)} for surface in backdrop.surfaces]
     counts = {shape: len(backdrop.parts.of(shape)) for shape in SHAPES}
     return _packed({"surfaces": surfaces, "counts": counts, "travels": backdrop.travels}, arrays)
+
+
+def encode_figures(figures: Sequence[Parts]) -> bytes:
+    """Return rigid figures, which a page moves itself, each in its own frame.
+
+    Args:
+        figures: Primitives of each figure; a primitive's number `figure` counts them from 1.
+    """
+    batches = [(number, part.of(shape)) for shape in SHAPES for number, part in enumerate(figures, 1)]
+    arrays = {
+        "figure": np.concatenate([np.full(len(batch), number, np.uint16) for number, batch in batches]),
+        "own_positions": np.concatenate([batch.positions for _, batch in batches]).astype(np.float32),
+        "own_turns": np.concatenate([batch.wxyzs for _, batch in batches]).astype(np.float32),
+        "sizes": np.concatenate([batch.sizes for _, batch in batches]).astype(np.float32),
+        "colours": np.concatenate([batch.colours for _, batch in batches]),
+    }
+    counts = {shape: sum(len(figure.of(shape)) for figure in figures) for shape in SHAPES}
+    return _packed({"figures": len(figures), "counts": counts}, arrays)
 
 
 def _alike(one: Frame, other: Frame) -> bool:

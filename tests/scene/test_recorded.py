@@ -8,7 +8,7 @@ import pytest
 
 from coachable.scene.frame import Backdrop, Frame, Gauge, Label, Map
 from coachable.scene.parts import BOX, Batch, Parts, Surface, about_z, multiplied, rotated
-from coachable.scene.recorded import encode_backdrop, encode_frames
+from coachable.scene.recorded import encode_backdrop, encode_figures, encode_frames
 
 GREY, RED = (90, 90, 90), (200, 30, 30)
 
@@ -137,3 +137,15 @@ def test_turned_quaternions_may_change_their_sign():
         frames.append(Frame(Parts().batch(BOX, batch), (0, 0, 0), 0.0))
     _, arrays = decoded(encode_frames(frames, {"": 0}))
     assert arrays["0/figure"].tolist() == [1, 1]
+
+
+def test_figures_are_written_in_the_order_of_the_shapes():
+    wheel = Parts().cylinder((0, 0, 0), (0.6, 0.6, 0.2), GREY)
+    body = Parts().box((0.0, 0.0, 0.5), (2.0, 1.0, 0.5), RED, about_z(0.3)).ball((1.0, 0.0, 1.0), (0.5, 0.5, 0.5), GREY)
+    header, arrays = decoded(encode_figures([wheel, body, wheel]))
+    assert header["figures"] == 3
+    assert header["counts"] == {"box": 1, "ball": 1, "cylinder": 2, "sector": 0}
+    assert arrays["figure"].tolist() == [2, 2, 1, 3]
+    assert arrays["own_positions"].tolist() == [[0.0, 0.0, 0.5], [1.0, 0.0, 1.0], [0.0] * 3, [0.0] * 3]
+    assert arrays["own_turns"][0] == pytest.approx(about_z(0.3))
+    assert arrays["sizes"][2] == pytest.approx([0.6, 0.6, 0.2]) and arrays["colours"].tolist()[0] == list(RED)

@@ -10,7 +10,7 @@ import numpy as np
 from coachable.envs.racing.physics.state import ROW, SPINS
 from coachable.scene import palette
 from coachable.scene.palette import Colour
-from coachable.scene.parts import Parts, about_x, about_y, about_z, multiplied
+from coachable.scene.parts import Parts, about_x, about_y
 
 OPEN_WHEEL, GRAND_TOURER, STREET = "open-wheel", "grand tourer", "street"
 _WINGS = 3.0  # [m²], of downforce area, from which a car is an open-wheel car
@@ -82,16 +82,6 @@ def wheel(radius: float) -> Parts:
     return parts
 
 
-def turned_wheel(steer: float, spin: float) -> np.ndarray:
-    """Return the rotation (4,) of a wheel that is steered to the left and has rolled forward by angles [rad].
-
-    Args:
-        steer: Steering angle, positive to the left [rad].
-        spin: Angle by which the wheel has rolled forward [rad].
-    """
-    return multiplied(np.array(about_z(steer)), np.array([about_y(spin)]))[0]
-
-
 def wheel_places(front: float, rear: float, track_front: float, track_rear: float) -> np.ndarray:
     """Return the places (4, 2) of the wheels relative to the centre of gravity, in the order of `CarState` [m].
 
@@ -116,11 +106,12 @@ def wheel_slip(state: np.ndarray, places: np.ndarray, radius: float, peak_ratio:
         peak_ratio: Slip ratio of the largest force.
         peak_angle: Slip angle of the largest force [rad].
     """
-    yaw_rate, steer = state[ROW["yaw_rate"]], state[ROW["steer"]] * np.array([1.0, 1.0, 0.0, 0.0])
+    yaw_rate, steer = state[ROW["yaw_rate"]], state[ROW["steer"]] * np.array([1.0, 1.0, 0.0, 0.0], np.float32)
     forward = state[ROW["vx"]] - yaw_rate * places[:, 1]
     sideways = state[ROW["vy"]] + yaw_rate * places[:, 0]
     along = forward * np.cos(steer) + sideways * np.sin(steer)
     across = sideways * np.cos(steer) - forward * np.sin(steer)
     scale = np.sqrt(along**2 + _SLOW**2)
     ratio = (state[SPINS] * radius - along) / (scale * peak_ratio)
-    return np.hypot(ratio, across / (scale * math.tan(peak_angle)))
+    angle = across / (scale * math.tan(peak_angle))
+    return np.sqrt(ratio * ratio + angle * angle)

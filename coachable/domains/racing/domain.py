@@ -11,6 +11,7 @@ from coachable.domain import Domain, EnvOption, Recorded
 from coachable.domains.racing.families import home_track, racing_family
 from coachable.domains.racing.metrics import RacingMeasures
 from coachable.domains.racing.stage import RacingStage
+from coachable.domains.racing.web_step import racing_web
 from coachable.domains.racing.words import WORDS
 from coachable.envs.racing.circuit.track import Track
 from coachable.envs.racing.env import EPISODE_STEPS
@@ -59,13 +60,19 @@ def racing_domain(
         if cars == 1 and (met := chosen.pop("cars", 1)) > 1:  # agents trained in traffic are measured alone, too
             coached = {"cars": met, "scenarios": rolling_start(met)}
         pool, points = chosen.get("car") == "pool", chosen.get("course_points", COURSE_POINTS)
+        shown = partial(make_env, **chosen)
         return replace(
             domain,
-            make_env=partial(make_env, **chosen),
+            make_env=shown,
+            make_web=None if coached or pool else page(shown),
             coached=coached,
             episode_steps=chosen.get("episode_steps", domain.episode_steps),
             observation_groups=observation_groups(chosen["opponents"], pool, points, chosen.get("curvature", False)),
         )
+
+    def page(shown: Callable[..., Any]) -> Callable[..., Any] | None:
+        """Return the function that makes the page on which a car drives alone, or None for races of several cars."""
+        return partial(racing_web, family=family, make_env=shown) if cars == 1 else None
 
     angles = ("sideslip", "sideslip_corners", "sideslip_straights") if family == "drift" else ()
     units = {"pace": "m/s", "speed": "m/s", "fuel_per_km": "l"}
@@ -75,6 +82,7 @@ def racing_domain(
     domain = Domain(
         name=f"racing_{family}",
         make_env=partial(make_env, **options),
+        make_web=page(partial(make_env, **options)),
         make_space=make_space,
         make_reward=make_reward,
         measures=RacingMeasures(family),

@@ -146,8 +146,10 @@ def traffic_report(rows: Sequence[dict[str, Any]], response: Sequence[dict[str, 
     text = f"\n## Among others\n\n{CARS} copies, on tyres and fuel of any state, for a minute; "
     text += f"{rows[0]['races']} races per weight, the same starts for each. The weight of overtaking of the last car "
     text += f"rises, or that of defending of the first; all others are {OTHERS_WEIGHT:g}. Starts: close together on a "
-    text += "straight with some cars faster (passing), in a line there (slipstream), or rolling up to the line. Savers: cars that "
-    text += "save tyres and fuel as much as they can.\n\n![traffic](traffic.png)\n\n"
+    text += (
+        "straight with some cars faster (passing), in a line there (slipstream), or rolling up to the line. Savers: "
+    )
+    text += "cars that save tyres and fuel as much as they can.\n\n![traffic](traffic.png)\n\n"
     formats = {"sweep": "", "start": "", "savers": "", "smallest": "+.1f", "largest": "+.1f", "apart": ""}
     formats |= {"metres": ".2f", "places": ".2f", "contacts": ".2f"}
     text += markdown_table(response, formats, {"smallest": "m", "largest": "m"})

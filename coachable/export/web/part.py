@@ -1,14 +1,20 @@
-"""`WebPart`: what a domain adds to the page that `coachable export --web` writes."""
+"""`WebPart`: what a domain that MuJoCo simulates adds to the page that `coachable export --web` writes."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from torch import Tensor, nn
 
-__all__ = ["Measure", "WebPart", "WebScene"]
+from coachable.export.graph import graph_of
+
+__all__ = ["Measure", "PagePart", "WebPart", "WebScene"]
+
+_OUTPUTS = ("observation", "measured", "mark", "memory_after", "terminated")
+_MODELS = {"dynamics": "dynamics.xml", "kinematics": "kinematics.xml"}
+_FEATURES = "features.onnx"
 
 
 @dataclass(frozen=True)
@@ -18,11 +24,14 @@ class Measure:
     Attributes:
         name: Name of the measure, as in the domain's `StyleMeasures`.
         parameter: Style parameter beside which the page shows it, or "" for none.
-        text: What it is called on the page.
+        text: What it is called on the page, or "" if the page does not show it.
         unit: Unit, or "" for none.
         share: Whether it is a share of time, which the page shows in percent.
         at_marks: Whether the values at the last marks are listed beside the request.
         circular: Whether it is a direction in degrees, whose mean is that of directions.
+        comparable: Whether it is measured in what the parameter asks for, so that the slider shows it, too.
+        digits: Number of digits after the point.
+        per: Name of the measure by whose mean the mean of this one is divided, or "" for none.
     """
 
     name: str
@@ -32,6 +41,9 @@ class Measure:
     share: bool = False
     at_marks: bool = False
     circular: bool = False
+    comparable: bool = True
+    digits: int = 2
+    per: str = ""
 
 
 @dataclass(frozen=True)
@@ -69,16 +81,60 @@ class WebScene:
     legend: Sequence[tuple[str, str]]
 
 
-@dataclass(frozen=True)
-class WebPart:
-    """What the page needs to know of a domain that MuJoCo simulates, with one agent.
-
-    The page steps `dynamics` by a control step, reads the sensors of `kinematics` in the new state, and calls
-    `features` with them.
+@dataclass(frozen=True, kw_only=True)
+class PagePart:
+    """What every page needs to know of a domain with one agent.
 
     Attributes:
         title: Title of the page.
         summary: One sentence for the visitor.
+        measures: Measured quantities.
+        starts: Initial states, with lists of numbers by name.
+        physics: Constants of the physics: `control_step` [s], `substeps`, `episode_steps` and whatever else is worth
+            telling.
+        terminated: Verb for a terminated episode in the past tense.
+        opens: Request with which the page opens, by name; what it lacks has its default.
+        picture: What the picture shows, for those who do not see it.
+        licence: Notice that the licence of the model asks for, or "" for none.
+        window: Time over which shares and means are taken [s].
+    """
+
+    kind: ClassVar[str]
+    packages: ClassVar[tuple[str, ...]]
+    """Packages of other projects that the page needs, see `coachable.export.web.pinned_files`."""
+
+    title: str
+    summary: str
+    measures: Sequence[Measure]
+    starts: Sequence[Mapping[str, Sequence[float]]]
+    physics: Mapping[str, Any]
+    terminated: str
+    opens: Mapping[str, Any] = field(default_factory=dict)
+    picture: str = "The agent"
+    licence: str = ""
+    window: float = 3.0
+
+    def files(self) -> dict[str, bytes]:
+        """Return the files of the page beside the policy, by name.
+
+        Raises:
+            ImportError: If the extra `export` is not installed.
+        """
+        raise NotImplementedError
+
+    def told(self) -> dict[str, Any]:
+        """Return what only this kind of page has in `manifest.json`."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True)
+class WebPart(PagePart):
+    """What the page needs to know of a domain that MuJoCo simulates.
+
+    The page steps `dynamics` by a control step, reads the sensors of `kinematics` in the new state, and calls
+    `features` with them. `starts` have `positions`, `memory` and `observation`; `physics` has `physics_step` [s], too.
+
+    Attributes:
         dynamics: XML of the model that is stepped, without external assets.
         kinematics: XML of the model whose sensors the features read, without external assets.
         features: Module with the arguments `positions` (1, nq), `velocities` (1, nv), `sensors` (1, S) and `controls`
@@ -87,32 +143,35 @@ class WebPart:
             float64, which is x, y, the direction's x and y, and the side of a mark on the ground, or NaN, `memory`
             for the next call, and `terminated` (1,) bool.
         example: Example of these arguments by name.
-        measures: Measured quantities.
-        starts: Initial states, each with `positions`, `memory` and `observation` as lists of numbers.
-        physics: Constants of the physics: `control_step` and `physics_step` [s], `substeps`, `episode_steps` and
-            whatever else is worth telling.
         push: Force [N] and `duration` [s] of the page's push, which acts on the first three velocities.
         followed: Body that the camera follows.
         scene: How the model is drawn.
-        opens: Request with which the page opens, by name; what it lacks has its default.
-        picture: What the picture shows, for those who do not see it.
-        licence: Notice that the licence of the model asks for, or "" for none.
-        terminated: Verb for a terminated episode in the past tense.
     """
 
-    title: str
-    summary: str
+    kind = "simulation"
+    packages = ("@mujoco/mujoco", "onnxruntime-web", "three")
+
     dynamics: str
     kinematics: str
     features: nn.Module
     example: Mapping[str, Tensor]
-    measures: Sequence[Measure]
-    starts: Sequence[Mapping[str, Sequence[float]]]
-    physics: Mapping[str, Any]
     push: Mapping[str, float]
     followed: str
-    terminated: str
     scene: WebScene
-    opens: Mapping[str, Any] = field(default_factory=dict)
-    picture: str = "The agent"
-    licence: str = ""
+
+    def files(self) -> dict[str, bytes]:
+        """Return the models and the graph of the features; see `PagePart.files`."""
+        texts = {_MODELS["dynamics"]: self.dynamics, _MODELS["kinematics"]: self.kinematics}
+        features = graph_of(self.features, self.example, _OUTPUTS)
+        return {name: text.encode() for name, text in texts.items()} | {_FEATURES: features.SerializeToString()}
+
+    def told(self) -> dict[str, Any]:
+        """Return how the model is stepped and drawn; see `PagePart.told`."""
+        return {
+            "scene": vars(self.scene),
+            "legend": [list(entry) for entry in self.scene.legend],
+            "models": _MODELS,
+            "graphs": {"features": _FEATURES},
+            "push": dict(self.push),
+            "followed": self.followed,
+        }

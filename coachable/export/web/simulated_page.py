@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from coachable import __version__
-from coachable.export.graph import graph_of, import_onnx
+from coachable.export.graph import import_onnx
 from coachable.export.onnx import TOLERANCE, export
-from coachable.export.web.part import WebPart
+from coachable.export.web.part import PagePart
 from coachable.export.web.pinned_files import Package, packages, provide
 from coachable.scene.look import ICON, stylesheet
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
@@ -24,18 +24,17 @@ __all__ = ["SCHEMA_VERSION", "about", "copy_page", "export_page", "finish_page",
 SCHEMA_VERSION = 1
 """Version of `manifest.json`."""
 
-_OUTPUTS = ("observation", "measured", "mark", "memory_after", "terminated")
-_MODELS = {"dynamics": "dynamics.xml", "kinematics": "kinematics.xml"}
-_GRAPHS = {"policy": "policy.onnx", "features": "features.onnx"}
+_POLICY = "policy.onnx"
 _VENDORED = "third_party"
 _PRELOADS = "<!-- preloads -->"
+_SCRIPTS = {"recordings": "recorded.js", "simulation": "simulated.js", "steps": "stepped.js"}  # as in main.js
 
 
 def export_page(source: str | Path, out: Path, assets: Path | None = None, *, home: str | None = None) -> int:
     """Write the page of an agent.
 
-    The folder contains the page's own files, the physics as XML, the policy and the features as ONNX, `manifest.json`
-    with everything else that the page has to know, and the pinned files of other projects in `third_party`.
+    The folder contains the page's own files, the policy as ONNX, the physics as XML or ONNX, `manifest.json` with
+    everything else that the page has to know, and the pinned files of other projects in `third_party`.
 
     Args:
         source: Checkpoint, run folder, weights file, or the name of a domain that ships with weights.
@@ -52,22 +51,20 @@ def export_page(source: str | Path, out: Path, assets: Path | None = None, *, ho
         CheckpointError: If the source does not hold a usable policy.
         OSError: If the files of other projects cannot be fetched, or writing fails.
     """
-    onnx = import_onnx()
+    import_onnx()
     agent = load_policy(source)
     part = _part_of(agent)
     if out.exists() and not out.is_dir():
         raise NotADirectoryError(f"{out} is a file: expected a folder, or a name that is free")
-    vendored = provide(assets)
-    features = graph_of(part.features, part.example, _OUTPUTS)
-    onnx.checker.check_model(features)
+    vendored = provide(assets, *part.packages)
+    files = part.files()
     out.mkdir(parents=True, exist_ok=True)
     copy_page(out, vendored, part.licence)
-    export(source, out / _GRAPHS["policy"])
-    (out / _GRAPHS["features"]).write_bytes(features.SerializeToString())
-    for name, text in (("dynamics", part.dynamics), ("kinematics", part.kinematics)):
-        (out / _MODELS[name]).write_text(text, encoding="utf-8")
+    export(source, out / _POLICY)
+    for name, content in files.items():
+        (out / name).write_bytes(content)
     manifest = manifest_of(agent, part) | ({} if home is None else {"home": home})
-    return finish_page(out, manifest, [*_MODELS.values(), *_GRAPHS.values()], vendored)
+    return finish_page(out, manifest, [*files, _POLICY], vendored)
 
 
 def copy_page(out: Path, vendored: Mapping[str, Path], licence: str = "") -> None:
@@ -76,7 +73,7 @@ def copy_page(out: Path, vendored: Mapping[str, Path], licence: str = "") -> Non
     Args:
         out: The page's folder.
         vendored: Files of other projects, from `coachable.export.web.pinned_files.provide`.
-        licence: Notice of the domain's own model, see `WebPart.licence`.
+        licence: Notice of the domain's own model, see `PagePart.licence`.
     """
     with as_file(files("coachable.export.web") / "static") as own:
         shutil.copytree(own, out, dirs_exist_ok=True)
@@ -114,7 +111,7 @@ def finish_page(out: Path, manifest: dict[str, Any], data: Sequence[str], vendor
 
 def _name_preloads(out: Path, manifest: Mapping[str, Any], vendored: Mapping[str, Path]) -> None:
     """Name in `index.html` what its scripts will ask for, so that the browser fetches everything at once."""
-    modules = ["recorded.js" if manifest["kind"] == "recordings" else "simulated.js"]
+    modules = [_SCRIPTS[manifest["kind"]]]
     for name in modules:  # which grows
         imported = re.findall(r'"\./(\w+\.js)"', (out / name).read_text(encoding="utf-8"))
         modules += [other for other in dict.fromkeys(imported) if other not in modules]
@@ -150,7 +147,7 @@ def home_page() -> str:
     return next((addresses[name] for name in ("documentation", "repository", "homepage") if name in addresses), "")
 
 
-def manifest_of(agent: LoadedPolicy, part: WebPart) -> dict[str, Any]:
+def manifest_of(agent: LoadedPolicy, part: PagePart) -> dict[str, Any]:
     """Return what the page has to know besides models and graphs.
 
     Args:
@@ -171,9 +168,11 @@ def manifest_of(agent: LoadedPolicy, part: WebPart) -> dict[str, Any]:
         }
         for control in domain.controls
     ]
+    told = part.told()
     return {
         **about(agent),
-        "kind": "simulation",
+        **told,
+        "kind": part.kind,
         "title": part.title,
         "summary": part.summary,
         "style_space": json.loads(space.to_json()),
@@ -182,14 +181,10 @@ def manifest_of(agent: LoadedPolicy, part: WebPart) -> dict[str, Any]:
         "controls": controls,
         "opens": dict(part.opens),
         "names": dict(domain.words.names),
-        "scene": vars(part.scene),
-        "legend": [list(entry) for entry in part.scene.legend],
         "measures": [vars(measure) for measure in part.measures],
-        "models": _MODELS,
-        "graphs": _GRAPHS,
+        "window": part.window,
+        "graphs": {"policy": _POLICY, **told["graphs"]},
         "physics": dict(part.physics),
-        "push": dict(part.push),
-        "followed": part.followed,
         "picture": part.picture,
         "terminated": part.terminated,
         "starts": [dict(start) for start in part.starts],
@@ -197,7 +192,7 @@ def manifest_of(agent: LoadedPolicy, part: WebPart) -> dict[str, Any]:
     }
 
 
-def _part_of(agent: LoadedPolicy) -> WebPart:
+def _part_of(agent: LoadedPolicy) -> PagePart:
     domain = domain_of(agent)
     if domain.make_web is None:
         raise ValueError(f"the domain {domain.name} has no page for the browser: expected one that declares `make_web`")

@@ -12,12 +12,12 @@ from coachable.domains.racing.car_scene import (
     STREET,
     body,
     kind_of,
-    turned_wheel,
     wheel_places,
     wheel_slip,
 )
+from coachable.domains.racing.car_view import SLIDING, CarSize, car_poses
 from coachable.domains.racing.circuit_scene import circuit, outline
-from coachable.domains.racing.stage import CARS, SKID, SLIDING, RacingStage
+from coachable.domains.racing.stage import CARS, SKID, RacingStage
 from coachable.envs.racing import RacingEnv
 from coachable.envs.racing.circuit.circuits import load_track
 from coachable.envs.racing.physics.cars import load_car
@@ -123,7 +123,8 @@ def test_front_wheels_are_steered_and_all_roll(env):
         [0.0] * 4, abs=0.5
     )
     assert not np.allclose(before.wxyzs, after.wxyzs)
-    spoke = rotated(turned_wheel(0.0, 0.1), np.array([[0.0, 0.0, 0.3]]))[0]
+    turn = car_poses(np.zeros(29), np.full(4, 0.1), CarSize.of(env.garage.car))[1, 3:]
+    spoke = rotated(turn, np.array([[0.0, 0.0, 0.3]]))[0]
     assert spoke[0] > 0, "the top of a wheel that rolls forward moves forward"
 
 

@@ -15,6 +15,8 @@ import pytest
 pytestmark = [pytest.mark.slow, pytest.mark.browser]  # a browser without a graphics card draws for a minute
 
 LENGTHS = (0.30, 0.475, 0.65)
+CORNERS = 18  # [s] in which what is measured is read
+SLIDES = 10.0  # [deg], by which a car slides more at least if it is asked to
 OFFSET = 0.03  # [m], by which the shipped agent misses a request at most, see docs/domains/humanoid.md
 
 SMALL = (
@@ -156,6 +158,49 @@ def test_nothing_is_wider_than_the_window_and_everything_has_a_name(browser, add
     assert browser.evaluate(SMALL) == []
     assert browser.evaluate("document.getElementById('pause').textContent") == "Go on"  # it waits to be started
     assert seconds(browser) == 0
+
+
+def test_a_car_follows_its_sliders_and_asks_no_other_site(browser, stepped_site):
+    """Gripping first, then sliding."""
+    browser.call("Emulation.setDeviceMetricsOverride", width=240, height=320, deviceScaleFactor=1, mobile=False)
+    with served(stepped_site) as address:
+        browser.call("Page.navigate", url=f"{address}#slip_angle_rear=0&slip_ratio_rear=0")
+        wait_for(lambda: browser.evaluate("document.getElementById('loading')?.hidden === true"), 120)
+        wait_for(lambda: seconds(browser) > 0, 120)
+        assert browser.evaluate("document.getElementById('request-slip_angle_rear').value") == "0"
+        angles = []
+        for weight in (0.0, 3.0):
+            for name in ("slip_angle_rear", "slip_ratio_rear"):
+                browser.evaluate(
+                    f"(() => {{ const slider = document.getElementById('request-{name}'); slider.value = {weight};"
+                    " slider.dispatchEvent(new Event('input')); })()"
+                )
+            assert browser.evaluate("document.getElementById('measured-sideslip_corners').dataset.value") == ""
+            angles.append(sideslip_in_corners(browser, CORNERS))
+        assert "slip_angle_rear=3" in browser.evaluate("location.hash")
+        assert angles[1] > angles[0] + SLIDES, angles
+        assert browser.evaluate("document.getElementById('gauges').textContent").startswith("speed")
+        assert browser.evaluate("document.getElementById('map').checkVisibility()")
+        assert browser.evaluate("document.getElementById('push').checkVisibility()") is False
+        sent = [e["params"]["request"]["url"] for e in browser.events if e.get("method") == "Network.requestWillBeSent"]
+        assert len(sent) > 10
+        assert [url for url in sent if not url.startswith((address, "data:", "blob:", "about:"))] == []
+    assert not [e for e in browser.events if e.get("method") == "Runtime.exceptionThrown"]
+
+
+def sideslip_in_corners(browser, samples):
+    """Mean of what the page shows, read once per second on its clock [deg]."""
+    values, last = [], seconds(browser)
+    end = time.monotonic() + 240
+    while len(values) < samples:
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.2)
+        now = seconds(browser)
+        shown = browser.evaluate("document.getElementById('measured-sideslip_corners').dataset.value")
+        if shown and abs(now - last) >= 1.0:  # the clock begins anew where the car retires
+            values.append(float(shown))
+            last = now
+    return sum(values[samples // 3 :]) / len(values[samples // 3 :])
 
 
 def test_recordings_follow_their_sliders_and_ask_no_other_site(browser, recorded_site):

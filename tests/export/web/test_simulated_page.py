@@ -17,9 +17,11 @@ from coachable.cli import main
 from coachable.domain import load_domain
 from coachable.domains.humanoid.metrics import FORWARD_SPEED
 from coachable.domains.humanoid.stage import HumanoidStage
+from coachable.domains.racing.car_view import GAUGES, VALUES
 from coachable.export.web import pinned_files
 from coachable.export.web.simulated_page import home_page
 from coachable.scene.frame import Frame, Gauge
+from coachable.scene.palette import css
 from coachable.scene.parts import Parts
 from coachable.scene.recorded import encode_frames
 
@@ -157,6 +159,18 @@ const towards = new Readout([{ name: "heading", circular: true }]);
 assert.equal(Math.abs(Math.round(towards.mean("heading"))), 180);
 readout.clear();
 assert.equal(readout.mean("length"), null);
+const used = new Readout([{ name: "fuel", per: "way" }, { name: "way" }], 10);
+assert.equal(used.mean("fuel"), null);
+[[0, 1, 2], [9, 3, 2], [10, 2, 1]].forEach(([time, ...values]) => used.add(time, values));
+assert.equal(used.mean("fuel"), 6 / 5); // all of it per all of the way
+"""
+
+
+GAUGE = """
+import assert from "node:assert/strict";
+globalThis.document = {};
+const { gaugeOf } = await import(DIALS);
+assert.deepEqual(ROWS.map((values) => FORMS.map((form) => gaugeOf(form, values))), EXPECTED);
 """
 
 
@@ -199,6 +213,22 @@ def test_recordings_are_decoded_and_found():
     for name, content in texts.items():
         script = script.replace(name, json.dumps(base64.b64encode(content).decode()))
     run_in_node(script, "recording")
+
+
+def test_gauges_are_those_of_the_stage():
+    rows = [[0.0] * len(VALUES), [151.6, 4.0, 100.0, 0.4, 12.4, 1.0, 33.33, 5.0, 6.4, 70.0, 77.6, 0.776, 1.0]]
+    numbers = [dict(zip(VALUES, row, strict=True)) for row in rows]
+    gauges = [[form.gauge(values) for form in GAUGES] for values in numbers]
+    texts = {
+        "FORMS": [form.told() for form in GAUGES],
+        "ROWS": numbers,
+        "EXPECTED": [[[g.name, g.text, g.share, css(g.colour)] for g in row] for row in gauges],
+    }
+    script = GAUGE
+    for name, content in texts.items():
+        script = script.replace(name, json.dumps(content))
+    run_in_node(script, "dials")
+    assert gauges[1][3].text == "12°, sliding" and gauges[1][5].colour != gauges[0][5].colour
 
 
 def test_requests_links_and_readouts():

@@ -2,6 +2,8 @@
 
 import { at, megabytes } from "./dom.js";
 
+const KINDS = { recordings: "./recorded.js", simulation: "./simulated.js", steps: "./stepped.js" };
+
 async function start() {
   const manifest = await (await fetch("manifest.json")).json();
   document.title = `${manifest.title} – coachable`;
@@ -9,7 +11,7 @@ async function start() {
   at("summary").textContent = manifest.summary;
   if (manifest.home) Object.assign(at("documentation"), { href: manifest.home, hidden: false });
   tellLoads(manifest);
-  const kind = await import(manifest.kind === "recordings" ? "./recorded.js" : "./simulated.js");
+  const kind = await import(KINDS[manifest.kind]);
   await kind.start(manifest);
 }
 

@@ -13,6 +13,7 @@ export class Panel {
    */
   constructor(form, others, entries, measures, ask) {
     this.entries = entries;
+    measures = measures.filter(({ text }) => text);
     this.measures = measures;
     this.shown = new Map();
     for (const entry of entries) {
@@ -98,6 +99,7 @@ export class Panel {
     slider.style.setProperty("--high", entry.style ? high : "0%");
     const outside = make("p", { class: "outside", hidden: "" }, "Outside of the trained range: the agent has never been asked for this.");
     const lines = measures.flatMap((measure) => {
+      if (!measure.comparable) return this.#line(measure);
       const pointer = make("div", { class: "pointer", hidden: "" });
       pointer.entry = entry;
       slider.append(pointer);
@@ -168,7 +170,7 @@ function placeOf({ from, to }, value) {
   return `calc(12px + ${share.toFixed(4)} * (100% - 24px))`;
 }
 
-function textOfMeasure({ share, unit, circular }, value) {
+function textOfMeasure({ share, unit, circular, digits }, value) {
   if (circular) return withUnit(String(Math.round(value) || 0), unit);
-  return share ? `${Math.round(100 * value)} % of the time` : withUnit(value.toFixed(2), unit);
+  return share ? `${Math.round(100 * value)} % of the time` : withUnit(value.toFixed(digits), unit);
 }

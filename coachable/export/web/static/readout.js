@@ -1,12 +1,15 @@
 // What was measured since the latest request, over the last seconds and over the last marks on the ground.
 
-const SECONDS = 3; // over which shares and means are taken
 const MARKS = 8; // of which values are kept
 
 export class Readout {
-  /** @param {object[]} measures  The manifest's measures. */
-  constructor(measures) {
+  /**
+   * @param {object[]} measures  The manifest's measures.
+   * @param {number} seconds  Time over which shares and means are taken [s].
+   */
+  constructor(measures, seconds = 3) {
     this.measures = measures;
+    this.seconds = seconds;
     this.clear();
   }
 
@@ -19,7 +22,7 @@ export class Readout {
   /** Add what was measured at a time [s]; NaN is no value. */
   add(time, values) {
     this.rows.push({ time, values });
-    while (this.rows[0].time < time - SECONDS) this.rows.shift();
+    while (this.rows[0].time < time - this.seconds) this.rows.shift();
     this.measures.forEach(({ name, at_marks }, i) => {
       if (!at_marks || Number.isNaN(values[i])) return;
       const kept = this.marked.get(name);
@@ -33,10 +36,16 @@ export class Readout {
     return this.marked.get(name);
   }
 
-  /** Mean of a measure, or null if there is no value. */
+  /** Mean of a measure, divided by that of another one if it is measured per another one, or null if there is no value. */
   mean(name) {
     const index = this.measures.findIndex((measure) => measure.name === name);
-    const { at_marks, circular } = this.measures[index];
+    const { at_marks, circular, per } = this.measures[index];
+    if (per) {
+      const [own, other] = [index, this.measures.findIndex((measure) => measure.name === per)].map((i) =>
+        this.rows.reduce((sum, { values }) => sum + values[i], 0),
+      );
+      return other > 0 ? own / other : null;
+    }
     const values = at_marks ? this.last(name) : this.rows.map((row) => row.values[index]);
     const known = values.filter((value) => !Number.isNaN(value));
     if (circular && known.length) {

@@ -1,6 +1,7 @@
 // A page that plays recorded episodes, one for each of some styles.
 
-import { at, make, shape } from "./dom.js";
+import { drawMap, moveDots, showGauges } from "./dials.js";
+import { at } from "./dom.js";
 import { Page, download } from "./page.js";
 import { RecordedPanel } from "./recorded_panel.js";
 import { decode, fragmentOf, fromFragment, nearest } from "./recording.js";
@@ -14,7 +15,7 @@ class RecordedPage extends Page {
     const count = manifest.recordings.length;
     at("notice").textContent =
       `Recording: this page plays ${count} recorded ${count === 1 ? "episode" : "episodes"} of the agent, one for each ` +
-      "style below, because the simulation of this domain is a Python program, which does not run in a browser.";
+      "style below, because this simulation is a Python program, which does not run in a browser.";
     at("notice").hidden = false;
     at("where").textContent = "Everything comes from this site.";
     at("scale").hidden = true;
@@ -117,7 +118,7 @@ class RecordedPage extends Page {
     at("moment").setAttribute("aria-valuetext", `${this.time.toFixed(1)} seconds`);
     if (index === this.shown) return;
     this.shown = index;
-    this.#gauges(this.recording.gauges[index]);
+    showGauges(this.recording.gauges[index]);
     this.#map(index);
   }
 
@@ -127,39 +128,16 @@ class RecordedPage extends Page {
     this.tell(terminated ? `The agent ${this.manifest.terminated} after ${this.length.toFixed(1)} s` : "The recording ends here");
   }
 
-  #gauges(gauges) {
-    const box = at("gauges");
-    if (box.children.length !== gauges.length) {
-      box.replaceChildren(...gauges.map(() => make("div", {}, make("b", {}), make("span", {}, make("i", {}), make("em", {})))));
-    }
-    gauges.forEach(([name, text, share, colour], i) => {
-      const [title, value] = box.children[i].children;
-      const [bar, words] = value.children;
-      if (title.textContent !== name) title.textContent = name;
-      words.textContent = text;
-      bar.hidden = share === null;
-      bar.style.width = `${100 * Math.min(Math.max(share ?? 0, 0), 1)}%`;
-      bar.style.background = colour;
-    });
-  }
-
   #map(index) {
     const { map, arrays } = this.recording;
     at("map").toggleAttribute("hidden", !map);
     if (!map) return;
     if (at("map").dataset.of !== String(this.number)) {
       at("map").dataset.of = this.number;
-      const points = map.outline.map((point) => point.join()).join(" ");
-      const dots = map.colours.map((fill) => shape("circle", { r: 4, fill }));
-      at("map").replaceChildren(shape("polygon", { points }), ...dots.reverse());
+      drawMap(map.outline, map.colours);
     }
-    const dots = [...at("map").children].slice(1).reverse();
-    const places = arrays.get("map").subarray(2 * dots.length * index, 2 * dots.length * (index + 1));
-    dots.forEach((dot, i) => {
-      const [x, y] = places.subarray(2 * i, 2 * i + 2);
-      dot.toggleAttribute("hidden", Number.isNaN(x));
-      if (!Number.isNaN(x)) dot.setAttribute("transform", `translate(${x} ${y})`);
-    });
+    const width = 2 * map.colours.length;
+    moveDots([...arrays.get("map").subarray(width * index, width * (index + 1))]);
   }
 
   #read(number) {

@@ -73,6 +73,11 @@ export class RecordedScene {
     this.index = null;
   }
 
+  /** Read marks and labels anew, because the recording has changed. */
+  refresh() {
+    this.index = null;
+  }
+
   /** Draw a moment, in control steps from the start. */
   draw(moment) {
     const { segments, arrays } = this.recording;

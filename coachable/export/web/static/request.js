@@ -4,7 +4,7 @@ const MARGIN = 0.2; // share of the trained range by which a slider exceeds it t
 
 /** One entry per parameter and control, in the order of the declaration. */
 export function entriesOf(manifest) {
-  const styles = manifest.style_space.parameters.map((parameter) => ({ ...parameter, style: true }));
+  const styles = manifest.style_space.parameters.map((parameter) => ({ default: 0, ...parameter, style: true }));
   const controls = manifest.controls.map((control) => ({ ...control, kind: "control" }));
   return [...styles, ...controls].map((entry) => ({ ...entry, label: words(manifest.names?.[entry.name] ?? entry.name), ...sliderOf(entry) }));
 }

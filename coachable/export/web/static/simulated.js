@@ -10,35 +10,50 @@ import { createSimulator } from "./simulator.js";
 const THIRD_PARTY = "third_party";
 const MUJOCO = `${THIRD_PARTY}/@mujoco/mujoco/mujoco`;
 const ONNX = `${THIRD_PARTY}/onnxruntime-web/dist`;
-const BEHIND = 0.25; // [s] that a frame catches up at most; beyond this the agent acts slower than real time
 const AFTER_FALL = 1200; // [ms] before the next episode
 const ANNOUNCE = 4; // [s] after a request, what was measured is read out
 
-class SimulatedPage extends Page {
+export const RUNTIME = `${ONNX}/ort-wasm-simd-threaded.wasm`;
+
+/** Return the module of onnxruntime-web, once its WebAssembly is here. */
+export async function runtimeOf(bytes) {
+  const [ort, wasmBinary] = await Promise.all([import(`./${ONNX}/ort.wasm.min.mjs`), bytes]);
+  ort.env.wasm.numThreads = 1; // more need headers that a static host does not send
+  ort.env.wasm.wasmBinary = wasmBinary;
+  return ort;
+}
+
+export class SimulatedPage extends Page {
   resting = "Go on";
+  behind = 0.25; // [s] that a frame catches up at most; beyond this the agent acts slower than real time
 
   async load() {
     const { manifest } = this;
     const own = [...Object.values(manifest.models), ...Object.values(manifest.graphs)];
-    const engines = [`${MUJOCO}.wasm`, `${ONNX}/ort-wasm-simd-threaded.wasm`];
+    const engines = [`${MUJOCO}.wasm`, RUNTIME];
     const files = download([...own, ...engines], manifest.downloads);
     // Each engine starts as soon as its own files are here.
     const mujoco = Promise.all([import(`./${MUJOCO}.js`), files.get(engines[0])]).then(([{ default: load }, wasmBinary]) =>
       load({ wasmBinary }),
     );
-    const ort = Promise.all([import(`./${ONNX}/ort.wasm.min.mjs`), files.get(engines[1])]).then(([ort, wasmBinary]) => {
-      ort.env.wasm.numThreads = 1; // more need headers that a static host does not send
-      ort.env.wasm.wasmBinary = wasmBinary;
-      return ort;
-    });
+    const ort = runtimeOf(files.get(RUNTIME));
     const [simulator, drawing] = await Promise.all([createSimulator({ mujoco, ort, manifest, files }), import("./scene.js")]);
     this.simulator = simulator;
     try {
       this.scene = new drawing.Scene(at("scene"), this.simulator.kinematics, manifest.followed, manifest.scene);
     } catch (error) {
-      console.error(error);
-      this.tell("This browser cannot draw in 3-D: the numbers go on.");
+      this.cannotDraw(error);
     }
+  }
+
+  cannotDraw(error) {
+    console.error(error);
+    this.tell("This browser cannot draw in 3-D: the numbers go on.");
+  }
+
+  /** What buttons and keys do. */
+  get actions() {
+    return { push: () => this.push(), again: () => this.again() };
   }
 
   start() {
@@ -46,7 +61,7 @@ class SimulatedPage extends Page {
     this.entries = entriesOf(manifest);
     at("scene").setAttribute("aria-label", `${manifest.picture}. Arrow keys turn the camera.`);
     this.explain(manifest.legend);
-    this.readout = new Readout(manifest.measures);
+    this.readout = new Readout(manifest.measures, manifest.window);
     this.panel = new Panel(at("requests"), at("others"), this.entries, manifest.measures, (name, value) =>
       this.ask({ ...this.request, [name]: value }),
     );
@@ -55,7 +70,7 @@ class SimulatedPage extends Page {
     this.ask(this.request);
     this.again();
     addEventListener("hashchange", () => this.ask(fromFragment(this.entries, location.hash, this.request)));
-    this.listen({ push: () => this.push(), again: () => this.again() });
+    this.listen(this.actions);
     this.pause(matchMedia("(prefers-reduced-motion: reduce)").matches);
     at("loading").hidden = true;
     this.before = performance.now();
@@ -116,7 +131,7 @@ class SimulatedPage extends Page {
     this.before = now;
     const { control_step: step } = this.manifest.physics;
     if (!this.paused && this.fell === null) {
-      this.pending += Math.min(elapsed, BEHIND);
+      this.pending += Math.min(elapsed, this.behind);
       let steps = 0;
       for (; this.pending >= step && this.fell === null; steps++) {
         await this.advance();
