@@ -26,7 +26,7 @@ def graph_of(function: nn.Module, example: Mapping[str, Tensor], outputs: Sequen
 
     Args:
         function: Module without parameters, from tensors to a tuple of tensors.
-        example: Inputs by name, in the order of the arguments.
+        example: Inputs by name, in the order of the arguments, each a tensor of its own.
         outputs: Names of the outputs.
 
     Returns:
