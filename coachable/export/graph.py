@@ -36,7 +36,7 @@ def graph_of(function: nn.Module, example: Mapping[str, Tensor], outputs: Sequen
         ImportError: If the extra `export` is not installed.
     """
     onnx = import_onnx()
-    inputs = tuple(example.values())
+    inputs = tuple(value.clone() for value in example.values())  # one tensor for two inputs would make them one
     found: list[tuple[Any, Sequence[Any]]] = []
 
     def keep(graph: Any, _: Any) -> Any:

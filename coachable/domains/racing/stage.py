@@ -72,9 +72,8 @@ class RacingStage:
         slips = [self._car(parts, env, state[:, column], column, index) for index, column in enumerate(columns)]
         own = state[:, row]
         aim = aimed(own)
-        self._heading = float(
-            aim if self._heading is None else turned_camera(np.asarray(self._heading, np.float32), aim)
-        )
+        before = aim if self._heading is None else np.asarray(self._heading, np.float32)
+        self._heading = float(turned_camera(before, aim))
         marks = Parts()
         for x, y, length, direction in self._marks:
             marks.box((x, y, SKID_HEIGHT), (length, *SKID_SIZE), SKID, about_z(direction))

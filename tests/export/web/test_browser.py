@@ -191,7 +191,7 @@ def test_a_car_follows_its_sliders_and_asks_no_other_site(browser, stepped_site)
 def sideslip_in_corners(browser, samples):
     """Mean of what the page shows, read once per second on its clock [deg]."""
     values, last = [], seconds(browser)
-    end = time.monotonic() + 240
+    end = time.monotonic() + 480
     while len(values) < samples:
         assert time.monotonic() < end, "waited in vain"
         time.sleep(0.2)
