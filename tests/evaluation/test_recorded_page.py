@@ -78,7 +78,7 @@ def test_all_recordings_of_a_race_begin_at_the_same_place(changed, tmp_path):
 
 def test_a_domain_without_scene_or_simulation_for_the_browser_says_so(changed, tmp_path, capsys):
     changed(make_stage=None)
-    assert main(["export", NAME, "--web", str(tmp_path / "site")]) == 2
+    assert main(["export", "racing_traffic", "--web", str(tmp_path / "site")]) == 2
     error = capsys.readouterr().err
     assert "neither a simulation for the browser nor a scene" in error and error.count("\n") == 1
     assert not (tmp_path / "site").exists()
