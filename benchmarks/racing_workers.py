@@ -8,7 +8,7 @@ from typing import Any
 from contest import serve
 
 CARS = 4096  # 4095 in races of five
-POOLED = 64  # environments of EnvPool, the fastest number of 16, 64 and 256
+POOLED = 64  # environments of EnvPool
 THREADS = int(os.environ.get("OMP_NUM_THREADS", "1"))
 
 

@@ -171,7 +171,7 @@ def test_a_car_follows_its_sliders_and_asks_no_other_site(browser, stepped_site)
         wait_for(lambda: seconds(browser) > 0, 120)
         assert browser.evaluate("document.getElementById('request-slip_angle_rear').value") == "0"
         angles = []
-        for weight in (0.0, 3.0):
+        for weight in (0.0, 5.0):
             for name in ("slip_angle_rear", "slip_ratio_rear"):
                 browser.evaluate(
                     f"(() => {{ const slider = document.getElementById('request-{name}'); slider.value = {weight};"
@@ -179,7 +179,7 @@ def test_a_car_follows_its_sliders_and_asks_no_other_site(browser, stepped_site)
                 )
             assert browser.evaluate("document.getElementById('measured-sideslip_corners').dataset.value") == ""
             angles.append(sideslip_in_corners(browser, CORNERS))
-        assert "slip_angle_rear=3" in browser.evaluate("location.hash")
+        assert "slip_angle_rear=5" in browser.evaluate("location.hash")
         assert angles[1] > SLIDES * angles[0], angles
         assert browser.evaluate("document.getElementById('gauges').textContent").startswith("speed")
         assert browser.evaluate("document.getElementById('map').checkVisibility()")
