@@ -7,6 +7,7 @@ import time
 from argparse import Namespace
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -270,9 +271,12 @@ def announce(config: dict[str, Any], trainer: Trainer) -> None:
     parameters = sum(p.numel() for p in learner.loss_module.actor_network_params.parameters())
     device, bf16 = pick_device(settings.device), learner.precision == "bf16"
 
-    def update_seconds(settings: Any) -> float:
-        samples = settings.train.batch_size * (settings.impersonation.n + 1)
+    @cache  # it is measured
+    def seconds_for(samples: int) -> float:
         return estimate_update_seconds(parameters, samples, bf16, device)
+
+    def update_seconds(settings: Any) -> float:
+        return seconds_for(settings.train.batch_size * (settings.impersonation.n + 1))
 
     def hours(settings: Any, frames: int) -> float:
         train: TrainSettings = settings.train

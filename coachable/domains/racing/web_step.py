@@ -156,8 +156,8 @@ def memory_of(env: RacingEnv) -> Tensor:
     Args:
         env: Environment of single cars.
     """
-    rows = torch.cat([env.state.T, env.run.T, env.compound.T], dim=1)
-    seen = [torch.from_numpy(_start(state, CarSize.of(env.garage.car))[-1]) for state in env.state.T.cpu().numpy()]
+    rows, size = torch.cat([env.state.T, env.run.T, env.compound.T], dim=1), CarSize.of(env.garage.car)
+    seen = [torch.from_numpy(_start(state, size)[-1]) for state in env.state.T.cpu().numpy()]
     return torch.cat([rows, torch.stack(seen)], dim=1)
 
 
