@@ -93,7 +93,7 @@ def endurance() -> Track:
 _BUILDERS = {"lakeside": lakeside, "ridge": ridge, "endurance": endurance, "ring": ring, "oval": oval}
 CIRCUITS = tuple(_BUILDERS)
 SHIPPED = ("lakeside", "ridge", "endurance")
-TRAINED = tuple(f"circuit-{number}" for number in range(24))
+TRAINED = tuple(f"circuit-{number}" for number in range(128))
 HELD_OUT = tuple(f"circuit-{number}" for number in range(1000, 1008))
 SETS = {"training": (*SHIPPED, *TRAINED), "held_out": HELD_OUT}
 
