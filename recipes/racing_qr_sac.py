@@ -17,11 +17,13 @@ from recipe_config import run_recipe
 from torchrl.envs import Compose, EnvBase
 
 from coachable.domains.racing.families import family_style
+from coachable.domains.racing.mirror_maps import racing_mirror_maps
 from coachable.fast import accelerate
+from coachable.training.collection import simulation_env
 from coachable.training.episodes import EpisodeSums
 from coachable.training.trainer import Trainer
 from coachable.training.weights import initialise_from
-from coachable.transforms import CoachableEnv, StyleRewardTransform, StyleSampler, TaskImpersonation
+from coachable.transforms import CoachableEnv, MirrorSymmetry, StyleRewardTransform, StyleSampler, TaskImpersonation
 
 
 def build(config: dict[str, Any]) -> Trainer:
@@ -53,8 +55,10 @@ def build(config: dict[str, Any]) -> Trainer:
     learner = cfg.learner.build(loss)
     accelerate(learner, cfg.fast)  # same results up to rounding
 
-    # Replay buffer, which sums rewards over n steps; its samples are relabelled with other styles
-    replay = boxes.make_replay(run, example)
+    # Replay buffer, which sums rewards over n steps; its samples are mirrored, and relabelled with other styles
+    replay = boxes.make_replay(run, example, mirrored=True)
+    if cfg.mirror:
+        replay.append_transform(MirrorSymmetry(racing_mirror_maps(simulation_env(example)), cfg.mirror, seed=cfg.seed))
     if cfg.impersonation.n:
         replay.append_transform(TaskImpersonation(style_reward, n=cfg.impersonation.n, seed=cfg.seed))
     boxes.open_run_dir(run, example, replay)  # files are written from here on

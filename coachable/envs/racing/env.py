@@ -173,9 +173,8 @@ class RacingEnv(EnvBase):
         self.scenario = torch.zeros(self.races, dtype=torch.int64, device=place)
         self.episode = torch.zeros(self.races, dtype=torch.int64, device=place)
         self.seeds = torch.zeros(self.races, dtype=torch.int64, device=place)
-        self.observation_size = sum(
-            group.width for group in observation_groups(opponents, self.garage.pooled, course_points, curvature)
-        )
+        self.observation_groups = observation_groups(opponents, self.garage.pooled, course_points, curvature)
+        self.observation_size = sum(group.width for group in self.observation_groups)
         self._observation = torch.zeros(rows, self.observation_size, device=place)
         self._set_seed(seed)
         self._make_specs()
