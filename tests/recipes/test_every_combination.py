@@ -11,6 +11,7 @@ from recipe_config import compose_config, config_groups, run_recipe
 from tensordict import TensorDict
 
 from coachable.domains.racing.families import racing_family
+from coachable.envs.racing.race.observation import COURSE_POINTS
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
 from coachable.training.trainer import REPLAY_KEYS
 from coachable.training.weights import load_policy
@@ -116,6 +117,13 @@ def test_returns_over_several_steps_are_relabelled_by_the_sum_of_their_features(
     style_reward = racing_family("resources").make_reward(racing_family("resources").make_space())
     expected = following["task_reward"] + style_reward(following["style_features"], sample["style"])
     torch.testing.assert_close(following["reward"], expected, rtol=1e-4, atol=1e-4)
+
+
+def test_circuits_that_turn_left_turn_right_in_the_mirror(tmp_path):
+    train = _train("racing_qr_sac", tmp_path, "mirror=1", "impersonation.n=1", "family=resources")
+    assert train.learner.updates > 0
+    bends = train.replay.sample(16)["observation"][..., -COURSE_POINTS:]  # curvature of a ring and an oval
+    assert (bends <= 0).all() and (bends < 0).any()
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
@@ -242,6 +250,7 @@ def test_runs_with_tables_resume_bit_for_bit(loss, replay, tmp_path):
         ("combat_cat_rac", ["loss=sac"], r"continuous actions only"),
         ("combat_cat_rac", ["loss=qr_sac"], r"continuous actions only"),
         ("cheetah_speed", ["mirror=0.5"], r"cheetah has no mirror images, expected mirror=0"),
+        ("racing_qr_sac", ["mirror=0.5", "env.curvature=false"], r"mirror images need env.curvature=true"),
     ],
 )
 def test_what_makes_no_sense_fails_at_the_start_with_one_sentence(recipe, arguments, message, tmp_path):

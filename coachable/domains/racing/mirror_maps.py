@@ -17,8 +17,8 @@ from coachable.envs.racing.race.observation import ACTION_GROUPS
 from coachable.signals import Signal
 from coachable.transforms.mirror import MirrorMap
 
-# Patterns of the entries whose sign changes, by block. Blocks without such entries are listed too: one that is not listed
-# is refused.
+# Patterns of the entries whose sign changes, by block. Blocks without such entries are listed, too, because others are
+# refused.
 _TURNED: dict[str, tuple[str, ...]] = {
     "motion": ("left_speed", "yaw_rate", "left_acceleration"),
     "tyre_load": (),

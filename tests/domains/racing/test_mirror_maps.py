@@ -1,128 +1,136 @@
-"""A race on a mirrored circuit, driven as in the mirror, is the mirror image of the original: shown by the simulator."""
+"""A race on a mirrored circuit, driven as in the mirror, is the mirror image of the original in every number."""
 
-import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 from tensordict import TensorDict
 
-from coachable.domains.racing.events import racing_events
+from coachable.domains.racing.events import SLIDE, racing_events
 from coachable.domains.racing.families import family_env, family_style
 from coachable.domains.racing.mirror_maps import mirror_map, racing_mirror_maps
 from coachable.envs.racing import RacingEnv
 from coachable.envs.racing.circuit.circuits import load_track
-from coachable.envs.racing.physics.cars import load_car
+from coachable.envs.racing.physics.cars import Resources
 from coachable.envs.racing.physics.dynamics import WheelSet
 from coachable.envs.racing.physics.state import HEATS, ROW, SPINS, WEARS
 from coachable.envs.racing.race.driver import LineFollower
-from coachable.envs.racing.race.features import OVERTAKE
 from coachable.envs.racing.race.referee import TELEMETRY
-from coachable.envs.racing.race.scenarios import race_scenarios
+from coachable.envs.racing.race.run import Run
+from coachable.envs.racing.race.scenarios import Conditions, race_scenarios
 from coachable.signals import Signal, entry_names
-from coachable.transforms import MirrorSymmetry
 
-# Fields of the state whose sign changes.
-STATE = ("y", "yaw", "vy", "yaw_rate", "steer", "ay", "steer_command")
-TELEMETRY_SIGN = torch.ones(len(TELEMETRY))
-for name in ("offset", "sideslip", "heading", "curvature"):
-    TELEMETRY_SIGN[TELEMETRY.index(name)] = -1.0
-STEPS = 250
+STEPS = 200
+WORN = Conditions.resources()
+TURNED = ("y", "yaw", "vy", "yaw_rate", "steer", "ay", "steer_command")  # fields of the state whose sign changes
+TURNED_TELEMETRY = ("offset", "sideslip", "heading", "curvature")
 
 
 def image(mirror, vector):
     return vector[..., list(mirror.source)] * torch.tensor(mirror.sign, dtype=vector.dtype)
 
 
-def lopsided(track):
-    """Return a circuit that is wider to the left of its centre line, so that the widths take part."""
+def circuit_and_its_image():
+    """Return a circuit that is wider to the left of its centre line, and its mirror image."""
+    track = load_track("circuit-3")
     table = track.table.clone()
     table[:, 5] += 1.5
-    return replace(track, table=table)
+    mirrored = table[:, [0, 1, 2, 3, 4, 6, 5, 7]] * torch.tensor([1.0, -1, 1, -1, -1, 1, 1, 1])
+    return [replace(track, table=table), replace(track, table=mirrored)]
 
 
-def mirrored_track(track):
-    """Return the circuit in the mirror: y, ty and curvature change their sign, left and right widths swap."""
-    table = track.table[:, [0, 1, 2, 3, 4, 6, 5, 7]] * torch.tensor([1.0, -1, 1, -1, -1, 1, 1, 1])
-    return replace(track, table=table)
+def start_in_pairs(env):
+    """Start every odd race as the mirror image of the one before it.
 
-
-def mirrored_state(state):
-    other = state.clone()
-    for name in STATE:
+    In double precision roundings do not grow to what can be seen.
+    """
+    env.reset()
+    env.course.double()
+    if env.garage.pooled:
+        env.garage.model[1::2] = env.garage.model[0::2]
+        env.garage._assemble()
+    env.simulation.wheels = WheelSet.of(env.garage.car, dtype=torch.float64)
+    env.simulation.set_cars(env.garage.car)
+    state, compound, run = (
+        value.double().unflatten(1, env.group.shape) for value in (env.state, env.compound, env.run)
+    )
+    other = state[..., 0::2].clone()
+    for name in TURNED:
         other[ROW[name]] *= -1
     for wheels in (SPINS, HEATS, WEARS):
-        other[wheels] = state[wheels][[1, 0, 3, 2]]
-    return other
-
-
-def to_double(env):
-    """Change an environment to double precision, in which roundings do not grow to what can be seen."""
-    env.course.double()
-    env.simulation.wheels = WheelSet.of(env.garage.car, dtype=torch.float64)
-    env.state, env.compound = env.state.double(), env.compound.double()
-    return env
-
-
-def put_in_the_mirror(env, original):
-    """Start the races of `env` as the mirror images of those that `original` starts."""
-    env.group, env.compound, env.scenario = original.group, original.compound, original.scenario
-    env.state = mirrored_state(original.state)
-    for one in (env, original):
-        groups = one.group if one.cars > 1 else None
-        place, distance = original.run[0].double(), original.run[4].double()
-        one.run = one.referee.begin(one.state, place, distance, one.garage.car, groups)
+        other[wheels] = state[wheels, :, 0::2][[1, 0, 3, 2]]
+    state[..., 1::2] = other
+    for value in (compound, run, env.group):
+        value[..., 1::2] = value[..., 0::2]
+    env.state, env.compound = state.flatten(1), compound.flatten(1)
+    begun = Run(*run.flatten(1).unbind(0))
+    env.run = env.referee.begin(env.state, begun.s, begun.distance, env.garage.car, env._groups)
 
 
 @pytest.mark.parametrize(
-    "family, options",
+    "family, cars, make_env",
     [
-        ("drift", {}),
-        ("drift", {"opponents": True, "course_points": 5}),
-        ("resources", {"cars": 3, "scenarios": race_scenarios(3)}),
-        ("aggressiveness", {"controlled": 5}),
-        ("aggressiveness", {"controlled": 5, "car": "pool"}),
+        ("drift", 1, partial(family_env, family="drift", course_points=5)),
+        ("resources", 3, partial(family_env, family="resources")),
+        ("aggressiveness", 5, partial(RacingEnv, car="pool", conditions=WORN, resources=Resources.calibrated("gt3"))),
     ],
-    ids=["drift", "drift with room for opponents", "resources in traffic", "aggressiveness", "cars from the pool"],
 )
-def test_a_mirrored_race_stays_the_mirror_image(family, options):
-    track = lopsided(load_track("circuit-3"))
-    settings = {"family": family, "curvature": True, "seed": 1, **options}
-    here, there = (family_env(30, track=[one], **settings) for one in (track, mirrored_track(track)))
-    for env in (here, there):
-        env.reset()
-        to_double(env)
-    put_in_the_mirror(there, here)
-    maps = racing_mirror_maps(here)
-    seen, acted = maps["observation"], maps["action"]
-    assert len(seen.source) == here.observation_size
-    car = here.garage.typical
-    driver = LineFollower(here.tracks, car, grip=1.05, lanes=(0.0, 1.0, -1.0))
-    space, make_reward = family_style(family)
-    style_reward, events = make_reward(space), racing_events(family)
+def test_a_mirrored_race_stays_the_mirror_image(family, cars, make_env):
+    options = {"scenarios": race_scenarios(cars, {"passing": 0.5, "slipstream": 0.5})} if cars > 1 else {}
+    env = make_env(6 * cars, cars=cars, track=circuit_and_its_image(), curvature=True, seed=1, **options)
+    start_in_pairs(env)
+    maps, names = racing_mirror_maps(env), entry_names(env.observation_groups)
+    mirror = maps["observation"]
+    changes = torch.tensor([mirror.sign[i] < 0 or mirror.source[i] != i for i in range(env.observation_size)])
+    driver = LineFollower(env.tracks, env.garage.typical, grip=1.05, lanes=(0.0, 1.0, -1.0))
+    (space, make_reward), events = family_style(family), racing_events(family)
+    style_reward = make_reward(space)
     generator = torch.Generator().manual_seed(0)
-    theta = space.low + (space.high - space.low) * torch.rand(30, space.dim, generator=generator)
-    happened = {}
-    shove = torch.zeros(30, 2)
+    theta = space.low + (space.high - space.low) * torch.rand(3 * cars, space.dim, generator=generator)
+    sign = torch.ones(len(TELEMETRY), dtype=torch.float64)
+    sign[[TELEMETRY.index(name) for name in TURNED_TELEMETRY]] = -1
+    happened, varied = set(), torch.zeros(env.observation_size, dtype=torch.bool)
+
+    def halves(value):
+        """Return the rows of the original races, and those of their images."""
+        split = value.unflatten(0, env.group.shape)
+        return split[:, 0::2].flatten(0, 1), split[:, 1::2].flatten(0, 1)
+
     for step in range(STEPS):
         if step % 5 == 0:  # hands that slip now and then
-            shove = torch.randn(30, 2, generator=generator) * torch.tensor([0.25, 0.6])
-            shove = shove * (torch.rand(30, 1, generator=generator) < 0.4)
-        action = (driver(here.field, here._observation) + shove).clamp(-1.0, 1.0).float()
-        after, reflected = (
-            env.step(TensorDict({"action": value}, [30]))["next"]
-            for env, value in ((here, action), (there, image(acted, action)))
-        )
-        close = {"atol": 1e-5, "rtol": 1e-5, "check_dtype": False}
-        expected = image(seen, after["observation"])
-        if not torch.allclose(expected, reflected["observation"], atol=1e-5, rtol=1e-5):
-            apart = (expected - reflected["observation"]).abs().amax(0)
-            names = entry_names(here.observation_groups)
-            raise AssertionError(f"step {step}: {[names[i] for i in (apart > 1e-5).nonzero()[:, 0]]}, by {apart.max()}")
+            shove = torch.randn(3 * cars, 2, generator=generator) * torch.tensor([0.3, 0.7])
+            shove = shove * (torch.rand(3 * cars, 1, generator=generator) < 0.4)
+        wanted = (halves(driver(env.field, env._observation))[0] + shove).clamp(-1.0, 1.0).float()
+        action = torch.stack([wanted.unflatten(0, (cars, 3)), image(maps["action"], wanted).unflatten(0, (cars, 3))], 2)
+        after = env.step(TensorDict({"action": action.flatten(0, 2)}, [6 * cars]))["next"]
+        seen, mirrored = halves(after["observation"])
+        varied |= (seen != 0).any(0)
+        apart = (image(mirror, seen) - mirrored).abs().amax(0)
+        assert (apart < 1e-5).all(), (step, [(names[i], float(apart[i])) for i in (apart >= 1e-5).nonzero()[:, 0]])
         for key in ("style_features", "task_reward"):
-            torch.testing.assert_close(reflected[key], after[key], **close)
-        torch.testing.assert_close(reflected["telemetry"], after["telemetry"] * TELEMETRY_SIGN, **close)
-        rewards = [style_reward(one["style_features"].float(), theta) for one in (after, reflected)]
-        torch.testing.assert_close(*rewards, atol=1e-2, rtol=1e-4)
-        assert torch.equal(after["done"], reflected["done"])
-    print(happened)
+            torch.testing.assert_close(*halves(after[key]), atol=1e-5, rtol=1e-5)
+        here, there = halves(after["telemetry"])
+        torch.testing.assert_close(here * sign, there, atol=1e-5, rtol=1e-5)
+        features = [value.float() for value in halves(after["style_features"])]
+        torch.testing.assert_close(*(style_reward(value, theta) for value in features), atol=1e-3, rtol=1e-4)
+        assert torch.equal(*halves(after["done"]))
+        told = halves(events(TensorDict({"next": after}, [6 * cars])))
+        assert torch.equal(*told)
+        happened |= {name for name, flag in zip(events.names, told[0].any(0), strict=True) if flag}
+        slides = (here[:, TELEMETRY.index("speed")] > 20.0) & (features[0][:, 1] > SLIDE)
+        happened |= {"fast slide"} if slides.any() else set()
+    assert happened == {*events.names, "fast slide"}
+    assert cars < 5 or varied[changes].all(), "no entry that the mirror changes was always 0"
+
+
+def test_the_place_on_the_lap_has_no_mirror_image():
+    with pytest.raises(
+        ValueError, match=r"need env.curvature=true: without it the observation has the place on the lap"
+    ):
+        racing_mirror_maps(RacingEnv(1, track="ring"))
+
+
+def test_unknown_blocks_are_refused():
+    with pytest.raises(ValueError, match="block 'wind' of the observation has no mirror image: expected one of motion"):
+        mirror_map([Signal("fuel", 1), Signal("wind", 2)])
