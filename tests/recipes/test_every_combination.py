@@ -120,7 +120,7 @@ def test_returns_over_several_steps_are_relabelled_by_the_sum_of_their_features(
 
 
 def test_circuits_that_turn_left_turn_right_in_the_mirror(tmp_path):
-    train = _train("racing_qr_sac", tmp_path, "mirror=1", "impersonation.n=1", "family=resources")
+    train = _train("racing_qr_sac", tmp_path, "mirror=1", "impersonation.n=1", "n_steps=1", "family=resources")
     assert train.learner.updates > 0
     bends = train.replay.sample(16)["observation"][..., -COURSE_POINTS:]  # curvature of a ring and an oval
     assert (bends <= 0).all() and (bends < 0).any()
