@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -161,14 +163,16 @@ def memory_of(env: RacingEnv) -> Tensor:
     return torch.cat([rows, torch.stack(seen)], dim=1)
 
 
-def racing_web(space: StyleSpace, family: str, make_env: Callable[..., RacingEnv]) -> StepPart:
+def racing_web(space: StyleSpace, family: str, make_env: Callable[..., RacingEnv], **options: Any) -> StepPart:
     """Return the part of the page of a car that is alone.
 
     Args:
         space: The agent's style space.
         family: Name of the family, "drift" or "resources".
         make_env: Function that makes the environment in which the agent is shown.
+        **options: Its options that differ, such as `track`.
     """
+    make_env = partial(make_env, **options)
     env = make_env(num_envs=1, seed=0)
     env.reset()
     size, track = CarSize.of(env.garage.car), env.tracks[0]

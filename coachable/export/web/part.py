@@ -1,4 +1,4 @@
-"""`WebPart`: what a domain that MuJoCo simulates adds to the page that `coachable export --web` writes."""
+"""`WebPart`: what a domain that MuJoCo simulates adds to the page that `coachable export web` writes."""
 
 from __future__ import annotations
 
@@ -100,6 +100,7 @@ class PagePart:
     """
 
     kind: ClassVar[str]
+    """Name of the page's script, without its ending."""
     packages: ClassVar[tuple[str, ...]]
     """Packages of other projects that the page needs, see `coachable.export.web.pinned_files`."""
 
@@ -148,7 +149,7 @@ class WebPart(PagePart):
         scene: How the model is drawn.
     """
 
-    kind = "simulation"
+    kind = "simulated"
     packages = ("@mujoco/mujoco", "onnxruntime-web", "three")
 
     dynamics: str

@@ -132,7 +132,7 @@ def test_the_car_slides_when_asked_to_and_not_otherwise(drive_steps):
 
 def test_the_manifest_has_the_constants_of_the_environment(stepped_site):
     manifest = json.loads((stepped_site / "manifest.json").read_text())
-    assert manifest["kind"] == "steps" and len(manifest["starts"]) == 8
+    assert manifest["kind"] == "stepped" and len(manifest["starts"]) == 8
     assert manifest["physics"] == {"control_step": 0.1, "substeps": 10, "episode_steps": 1500, "track": "ridge"}
     assert sum(file.stat().st_size for file in stepped_site.rglob("*") if file.is_file()) < 25e6
     assert not (stepped_site / "third_party" / "@mujoco").exists()
@@ -151,4 +151,6 @@ def test_a_page_has_the_circuit_and_the_observation_of_its_training():
     assert domain.make_web is not None
     part = domain.make_web(domain.make_space())
     assert part.physics["track"] == "ring"
+    moved = domain.with_options({"track": "lakeside"})
+    assert moved.make_web is not None and moved.make_web(domain.make_space()).physics["track"] == "lakeside"
     assert len(part.starts[0]["observation"]) == sum(group.width for group in domain.observation_groups)
