@@ -46,6 +46,8 @@ OPENS = {
     "drift": {"slip_angle_rear": 3.0, "slip_ratio_rear": 3.0},
     "resources": {"overtake": 1.0, "defend": 1.0, "tire": 0.0, "fuel": 0.0},
 }
+IDLE = {"resources": ("overtake", "defend")}
+IDLE_NOTES = {"resources": "No other car drives here, so there are no sliders for overtaking and defending."}
 _COMMON = (
     Measure("pace", "", "pace along the track", "m/s", digits=1),
     Measure("off", "", "off the track", share=True),
@@ -189,6 +191,8 @@ def racing_web(space: StyleSpace, family: str, make_env: Callable[..., RacingEnv
         },
         terminated="retired",
         opens=OPENS[family],
+        idle=IDLE.get(family, ()),
+        idle_note=IDLE_NOTES.get(family, ""),
         picture="The car on its circuit, seen from behind",
         window=10.0,
         steps=racing_steps(env, family, space.default[None]),

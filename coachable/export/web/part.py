@@ -97,6 +97,8 @@ class PagePart:
         picture: What the picture shows, for those who do not see it.
         licence: Notice that the licence of the model asks for, or "" for none.
         window: Time over which shares and means are taken [s].
+        idle: Parameters that nothing on the page depends on. They have no slider and stay at what `opens` has.
+        idle_note: Sentence that says so, with the reason.
     """
 
     kind: ClassVar[str]
@@ -114,6 +116,8 @@ class PagePart:
     picture: str = "The agent"
     licence: str = ""
     window: float = 3.0
+    idle: Sequence[str] = ()
+    idle_note: str = ""
 
     def files(self) -> dict[str, bytes]:
         """Return the files of the page beside the policy, by name.

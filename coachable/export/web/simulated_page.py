@@ -187,6 +187,8 @@ def manifest_of(agent: LoadedPolicy, part: PagePart) -> dict[str, Any]:
         "presets": {name: dict(style) for name, style in domain.words.presets.items()},
         "controls": controls,
         "opens": dict(part.opens),
+        "idle": list(part.idle),
+        "idle_note": part.idle_note,
         "names": dict(domain.words.names),
         "measures": [vars(measure) for measure in part.measures],
         "window": part.window,
