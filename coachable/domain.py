@@ -240,7 +240,7 @@ class Domain:
         make_stage: `() -> coachable.scene.frame.Stage`, the scene that the page shows in 3-D; None shows the renderer's
             pictures.
         make_web: `(space, ...) -> coachable.export.web.part.PagePart`, for a page on which the agent acts in the
-            browser; it takes the `env_options`, too. None if the simulation cannot run there: the page plays recordings.
+            browser; it takes the `env_options`, too. None if the simulation cannot run there: pages play recordings.
         recorded: What such a page plays.
         grid: Values of each style parameter, of which the evaluation grid has all combinations, or a list of styles by
             parameter name. By default a few values over each parameter's evaluation range.

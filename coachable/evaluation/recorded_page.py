@@ -24,7 +24,7 @@ from coachable.keys import TASK_REWARD
 from coachable.scene.frame import Frame, Stage
 from coachable.scene.palette import css
 from coachable.scene.recorded import encode_backdrop, encode_frames
-from coachable.styles import Choice, StyleSpace
+from coachable.styles import Choice, StyleSpace, Weight
 from coachable.training.rollout import Rollout
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
@@ -219,6 +219,7 @@ def _manifest(agent: LoadedPolicy, domain: Domain, requests: list[dict[str, Any]
                 "name": parameter.name,
                 "text": domain.words.name(parameter.name),
                 "kind": "choice" if isinstance(parameter, Choice) else "number",
+                "weight": isinstance(parameter, Weight),
                 "unit": getattr(parameter, "unit", ""),
                 "help": parameter.help,
                 "values": values[parameter.name] if isinstance(parameter, Choice) else sorted(values[parameter.name]),

@@ -145,6 +145,14 @@ def test_traffic_and_pools_of_cars_are_recorded(env):
     assert load_domain("racing_aggressiveness").make_web is None
 
 
+def test_a_car_that_is_alone_is_not_asked_to_overtake():
+    domain = load_domain("racing_resources")
+    assert domain.make_web is not None
+    part = domain.make_web(domain.make_space())
+    assert set(part.idle) == {"overtake", "defend"} and "No other car" in part.idle_note
+    assert not {measure.parameter for measure in part.measures} & set(part.idle)
+
+
 def test_a_page_has_the_circuit_and_the_observation_of_its_training():
     settings = {"track": "ring", "course_points": 5, "curvature": True}
     domain = load_domain("racing_drift", {"env": settings})
