@@ -48,7 +48,7 @@ class SceneRenderer:
     def __init__(self, make_stage: Callable[[], Stage], width: int = 640, height: int = 480) -> None:
         self._stage, self._size = make_stage(), (width, height)
         self._finer = _FINER if _FINER * max(width, height) <= _FINEST else 1
-        self._line = max(10, width // 50)  # [px], height of the text
+        self._line = max(12, width // 50)  # [px], height of the text; the spaces of smaller letters vanish
         self._font = ImageFont.load_default(size=self._line)
         self._strip = 0  # [px], height of the gauges below the scene
         self._place: Hashable = None
@@ -193,11 +193,11 @@ class SceneRenderer:
     def _strip_of(self, frame: Frame) -> int:
         """Return the height of the gauges below a narrow scene [px]; 0 where they fit into its corner."""
         rows = -(-len(frame.gauges) // _COLUMNS)
-        return rows * (self._line + 8) + 4 if rows and self._size[0] < _NARROW else 0
+        return rows * (self._line + 6) + 4 if rows and self._size[0] < _NARROW else 0
 
     def _draw_strip(self, pen: ImageDraw.ImageDraw, gauges: Sequence[Gauge]) -> None:
         """Write the gauges below the scene: names and texts, with thin bars below them."""
-        gap, line, width = 6, self._line + 8, self._size[0] / _COLUMNS
+        gap, line, width = 6, self._line + 6, self._size[0] / _COLUMNS
         names = max(pen.textlength(gauge.name, self._font) for gauge in gauges)
         for index, gauge in enumerate(gauges):
             row, column = divmod(index, _COLUMNS)
@@ -209,7 +209,7 @@ class SceneRenderer:
             pen.text((x, middle), gauge.name, fill=mixed(WHITE, INK, 0.3), font=self._font, anchor="lm")
             pen.text((x + names + gap, middle), gauge.text, fill=WHITE, font=fitting, anchor="lm")
             if gauge.share is not None:
-                foot, share = y + line - 5, min(max(gauge.share, 0.0), 1.0)
+                foot, share = y + line - 4, min(max(gauge.share, 0.0), 1.0)
                 pen.rectangle((x, foot, x + share * (width - 2 * gap), foot + 2), fill=gauge.colour)
 
     def _draw_gauges(self, pen: ImageDraw.ImageDraw, gauges: Sequence[Gauge]) -> None:

@@ -93,7 +93,7 @@ def test_gauges_stand_below_a_narrow_scene():
     image = picture(Still(gauges=[*gauges, Gauge("three", "3")]))
     strip = 2 * 18 + 4
     assert np.array_equal(image[: 160 - strip], picture(Still(), 200, 160 - strip))
-    bars = hue(image[160 - strip + 16])
+    bars = hue(image[160 - strip + 18])
     assert (bars[8:94] == 2).all() and (bars[108:150] == 0).all()
 
 
