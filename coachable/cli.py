@@ -271,8 +271,8 @@ def _export(options: argparse.Namespace) -> int:
         size = write(options.source, out, options.assets, env_options=env_options)
         print(f"wrote {out} ({size / 1e6:.1f} MB); see it with: python3 -m http.server --directory {out}")
         return 0
-    for name in [*(["assets"] if options.assets else []), *env_options]:
-        raise ValueError(f"--{name} is for pages: expected coachable export web {options.source}")
+    if of_pages := [*(["assets"] if options.assets else []), *env_options]:
+        raise ValueError(f"--{of_pages[0]} is for pages: expected coachable export web {options.source}")
     from coachable.export.onnx import export
 
     out = options.out or Path("policy.onnx")
@@ -348,7 +348,7 @@ _fps = _number(lambda value: 1.0 <= value <= 60.0, "pictures per second from 1 t
 def _format(text: str) -> str:
     if text not in ("onnx", "web"):
         raise argparse.ArgumentTypeError(
-            f"{text!r}: expected onnx or web before the agent, as in coachable export onnx humanoid"
+            f"{text!r}: expected onnx or web before the agent, as in coachable export onnx {text}"
         )
     return text
 

@@ -14,7 +14,8 @@ export class Panel {
    */
   constructor(form, others, entries, measures, ask, note = "") {
     this.entries = entries.filter(({ idle }) => !idle);
-    measures = measures.filter(({ text }) => text);
+    const names = new Set(this.entries.map(({ name }) => name));
+    measures = measures.filter(({ text }) => text).map((measure) => (names.has(measure.parameter) ? measure : { ...measure, parameter: "" }));
     this.measures = measures;
     this.shown = new Map();
     for (const entry of this.entries) {
