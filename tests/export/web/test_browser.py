@@ -236,7 +236,7 @@ def test_recordings_follow_their_sliders_and_ask_no_other_site(browser, recorded
             wait_for(lambda announced=announced: browser.evaluate(announced), 60)
         assert "fuel=105" in browser.evaluate("location.hash")
         shown = "[...document.querySelectorAll('#gauges div')].filter(gauge => gauge.offsetHeight > 10).length"
-        assert browser.evaluate(shown) == 6
+        wait_for(lambda: browser.evaluate(shown) == 6, 60)  # the first picture may take long
         edges = "['scene', 'gauges'].map(id => document.getElementById(id).getBoundingClientRect())"
         assert browser.evaluate(f"(([scene, gauges]) => scene.bottom <= gauges.top)({edges})")
         browser.evaluate(
