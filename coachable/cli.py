@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = _parser()
     options, further = parser.parse_known_args(arguments)
-    if further and options.command not in ("coach", "evaluate"):
+    if further and options.command not in ("coach", "evaluate", "export"):
         parser.error(f"unrecognized arguments: {' '.join(further)}")
     if further:
         from coachable.coach.page.command import read_env_options
@@ -131,13 +131,14 @@ def _parser() -> argparse.ArgumentParser:
     _add_number(explain, "--states", 16, "of each trajectory")
     _add_rollout(explain)
 
-    export = command("export", _export, "write the policy as one ONNX file, to run it without torch", SOURCE_HELP)
-    target = export.add_mutually_exclusive_group()
-    target.add_argument("--out", type=Path, default=Path("policy.onnx"), help="(default: %(default)s)")
-    text = "write a page instead, on which the agent acts in the visitor's browser, or plays recordings"
-    target.add_argument("--web", type=Path, metavar="FOLDER", help=text)
-    text = "with --web: folder with the files of other projects, like node_modules (default: npm fetches them)"
+    export = command("export", _export, "write a policy as one ONNX file, or a page on which the agent acts")
+    text = "onnx: one file, to run the policy without torch; web: a page for the visitor's browser"
+    export.add_argument("format", type=_format, metavar="FORMAT", help=text)
+    export.add_argument("source", help=SOURCE_HELP)
+    export.add_argument("--out", type=Path, help="(default: the file policy.onnx, or the folder site)")
+    text = "of a page: folder with the files of other projects, like node_modules (default: npm fetches them)"
     export.add_argument("--assets", type=Path, metavar="FOLDER", help=text)
+    export.epilog = f"{ENV_OPTIONS} They are for pages."
 
     verify = command("verify", _verify, "check an exported model, and an environment, against the model's contract")
     verify.add_argument("file", type=Path, help="a file of coachable export")
@@ -258,24 +259,25 @@ def _report(options: argparse.Namespace) -> int:
 
 
 def _export(options: argparse.Namespace) -> int:
-    if options.web is not None:
+    env_options: dict[str, str] = getattr(options, "env_options", {})
+    if options.format == "web":
         from coachable.evaluation.recorded_page import export_recordings
         from coachable.export.web.simulated_page import export_page
         from coachable.training.weights import domain_of, load_policy
 
+        out = options.out or Path("site")
         acts = domain_of(load_policy(options.source)).make_web is not None
         write = export_page if acts else export_recordings
-        size = write(options.source, options.web, options.assets)
-        print(
-            f"wrote {options.web} ({size / 1e6:.1f} MB); see it with: python3 -m http.server --directory {options.web}"
-        )
+        size = write(options.source, out, options.assets, env_options=env_options)
+        print(f"wrote {out} ({size / 1e6:.1f} MB); see it with: python3 -m http.server --directory {out}")
         return 0
-    if options.assets is not None:
-        raise ValueError("--assets is for the page: expected --web FOLDER, too")
+    if of_pages := [*(["assets"] if options.assets else []), *env_options]:
+        raise ValueError(f"--{of_pages[0]} is for pages: expected coachable export web {options.source}")
     from coachable.export.onnx import export
 
-    difference = export(options.source, options.out)
-    print(f"wrote {options.out} ({options.out.stat().st_size / 1e6:.1f} MB), at most {difference:.1g} from torch")
+    out = options.out or Path("policy.onnx")
+    difference = export(options.source, out)
+    print(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB), at most {difference:.1g} from torch")
     return 0
 
 
@@ -341,6 +343,14 @@ def _number(accepted: Callable[[float], bool], expected: str) -> Callable[[str],
 
 _seconds = _number(lambda value: 0.0 < value <= 3600.0, "seconds above 0 and up to 3600")
 _fps = _number(lambda value: 1.0 <= value <= 60.0, "pictures per second from 1 to 60")
+
+
+def _format(text: str) -> str:
+    if text not in ("onnx", "web"):
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: expected onnx or web before the agent, as in coachable export onnx {text}"
+        )
+    return text
 
 
 def _style(text: str) -> dict[str, Any]:

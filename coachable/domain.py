@@ -105,7 +105,7 @@ class Control:
 
 @dataclass(frozen=True)
 class EnvOption:
-    """Option of an environment that `coachable coach` and `coachable evaluate` offer, as `--NAME VALUE`.
+    """Option of an environment that `coachable coach`, `evaluate` and `export web` offer, as `--NAME VALUE`.
 
     Attributes:
         name: Name of the argument of `make_env`, and of the option.
@@ -239,8 +239,8 @@ class Domain:
         make_renderer: `(width, height) -> Renderer`; by default `EnvPictures`, the environment's own pictures.
         make_stage: `() -> coachable.scene.frame.Stage`, the scene that the page shows in 3-D; None shows the renderer's
             pictures.
-        make_web: `(space) -> coachable.export.web.part.PagePart`, for a page on which the agent acts in the browser;
-            None if the simulation cannot run there, so that the page plays recordings.
+        make_web: `(space, ...) -> coachable.export.web.part.PagePart`, for a page on which the agent acts in the
+            browser; it takes the `env_options`, too. None if the simulation cannot run there: pages play recordings.
         recorded: What such a page plays.
         grid: Values of each style parameter, of which the evaluation grid has all combinations, or a list of styles by
             parameter name. By default a few values over each parameter's evaluation range.
@@ -292,7 +292,7 @@ class Domain:
     coached: Mapping[str, Any] = field(default_factory=dict)
     evaluation: Callable[..., str] | None = None
     make_stage: Callable[[], Stage] | None = None
-    make_web: Callable[[StyleSpace], Any] | None = None
+    make_web: Callable[..., Any] | None = None
     recorded: Recorded = field(default_factory=Recorded)
 
     def styled_env(
@@ -332,15 +332,14 @@ class Domain:
         known = {option.name: option for option in self.env_options}
         for name in texts:
             if name not in known:
-                offered = [f"--{option.name} ({option.help})" for option in self.env_options]
-                raise ValueError(
-                    f"{self.name} has no option --{name}: expected {' or '.join(offered) or 'no options of its own'}"
-                )
+                offered = " or ".join(f"--{option.name} ({option.help})" for option in self.env_options)
+                raise ValueError(f"{self.name} has no option --{name}: expected {offered or 'no options of its own'}")
         return {name: known[name].read(text) for name, text in texts.items()}
 
     def with_options(self, options: Mapping[str, Any]) -> Domain:
-        """Return this domain with arguments of `make_env`, such as those from `read_options`."""
-        return replace(self, make_env=partial(self.make_env, **options)) if options else self
+        """Return this domain with arguments of `make_env` and `make_web`, such as those from `read_options`."""
+        make_web = self.make_web and partial(self.make_web, **options)
+        return replace(self, make_env=partial(self.make_env, **options), make_web=make_web)
 
     def cells(self) -> list[dict[str, Any]]:
         """Return the styles of the evaluation grid, by parameter name."""

@@ -37,7 +37,7 @@ NOT_RUN = {
     r"^python benchmarks/": "a benchmark of minutes to hours",
     r"tests\.(random_kills|mutation)": "takes a quarter of an hour or more",
     r"^coachable (evaluate|report) ": "evaluates for minutes",
-    r"^coachable export .*--web": "fetches the page's files from npm",
+    r"^coachable export web": "fetches the page's files from npm",
     r"http\.server": "serves until it is stopped",
     r"domains\.racing\.frontier": "evaluates for minutes",
     r"^coachable render humanoid($| --together)": "draws a film of an episode for about a minute",

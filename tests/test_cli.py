@@ -84,6 +84,9 @@ def test_a_missing_agent_is_named_without_a_traceback(arguments, capsys, tmp_pat
         ("explain x --episodes 1", "--episodes: '1': expected a whole number of at least 2"),
         ("explain x --states 0", "--states: '0': expected a whole number of at least 1"),
         ("curves a=nowhere* --smooth 0", "--smooth: '0': expected a whole number of at least 1"),
+        ("export humanoid", "'humanoid': expected onnx or web before the agent, as in coachable export onnx humanoid"),
+        ("export humanoid --web site", "'humanoid': expected onnx or web before the agent"),
+        ("export web", "required: source"),
         ("dance", "invalid choice: 'dance'"),
         ("", "required: COMMAND"),
     ],
@@ -126,18 +129,18 @@ def test_a_shipped_agent_goes_before_a_folder_that_is_no_run(monkeypatch, tmp_pa
     (tmp_path / "humanoid").mkdir()
     (tmp_path / "humanoid" / "notes.txt").write_text("of my own")
     assert Path(load_policy("humanoid").metadata["source"]).parts[-3:] == ("pretrained", "humanoid", "weights.pt")
-    assert main(["export", "humanoid", "--out", "humanoid.onnx"]) == 0
+    assert main(["export", "onnx", "humanoid", "--out", "humanoid.onnx"]) == 0
     (tmp_path / "humanoid" / "checkpoints").mkdir()  # a run goes before the shipped agent, even if it is not complete
     with pytest.raises(CheckpointError, match="humanoid"):
         load_policy("humanoid")
-    assert main(["export", "humanoid", "--out", "again.onnx"]) == 2
+    assert main(["export", "onnx", "humanoid", "--out", "again.onnx"]) == 2
     assert "humanoid" in capsys.readouterr().err
 
 
 def test_another_file_is_no_agent(capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "README.md").write_text("# Not an agent\n")
-    for command in (["export", "README.md"], ["weights", "README.md", "w.pt"], ["report", "README.md"]):
+    for command in (["export", "onnx", "README.md"], ["weights", "README.md", "w.pt"], ["report", "README.md"]):
         assert main(command) == 2
         error = capsys.readouterr().err
         assert "README.md" in error and error.count("\n") == 1

@@ -128,12 +128,15 @@ def mistake_in(command: list[str]) -> str | None:
 
 
 def mistake_in_options(words: list[str]) -> str | None:
-    """Of `coachable`: a sub-command or an option that neither it nor the domain has."""
+    """Of `coachable`: a sub-command, a format, or an option that neither it nor the domain has."""
     (subcommands,) = (a for a in _parser()._actions if isinstance(a, argparse._SubParsersAction))
     if words[0] not in subcommands.choices:
         return f"there is no sub-command {words[0]}"
+    if words[0] == "export" and words[1:] and words[1] not in ("onnx", "web"):
+        return f"export has no format {words[1]}"
     known = {*subcommands.choices[words[0]]._option_string_actions}
-    for domain in {*words[1:2]} & {*domain_names()} if words[0] in ("coach", "evaluate") else ():
+    source = words[2:3] if words[:2] == ["export", "web"] else words[1:2]
+    for domain in {*source} & {*domain_names()} if words[0] in ("coach", "evaluate", "export") else ():
         known |= {f"--{option.name}" for option in load_domain(domain).env_options}
     options = [word.partition("=")[0] for word in words if word.startswith("--")]
     return next((f"{words[0]} has no option {option}" for option in options if option not in known), None)
@@ -187,6 +190,9 @@ def test_commands_of_recipes_name_what_exists(recipe):
         ("coachable curves a='runs/*' --out x.png", None),
         ("coachable nothing", "there is no sub-command nothing"),
         ("coachable coach humanoid --nothing", "coach has no option --nothing"),
+        ("coachable export web racing_drift --track own.csv", None),
+        ("coachable export web humanoid --track own.csv", "export has no option --track"),
+        ("coachable export humanoid", "export has no format humanoid"),
     ],
 )
 def test_mistakes_are_found(line, mistake):

@@ -1,4 +1,4 @@
-"""`coachable export --web` for simulations that do not run in a browser: a page that plays recorded episodes."""
+"""`coachable export web` for simulations that do not run in a browser: a page that plays recorded episodes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from coachable.keys import TASK_REWARD
 from coachable.scene.frame import Frame, Stage
 from coachable.scene.palette import css
 from coachable.scene.recorded import encode_backdrop, encode_frames
-from coachable.styles import Choice, StyleSpace
+from coachable.styles import Choice, StyleSpace, Weight
 from coachable.training.rollout import Rollout
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
@@ -56,7 +56,13 @@ class Recording:
 
 
 def export_recordings(
-    source: str | Path, out: Path, assets: Path | None = None, *, seed: int = 0, progress: bool = True
+    source: str | Path,
+    out: Path,
+    assets: Path | None = None,
+    *,
+    env_options: Mapping[str, str] | None = None,
+    seed: int = 0,
+    progress: bool = True,
 ) -> int:
     """Write a page that plays one recorded episode of an agent in each style of a grid.
 
@@ -66,6 +72,7 @@ def export_recordings(
         source: Checkpoint, run folder, weights file, exported model, or the name of a domain that ships with weights.
         out: Folder to write into; files of the same names are replaced.
         assets: Folder with the files of other projects, see `coachable.export.web.pinned_files.provide`.
+        env_options: Options of the domain's environment as texts, see `Domain.env_options`.
         seed: Seed of the start and of sampled actions.
         progress: Whether to show a progress bar.
 
@@ -73,12 +80,14 @@ def export_recordings(
         Size of all files of the page [byte].
 
     Raises:
-        ValueError: If the agent's domain has no scene, more than `MOST` styles, or names an unknown measure.
+        ValueError: If the agent's domain has no scene, more than `MOST` styles, or names an unknown measure; if it has
+            no such option, or not with such a value.
         CheckpointError: If the source does not hold a usable policy.
         OSError: If the files of other projects cannot be fetched, or writing fails.
     """
     agent = load_policy(source)
     domain = domain_of(agent)
+    domain = domain.with_options(domain.read_options(env_options or {}))
     if domain.make_stage is None:
         raise ValueError(
             f"the domain {domain.name} has neither a simulation for the browser nor a scene: expected one that "
@@ -202,7 +211,7 @@ def _manifest(agent: LoadedPolicy, domain: Domain, requests: list[dict[str, Any]
     values = {name: list(dict.fromkeys(request[name] for request in requests)) for name in agent.space.names}
     return {
         **about(agent),
-        "kind": "recordings",
+        "kind": "recorded",
         "title": told.title or f"An agent that you coach: {readable(domain.name)}",
         "summary": told.summary,
         "parameters": [
@@ -210,6 +219,7 @@ def _manifest(agent: LoadedPolicy, domain: Domain, requests: list[dict[str, Any]
                 "name": parameter.name,
                 "text": domain.words.name(parameter.name),
                 "kind": "choice" if isinstance(parameter, Choice) else "number",
+                "weight": isinstance(parameter, Weight),
                 "unit": getattr(parameter, "unit", ""),
                 "help": parameter.help,
                 "values": values[parameter.name] if isinstance(parameter, Choice) else sorted(values[parameter.name]),

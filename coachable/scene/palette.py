@@ -26,6 +26,9 @@ INK: Colour = (34, 37, 43)
 AIR: Colour = (214, 224, 234)
 HAZE: Colour = (195, 202, 210)
 """Sky above, and at the horizon, where what is far fades."""
+NIGHT_AIR: Colour = (16, 22, 31)
+NIGHT_HAZE: Colour = (30, 38, 48)
+"""The same where the page is dark."""
 
 REQUESTED, MEASURED = (10, 122, 186), VERMILION
 """What was asked for and what was measured, in charts and scenes; the blue is lighter, for the dark page."""

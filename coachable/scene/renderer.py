@@ -22,7 +22,8 @@ _GEOMS = {
     CYLINDER: mujoco.mjtGeom.mjGEOM_CYLINDER,
     SECTOR: mujoco.mjtGeom.mjGEOM_TRIANGLE,  # several of them
 }
-_NARROW, _FEW = 480, 4  # [px], width below which only the first gauges are drawn, and how many
+_NARROW, _COLUMNS = 480, 2  # [px], width below which the gauges stand in columns below the scene
+_SMALLEST = 6  # [px], height of the text below which it is not made smaller
 _BAR = 0.26  # of the width, least length of a gauge's bar
 GLOW = 0.45  # opacity of the translucent primitives
 _MOST = 4000  # primitives
@@ -47,8 +48,9 @@ class SceneRenderer:
     def __init__(self, make_stage: Callable[[], Stage], width: int = 640, height: int = 480) -> None:
         self._stage, self._size = make_stage(), (width, height)
         self._finer = _FINER if _FINER * max(width, height) <= _FINEST else 1
-        self._line = max(10, width // 50)  # [px], height of the text
+        self._line = max(12, width // 50)  # [px], height of the text; the spaces of smaller letters vanish
         self._font = ImageFont.load_default(size=self._line)
+        self._strip = 0  # [px], height of the gauges below the scene
         self._place: Hashable = None
         self._offscreen: OffscreenMujoco | None = None
         self._last: Frame | None = None
@@ -86,7 +88,9 @@ class SceneRenderer:
         """
         frame, last = self._stage.frame(env, row, asked), self._last
         self._last = frame
-        if shares and frame.place != self._place:
+        strip = self._strip_of(frame)
+        if shares and (frame.place, strip) != (self._place, self._strip):
+            self._strip = strip
             self._build(self._stage.backdrop(env, row))
             self._place = frame.place
         if last is None or not continues(last, frame):
@@ -109,7 +113,7 @@ class SceneRenderer:
         """Compile a model of what does not move."""
         self.close()
         spec = mujoco.MjSpec()
-        width, height = (self._finer * side for side in self._size)
+        width, height = self._finer * self._size[0], self._finer * self._height
         spec.visual.global_.offwidth, spec.visual.global_.offheight = width, height
         spec.visual.quality.offsamples = 0
         spec.visual.global_.fovy = _FIELD
@@ -173,8 +177,40 @@ class SceneRenderer:
             self._write(pen, label.text, self._seen(np.asarray(label.position, dtype=float), frame))
         if frame.map is not None:
             self._draw_map(pen, frame.map)
-        self._draw_gauges(pen, frame.gauges if self._size[0] >= _NARROW else frame.gauges[:_FEW])
+        if self._strip:
+            whole = Image.new("RGB", self._size, INK)
+            whole.paste(image)
+            self._draw_strip(ImageDraw.Draw(whole), frame.gauges)
+            return np.asarray(whole)
+        self._draw_gauges(pen, frame.gauges)
         return np.asarray(image)
+
+    @property
+    def _height(self) -> int:
+        """Height of the scene [px]."""
+        return self._size[1] - self._strip
+
+    def _strip_of(self, frame: Frame) -> int:
+        """Return the height of the gauges below a narrow scene [px]; 0 where they fit into its corner."""
+        rows = -(-len(frame.gauges) // _COLUMNS)
+        return rows * (self._line + 6) + 4 if rows and self._size[0] < _NARROW else 0
+
+    def _draw_strip(self, pen: ImageDraw.ImageDraw, gauges: Sequence[Gauge]) -> None:
+        """Write the gauges below the scene: names and texts, with thin bars below them."""
+        gap, line, width = 6, self._line + 6, self._size[0] / _COLUMNS
+        names = max(pen.textlength(gauge.name, self._font) for gauge in gauges)
+        for index, gauge in enumerate(gauges):
+            row, column = divmod(index, _COLUMNS)
+            x, y = gap + column * width, self._height + 3 + row * line
+            room = width - names - 3 * gap
+            fonts = [self._font, *(ImageFont.load_default(size=size) for size in range(self._line - 1, _SMALLEST, -1))]
+            fitting = next((font for font in fonts if pen.textlength(gauge.text, font) <= room), fonts[-1])
+            middle = y + line / 2 - 3
+            pen.text((x, middle), gauge.name, fill=mixed(WHITE, INK, 0.3), font=self._font, anchor="lm")
+            pen.text((x + names + gap, middle), gauge.text, fill=WHITE, font=fitting, anchor="lm")
+            if gauge.share is not None:
+                foot, share = y + line - 4, min(max(gauge.share, 0.0), 1.0)
+                pen.rectangle((x, foot, x + share * (width - 2 * gap), foot + 2), fill=gauge.colour)
 
     def _draw_gauges(self, pen: ImageDraw.ImageDraw, gauges: Sequence[Gauge]) -> None:
         """Write the gauges into the lower left corner: names, and texts on their bars, in columns as wide as needed."""
@@ -198,7 +234,7 @@ class SceneRenderer:
             pen.text((left + gap, middle), gauge.text, stroke_width=1, stroke_fill=(*INK, 255), **style)
 
     def _draw_map(self, pen: ImageDraw.ImageDraw, small: Map) -> None:
-        side = 0.26 * self._size[1]
+        side = 0.26 * self._height
         corner = np.array([self._size[0] - side, 0.0])
         pen.rectangle((*corner, self._size[0], side), fill=(*INK, 120))
         outline, places = small.scaled(side, side)
@@ -224,9 +260,9 @@ class SceneRenderer:
         depth = -offset @ back
         if depth < 0.1:
             return None
-        scale = 0.5 * self._size[1] / math.tan(math.radians(_FIELD) / 2) / float(depth)
+        scale = 0.5 * self._height / math.tan(math.radians(_FIELD) / 2) / float(depth)
         across, upwards = float(offset @ right), float(offset @ np.cross(back, right))
-        return self._size[0] / 2 + scale * across, self._size[1] / 2 - scale * upwards
+        return self._size[0] / 2 + scale * across, self._height / 2 - scale * upwards
 
 
 def _decorate(scene: mujoco.MjvScene, frame: Frame) -> None:

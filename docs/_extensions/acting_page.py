@@ -8,7 +8,7 @@ The directive `acting-page` takes the name of an agent, a title as its option, a
     ![The walker](walker.png)
     :::
 
-The page of `coachable export AGENT --web` is written into the built site, at `AGENT/index.html`, and shown within a
+The page of `coachable export web AGENT` is written into the built site, at `AGENT/index.html`, and shown within a
 frame. The picture stands in its place where no page can be: in other formats than HTML, in browsers without JavaScript,
 and everywhere if the build cannot get the files of other projects that the page needs. The build says so.
 """

@@ -41,7 +41,7 @@ def test_the_page_tells_what_the_evaluation_measures(changed, tmp_path):
     written = [file for file in out.rglob("*") if file.is_file()]
     assert size == sum(file.stat().st_size for file in written) < 1e6
     manifest = json.loads((out / "manifest.json").read_text())
-    assert manifest["kind"] == "recordings" and manifest["domain"] == NAME
+    assert manifest["kind"] == "recorded" and manifest["domain"] == NAME
     assert [row["style"] for row in manifest["recordings"]] == domain.recorded_cells()
     for download in manifest["downloads"]:
         assert (out / download["file"]).stat().st_size == download["bytes"]
@@ -78,7 +78,7 @@ def test_all_recordings_of_a_race_begin_at_the_same_place(changed, tmp_path):
 
 def test_a_domain_without_scene_or_simulation_for_the_browser_says_so(changed, tmp_path, capsys):
     changed(make_stage=None)
-    assert main(["export", "racing_traffic", "--web", str(tmp_path / "site")]) == 2
+    assert main(["export", "web", "racing_traffic", "--out", str(tmp_path / "site")]) == 2
     error = capsys.readouterr().err
     assert "neither a simulation for the browser nor a scene" in error and error.count("\n") == 1
     assert not (tmp_path / "site").exists()

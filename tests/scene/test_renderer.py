@@ -34,12 +34,12 @@ class Still:
         return Frame(parts, (0.0, 0.0, 0.0), 0.0, place="here", **self.further)
 
 
-def picture(stage):
-    renderer = SceneRenderer(lambda: stage, 200, 160)
+def picture(stage, width=200, height=160):
+    renderer = SceneRenderer(lambda: stage, width, height)
     image = renderer.draw(None).astype(int)
     again = renderer.draw(None)
     renderer.close()
-    assert image.shape == (160, 200, 3) and np.array_equal(image, again)
+    assert image.shape == (height, width, 3) and np.array_equal(image, again)
     return image
 
 
@@ -82,10 +82,19 @@ def test_states_between_two_steps_are_drawn():
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_the_bar_of_a_gauge_is_as_long_as_its_share(share):
-    image = picture(Still(gauges=[Gauge("", "", share, BLUE)]))
-    row = image[150]
+    image = picture(Still(gauges=[Gauge("", "", share, BLUE)]), 500, 400)
+    row = image[390]
     blue = np.flatnonzero((row[:, 2] > 150) & (row[:, 0] < 60) & (row[:, 1] < 60))
-    assert len(blue) == pytest.approx(share * 0.26 * 200, abs=2)
+    assert len(blue) == pytest.approx(share * 0.26 * 500, abs=2)
+
+
+def test_gauges_stand_below_a_narrow_scene():
+    gauges = [Gauge("one", "1", 1.0, BLUE), Gauge("two", "a text that is too long for its column", 0.5, RED)]
+    image = picture(Still(gauges=[*gauges, Gauge("three", "3")]))
+    strip = 2 * 18 + 4
+    assert np.array_equal(image[: 160 - strip], picture(Still(), 200, 160 - strip))
+    bars = hue(image[160 - strip + 18])
+    assert (bars[8:94] == 2).all() and (bars[108:150] == 0).all()
 
 
 def test_the_map_is_in_the_corner():

@@ -12,8 +12,10 @@ from websockets.http11 import Response
 from coachable.scene.look import FONT, TITLE, icon_link, stylesheet
 from coachable.scene.palette import INK, WHITE, css
 
-# viser shows the page in dark colours if the address says so. The browser's own setting decides here. The scene, which
-# all browsers share, is dimmed in the browsers that are dark.
+DAY, NIGHT = "light", "dark"  # the buttons that change the scene in one browser
+
+# viser shows the page in dark colours if the address says so. The browser's own setting decides here. A dark browser
+# presses the button for a dark scene as soon as there is one; what has no scene, such as pictures, is dimmed.
 _SCRIPT = """
 (() => {
   const asked = new URLSearchParams(location.search);
@@ -22,15 +24,25 @@ _SCRIPT = """
     asked.set("darkMode", "");
     history.replaceState(null, "", "?" + asked);
   }
-  document.documentElement.classList.toggle("dark", asked.has("darkMode"));
+  const page = document.documentElement.classList;
+  page.toggle("dark", asked.has("darkMode"));
+  const press = page.contains("dark") && setInterval(() => {
+    const buttons = [...document.querySelectorAll("button")];
+    const text = (button) => button?.textContent.trim();
+    const night = buttons.find((button, i) => text(button) === "NIGHT" && text(buttons[i - 1]) === "DAY");
+    if (!night) return;
+    night.click();
+    page.add("lit");
+    clearInterval(press);
+  }, 500);
 })();
-"""
+""".replace("NIGHT", NIGHT).replace("DAY", DAY)
 
 _STYLE = (
     """
 :root { --mantine-font-family: FONT !important; --mantine-font-family-headings: FONT !important; }
 body { font-family: FONT !important; }
-.dark canvas:not(.u-wrap *) { filter: brightness(0.6) contrast(1.1); }
+.dark:not(.lit) canvas:not(.u-wrap *) { filter: brightness(0.6) contrast(1.1); }
 .gauges {
   position: fixed; left: 12px; bottom: 12px; z-index: 5; pointer-events: none; min-width: 15em; padding: 6px 10px;
   border-radius: 8px; background: INKc7; color: WHITE; font: 13px/1.6 FONT;

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from coachable.coach.page.looks import DAY, NIGHT
 from coachable.coach.session.session import CoachSession
 from coachable.scene.between import between, continues
 from coachable.scene.frame import Frame, Map, Stage, Viewpoint
-from coachable.scene.palette import AIR, HAZE, css
+from coachable.scene.palette import AIR, HAZE, NIGHT_AIR, NIGHT_HAZE, css
 from coachable.scene.parts import SHAPES, Batch, Parts, about_z, rotated, unit_mesh
 from coachable.scene.renderer import GLOW
 
@@ -23,7 +24,8 @@ if TYPE_CHECKING:
 
 PHONE = 576  # [px]; in narrower windows viser's panel covers the lower right
 FOLLOW, TURN, STAY = "follow", "follow and turn", "stay"
-_EVEN, _DIRECTED = 1.5, 1.4  # brightness of the lights
+_LIGHTS = {DAY: (1.5, 1.4), NIGHT: (0.45, 0.75)}  # brightness of the even and of the directed light
+_SKIES = {DAY: (AIR, HAZE), NIGHT: (NIGHT_AIR, NIGHT_HAZE)}
 _ROOT, _MOVING = "/scene", "/scene/moving"
 _FARTHER = 2.2  # factor on the camera's distance in narrow windows
 _LABELS = 12
@@ -46,6 +48,7 @@ class SceneView:
         frame: The frame of the last update.
         overlay: HTML that is laid over the scene.
         mode: Dropdown of what the camera does.
+        brightness: Buttons that make the scene light or dark in the browser that presses them.
     """
 
     def __init__(self, server: viser.ViserServer, session: CoachSession, stage: Stage) -> None:
@@ -63,8 +66,9 @@ class SceneView:
         }
         self.overlay = ""
         server.scene.set_up_direction("+z")
-        _light(server)
-        _surround(server, stage.viewpoint)
+        server.scene.configure_default_lights(enabled=False, cast_shadow=False)
+        server.scene.configure_environment_map(None)
+        _light(server.scene, stage.viewpoint, DAY)
         self._root = server.scene.add_frame(_ROOT, show_axes=False)
         self._moving = server.scene.add_frame(_MOVING, show_axes=False)
         self._ground = server.scene.add_frame(f"{_ROOT}/ground", show_axes=False)
@@ -74,6 +78,8 @@ class SceneView:
         ]
         modes = (TURN, FOLLOW, STAY) if stage.viewpoint.turns else (FOLLOW, TURN, STAY)
         self.mode = server.gui.add_dropdown("camera", modes, hint="drag to look around; the wheel zooms")
+        self.brightness = server.gui.add_button_group("scene", (DAY, NIGHT), hint="in this browser")
+        self.brightness.on_click(self._change_brightness)
         server.gui.add_html(_legend(stage))
         self._look(stage.viewpoint)
 
@@ -101,6 +107,10 @@ class SceneView:
 
     def close(self) -> None:
         """See `View.close`."""
+
+    def _change_brightness(self, event: viser.GuiEvent) -> None:
+        if event.client is not None and event.target.value in _LIGHTS:
+            _light(event.client.scene, self._stage.viewpoint, event.target.value)
 
     def _show(self, frame: Frame) -> None:
         focus = np.array([*frame.focus[:2], 0.0])
@@ -272,21 +282,25 @@ def _map_html(small: Map) -> str:
     )
 
 
-def _light(server: viser.ViserServer) -> None:
-    """Light the scene by an even and a directed light; shadows are several times slower without a graphics card."""
-    server.scene.configure_default_lights(enabled=False, cast_shadow=False)
-    server.scene.configure_environment_map(None)
-    server.scene.add_light_hemisphere("/sky", sky_color=(255, 255, 255), ground_color=(150, 150, 155), intensity=_EVEN)
-    server.scene.add_light_directional("/sun", intensity=_DIRECTED, position=(-4.0, -3.0, 9.0))
+def _light(scene: viser.SceneApi, view: Viewpoint, brightness: str) -> None:
+    """Set the lights, and a sky into which distant objects fade.
 
+    There is an even and a directed light; shadows are several times slower without a graphics card.
 
-def _surround(server: viser.ViserServer, view: Viewpoint) -> None:
-    """Show a sky into which distant objects fade."""
-    red, green, blue = _LINEAR[list(HAZE)].tolist()
-    server.scene.configure_fog(*view.haze, color=(red, green, blue))
+    Args:
+        scene: The scene of all browsers, or of one.
+        view: The stage's viewpoint.
+        brightness: `DAY` or `NIGHT`.
+    """
+    even, directed = _LIGHTS[brightness]
+    air, haze = _SKIES[brightness]
+    scene.add_light_hemisphere("/sky", sky_color=(255, 255, 255), ground_color=(150, 150, 155), intensity=even)
+    scene.add_light_directional("/sun", intensity=directed, position=(-4.0, -3.0, 9.0))
+    red, green, blue = _LINEAR[list(haze)].tolist()
+    scene.configure_fog(*view.haze, color=(red, green, blue))
     share = np.clip(np.linspace(0.0, 2.0, 64), 0.0, 1.0)[:, None, None]
-    sky = np.array(AIR) + share * np.subtract(HAZE, AIR)
-    server.scene.set_background_image(np.repeat(sky, 8, axis=1).round().astype(np.uint8), format="png")
+    sky = np.array(air) + share * np.subtract(haze, air)
+    scene.set_background_image(np.repeat(sky, 8, axis=1).round().astype(np.uint8), format="png")
 
 
 def _legend(stage: Stage) -> str:

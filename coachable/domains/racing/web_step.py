@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -44,6 +46,8 @@ OPENS = {
     "drift": {"slip_angle_rear": 3.0, "slip_ratio_rear": 3.0},
     "resources": {"overtake": 1.0, "defend": 1.0, "tire": 0.0, "fuel": 0.0},
 }
+IDLE = {"resources": ("overtake", "defend")}
+IDLE_NOTES = {"resources": "No other car drives here, so there are no sliders for overtaking and defending."}
 _COMMON = (
     Measure("pace", "", "pace along the track", "m/s", digits=1),
     Measure("off", "", "off the track", share=True),
@@ -161,14 +165,16 @@ def memory_of(env: RacingEnv) -> Tensor:
     return torch.cat([rows, torch.stack(seen)], dim=1)
 
 
-def racing_web(space: StyleSpace, family: str, make_env: Callable[..., RacingEnv]) -> StepPart:
+def racing_web(space: StyleSpace, family: str, make_env: Callable[..., RacingEnv], **options: Any) -> StepPart:
     """Return the part of the page of a car that is alone.
 
     Args:
         space: The agent's style space.
         family: Name of the family, "drift" or "resources".
         make_env: Function that makes the environment in which the agent is shown.
+        **options: Its options that differ, such as `track`.
     """
+    make_env = partial(make_env, **options)
     env = make_env(num_envs=1, seed=0)
     env.reset()
     size, track = CarSize.of(env.garage.car), env.tracks[0]
@@ -185,6 +191,8 @@ def racing_web(space: StyleSpace, family: str, make_env: Callable[..., RacingEnv
         },
         terminated="retired",
         opens=OPENS[family],
+        idle=IDLE.get(family, ()),
+        idle_note=IDLE_NOTES.get(family, ""),
         picture="The car on its circuit, seen from behind",
         window=10.0,
         steps=racing_steps(env, family, space.default[None]),

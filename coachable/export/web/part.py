@@ -1,4 +1,4 @@
-"""`WebPart`: what a domain that MuJoCo simulates adds to the page that `coachable export --web` writes."""
+"""`WebPart`: what a domain that MuJoCo simulates adds to the page that `coachable export web` writes."""
 
 from __future__ import annotations
 
@@ -97,9 +97,12 @@ class PagePart:
         picture: What the picture shows, for those who do not see it.
         licence: Notice that the licence of the model asks for, or "" for none.
         window: Time over which shares and means are taken [s].
+        idle: Parameters that nothing on the page depends on. They have no slider and stay at what `opens` has.
+        idle_note: Sentence that says so, with the reason.
     """
 
     kind: ClassVar[str]
+    """Name of the page's script, without its ending."""
     packages: ClassVar[tuple[str, ...]]
     """Packages of other projects that the page needs, see `coachable.export.web.pinned_files`."""
 
@@ -113,6 +116,8 @@ class PagePart:
     picture: str = "The agent"
     licence: str = ""
     window: float = 3.0
+    idle: Sequence[str] = ()
+    idle_note: str = ""
 
     def files(self) -> dict[str, bytes]:
         """Return the files of the page beside the policy, by name.
@@ -148,7 +153,7 @@ class WebPart(PagePart):
         scene: How the model is drawn.
     """
 
-    kind = "simulation"
+    kind = "simulated"
     packages = ("@mujoco/mujoco", "onnxruntime-web", "three")
 
     dynamics: str

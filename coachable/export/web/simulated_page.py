@@ -1,4 +1,4 @@
-"""`coachable export --web`: write a folder that any static host serves, in which an agent acts in the browser."""
+"""`coachable export web`: write a folder that any static host serves, in which an agent acts in the browser."""
 
 from __future__ import annotations
 
@@ -27,10 +27,16 @@ SCHEMA_VERSION = 1
 _POLICY = "policy.onnx"
 _VENDORED = "third_party"
 _PRELOADS = "<!-- preloads -->"
-_SCRIPTS = {"recordings": "recorded.js", "simulation": "simulated.js", "steps": "stepped.js"}  # as in main.js
 
 
-def export_page(source: str | Path, out: Path, assets: Path | None = None, *, home: str | None = None) -> int:
+def export_page(
+    source: str | Path,
+    out: Path,
+    assets: Path | None = None,
+    *,
+    env_options: Mapping[str, str] | None = None,
+    home: str | None = None,
+) -> int:
     """Write the page of an agent.
 
     The folder contains the page's own files, the policy as ONNX, the physics as XML or ONNX, `manifest.json` with
@@ -40,6 +46,7 @@ def export_page(source: str | Path, out: Path, assets: Path | None = None, *, ho
         source: Checkpoint, run folder, weights file, or the name of a domain that ships with weights.
         out: Folder to write into; files of the same names are replaced.
         assets: Folder with the files of other projects, see `coachable.export.web.pinned_files.provide`.
+        env_options: Options of the domain's environment as texts, see `Domain.env_options`.
         home: Address of the documentation, to which the page links; by default the one that `home_page` finds.
 
     Returns:
@@ -47,13 +54,13 @@ def export_page(source: str | Path, out: Path, assets: Path | None = None, *, ho
 
     Raises:
         ImportError: If the extra `export` is not installed.
-        ValueError: If the agent's domain has no page.
+        ValueError: If the agent's domain has no page, no such option, or not with such a value.
         CheckpointError: If the source does not hold a usable policy.
         OSError: If the files of other projects cannot be fetched, or writing fails.
     """
     import_onnx()
     agent = load_policy(source)
-    part = _part_of(agent)
+    part = _part_of(agent, env_options or {})
     if out.exists() and not out.is_dir():
         raise NotADirectoryError(f"{out} is a file: expected a folder, or a name that is free")
     vendored = provide(assets, *part.packages)
@@ -111,7 +118,7 @@ def finish_page(out: Path, manifest: dict[str, Any], data: Sequence[str], vendor
 
 def _name_preloads(out: Path, manifest: Mapping[str, Any], vendored: Mapping[str, Path]) -> None:
     """Name in `index.html` what its scripts will ask for, so that the browser fetches everything at once."""
-    modules = [_SCRIPTS[manifest["kind"]]]
+    modules = [f"{manifest['kind']}.js"]
     for name in modules:  # which grows
         imported = re.findall(r'"\./(\w+\.js)"', (out / name).read_text(encoding="utf-8"))
         modules += [other for other in dict.fromkeys(imported) if other not in modules]
@@ -180,6 +187,8 @@ def manifest_of(agent: LoadedPolicy, part: PagePart) -> dict[str, Any]:
         "presets": {name: dict(style) for name, style in domain.words.presets.items()},
         "controls": controls,
         "opens": dict(part.opens),
+        "idle": list(part.idle),
+        "idle_note": part.idle_note,
         "names": dict(domain.words.names),
         "measures": [vars(measure) for measure in part.measures],
         "window": part.window,
@@ -192,8 +201,9 @@ def manifest_of(agent: LoadedPolicy, part: PagePart) -> dict[str, Any]:
     }
 
 
-def _part_of(agent: LoadedPolicy) -> PagePart:
+def _part_of(agent: LoadedPolicy, env_options: Mapping[str, str]) -> PagePart:
     domain = domain_of(agent)
+    domain = domain.with_options(domain.read_options(env_options))
     if domain.make_web is None:
         raise ValueError(f"the domain {domain.name} has no page for the browser: expected one that declares `make_web`")
     return domain.make_web(agent.space)

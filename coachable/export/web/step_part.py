@@ -1,4 +1,4 @@
-"""`StepPart`: what a domain whose own step is exported adds to the page that `coachable export --web` writes."""
+"""`StepPart`: what a domain whose own step is exported adds to the page that `coachable export web` writes."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class StepPart(PagePart):
         map: Small map with one place, or None.
     """
 
-    kind = "steps"
+    kind = "stepped"
     packages = ("onnxruntime-web", "three")
 
     steps: Steps

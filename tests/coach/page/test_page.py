@@ -196,7 +196,8 @@ def test_the_page_has_its_own_title_and_icon(server):
         head = text[: text.index("</title>")]
         assert head.endswith("<title>coachable") and icon_link() in head and "Viser" not in head
         assert "prefers-color-scheme: dark" in text and ".gauges {" in text
-        assert ".dark canvas:not(.u-wrap *) {" in text and f"body {{ font-family: {FONT} !important; }}" in text
+        assert ".dark:not(.lit) canvas:not(.u-wrap *) {" in text and 'text(button) === "dark"' in text
+        assert f"body {{ font-family: {FONT} !important; }}" in text
 
 
 def test_a_push_reaches_the_agent_and_the_recording(walker):

@@ -14,6 +14,7 @@ from coachable.coach.session.session import CoachSession  # noqa: E402
 from coachable.domains.combat.stage import CombatStage  # noqa: E402
 from coachable.domains.humanoid.stage import HumanoidStage  # noqa: E402
 from coachable.domains.racing.stage import RacingStage  # noqa: E402
+from coachable.scene import palette  # noqa: E402
 from coachable.scene.parts import Parts  # noqa: E402
 from tests.coach.echo_domain import echo_session  # noqa: E402
 
@@ -103,6 +104,29 @@ def test_the_camera_follows_turns_or_stays(server, monkeypatch):
     session.run(0.5)
     view.update()
     assert view._root.position == pytest.approx(before)
+    session.close()
+
+
+def test_a_browser_chooses_a_dark_scene_for_itself(server):
+    server.gui.reset()
+    server.scene.reset()
+    session = CoachSession.open("humanoid", seed=1)
+    view = scene_view.SceneView(server, session, HumanoidStage())
+    chosen = {}
+
+    def keep(name):
+        return lambda *values, **named: chosen.setdefault(name, (*values, *named.values()))
+
+    names = ("add_light_hemisphere", "add_light_directional", "configure_fog", "set_background_image")
+    client = SimpleNamespace(scene=SimpleNamespace(**{name: keep(name) for name in names}))
+    press = view.brightness._impl.update_cb[0]
+    press(SimpleNamespace(client=None, target=SimpleNamespace(value="dark")))
+    press(SimpleNamespace(client=client, target=SimpleNamespace(value="no such button")))
+    assert not chosen
+    press(SimpleNamespace(client=client, target=SimpleNamespace(value="dark")))
+    assert set(chosen) == set(names)
+    sky = chosen["set_background_image"][0]
+    assert sky[0, 0].tolist() == list(palette.NIGHT_AIR) and sky[-1, 0].tolist() == list(palette.NIGHT_HAZE)
     session.close()
 
 

@@ -162,14 +162,21 @@ def test_nothing_is_wider_than_the_window_and_everything_has_a_name(browser, add
     assert seconds(browser) == 0
 
 
-def test_a_car_follows_its_sliders_and_asks_no_other_site(browser, stepped_site):
+def test_a_car_follows_its_sliders_and_asks_no_other_site(browser, stepped_site, tmp_path):
     """Gripping first, then sliding."""
+    site = shutil.copytree(stepped_site, tmp_path / "site")
+    manifest = json.loads((site / "manifest.json").read_text())
+    told = {"idle": ["slip_ratio_front"], "idle_note": "The front wheels are not driven."}
+    (site / "manifest.json").write_text(json.dumps(manifest | told))
     browser.call("Emulation.setDeviceMetricsOverride", width=240, height=320, deviceScaleFactor=1, mobile=False)
-    with served(stepped_site) as address:
+    with served(site) as address:
         browser.call("Page.navigate", url=f"{address}#slip_angle_rear=0&slip_ratio_rear=0")
         wait_for(lambda: browser.evaluate("document.getElementById('loading')?.hidden === true"), 120)
         wait_for(lambda: seconds(browser) > 0, 120)
         assert browser.evaluate("document.getElementById('request-slip_angle_rear').value") == "0"
+        assert browser.evaluate("document.getElementById('request-slip_ratio_front')") is None
+        assert told["idle_note"] in browser.evaluate("document.getElementById('requests').innerText")
+        assert browser.evaluate("document.querySelector('.asked').textContent").startswith("weight 0")
         angles = []
         for weight in (0.0, 5.0):
             for name in ("slip_angle_rear", "slip_ratio_rear"):
@@ -222,12 +229,14 @@ def test_recordings_follow_their_sliders_and_ask_no_other_site(browser, recorded
             )
             shown = "Number(document.getElementById('measured-fuel_per_km').dataset.value)"
             assert browser.evaluate(shown) == recording["measured"]["fuel_per_km"]
+            weight = browser.evaluate("document.querySelector('output[for=request-fuel]').textContent")
+            assert weight == f"weight {recording['style']['fuel']:g}"
             asked = f"Requested: Fuel {recording['style']['fuel']:g}."
             announced = f"document.getElementById('announcement').textContent.startsWith('{asked}')"
             wait_for(lambda announced=announced: browser.evaluate(announced), 60)
         assert "fuel=105" in browser.evaluate("location.hash")
         shown = "[...document.querySelectorAll('#gauges div')].filter(gauge => gauge.offsetHeight > 10).length"
-        assert browser.evaluate(shown) == 6
+        wait_for(lambda: browser.evaluate(shown) == 6, 60)  # the first picture may take long
         edges = "['scene', 'gauges'].map(id => document.getElementById(id).getBoundingClientRect())"
         assert browser.evaluate(f"(([scene, gauges]) => scene.bottom <= gauges.top)({edges})")
         browser.evaluate(

@@ -94,9 +94,18 @@ def test_the_page_has_the_looks_of_the_stage():
     assert part.opens == {"pose": "t_pose", "step_length": 0.5}
 
 
-def test_assets_belong_to_the_page(capsys, tmp_path):
-    assert main(["export", "humanoid", "--assets", str(tmp_path)]) == 2
-    assert "expected --web FOLDER" in capsys.readouterr().err
+@pytest.mark.parametrize("option", ["--assets", "--track"])
+def test_options_of_pages_belong_to_pages(option, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", "onnx", "racing_drift", option, str(tmp_path)]) == 2
+    assert f"{option} is for pages: expected coachable export web racing_drift" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_page_names_options_that_its_domain_lacks(capsys, tmp_path):
+    assert main(["export", "web", "humanoid", "--out", str(tmp_path / "site"), "--track=own.csv"]) == 2
+    assert "humanoid has no option --track: expected no options of its own" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_changed_files_of_other_projects_are_refused(tmp_path):

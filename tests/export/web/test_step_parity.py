@@ -132,7 +132,7 @@ def test_the_car_slides_when_asked_to_and_not_otherwise(drive_steps):
 
 def test_the_manifest_has_the_constants_of_the_environment(stepped_site):
     manifest = json.loads((stepped_site / "manifest.json").read_text())
-    assert manifest["kind"] == "steps" and len(manifest["starts"]) == 8
+    assert manifest["kind"] == "stepped" and len(manifest["starts"]) == 8
     assert manifest["physics"] == {"control_step": 0.1, "substeps": 10, "episode_steps": 1500, "track": "ridge"}
     assert sum(file.stat().st_size for file in stepped_site.rglob("*") if file.is_file()) < 25e6
     assert not (stepped_site / "third_party" / "@mujoco").exists()
@@ -145,10 +145,20 @@ def test_traffic_and_pools_of_cars_are_recorded(env):
     assert load_domain("racing_aggressiveness").make_web is None
 
 
+def test_a_car_that_is_alone_is_not_asked_to_overtake():
+    domain = load_domain("racing_resources")
+    assert domain.make_web is not None
+    part = domain.make_web(domain.make_space())
+    assert set(part.idle) == {"overtake", "defend"} and "No other car" in part.idle_note
+    assert not {measure.parameter for measure in part.measures} & set(part.idle)
+
+
 def test_a_page_has_the_circuit_and_the_observation_of_its_training():
     settings = {"track": "ring", "course_points": 5, "curvature": True}
     domain = load_domain("racing_drift", {"env": settings})
     assert domain.make_web is not None
     part = domain.make_web(domain.make_space())
     assert part.physics["track"] == "ring"
+    moved = domain.with_options({"track": "lakeside"})
+    assert moved.make_web is not None and moved.make_web(domain.make_space()).physics["track"] == "lakeside"
     assert len(part.starts[0]["observation"]) == sum(group.width for group in domain.observation_groups)

@@ -2,8 +2,6 @@
 
 import { at, megabytes } from "./dom.js";
 
-const KINDS = { recordings: "./recorded.js", simulation: "./simulated.js", steps: "./stepped.js" };
-
 async function start() {
   const manifest = await (await fetch("manifest.json")).json();
   document.title = `${manifest.title} – coachable`;
@@ -11,7 +9,7 @@ async function start() {
   at("summary").textContent = manifest.summary;
   if (manifest.home) Object.assign(at("documentation"), { href: manifest.home, hidden: false });
   tellLoads(manifest);
-  const kind = await import(KINDS[manifest.kind]);
+  const kind = await import(`./${manifest.kind}.js`);
   await kind.start(manifest);
 }
 
@@ -19,7 +17,7 @@ function tellLoads(manifest) {
   const total = manifest.downloads.reduce((sum, { bytes }) => sum + bytes, 0);
   const versions = manifest.packages.map(({ name, version, license }) => `${name} ${version} (${license})`).join(", ");
   const agent = `agent (coachable ${manifest.coachable_version}, domain ${manifest.domain})`;
-  const content = manifest.kind === "recordings" ? `recordings of the ${agent}` : `the ${agent}, its physics`;
+  const content = manifest.kind === "recorded" ? `recordings of the ${agent}` : `the ${agent}, its physics`;
   at("loads").textContent =
     `${megabytes(total)} from this site and nothing from any other: ${content}, and ${versions}. Nothing is sent anywhere.`;
   for (const { file, bytes } of manifest.downloads) {

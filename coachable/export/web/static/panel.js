@@ -1,7 +1,7 @@
 // The coach's panel: requests as controls made from the declaration, and beside each what is measured.
 
 import { listening, make, shape } from "./dom.js";
-import { isOutside, textOf, withUnit, words } from "./request.js";
+import { askedOf, isOutside, textOf, withUnit, words } from "./request.js";
 
 export class Panel {
   /**
@@ -10,16 +10,19 @@ export class Panel {
    * @param {object[]} entries  From `entriesOf`.
    * @param {object[]} measures  The manifest's measures.
    * @param {(name: string, value: number | string) => void} ask  Called when the visitor asks for something.
+   * @param {string} note  A sentence below the controls, or "".
    */
-  constructor(form, others, entries, measures, ask) {
-    this.entries = entries;
-    measures = measures.filter(({ text }) => text);
+  constructor(form, others, entries, measures, ask, note = "") {
+    this.entries = entries.filter(({ idle }) => !idle);
+    const names = new Set(this.entries.map(({ name }) => name));
+    measures = measures.filter(({ text }) => text).map((measure) => (names.has(measure.parameter) ? measure : { ...measure, parameter: "" }));
     this.measures = measures;
     this.shown = new Map();
-    for (const entry of entries) {
+    for (const entry of this.entries) {
       const own = measures.filter((measure) => measure.parameter === entry.name);
       form.append(entry.options ? this.#choice(entry, own, ask) : this.#number(entry, own, ask));
     }
+    if (note) form.append(make("p", { class: "small" }, note));
     for (const measure of measures.filter(({ parameter }) => !parameter)) {
       others.append(make("div", {}, make("dt", {}, `${words(measure.text)}:`), this.#value(measure, "dd")));
     }
@@ -34,10 +37,10 @@ export class Panel {
         if (entry.options) input.checked = input.value === value;
         else {
           input.value = value;
-          input.setAttribute("aria-valuetext", textOf(entry, value));
+          input.setAttribute("aria-valuetext", askedOf(entry, value));
         }
       }
-      if (asked) asked.textContent = textOf(entry, value);
+      if (asked) asked.textContent = askedOf(entry, value);
       if (outside) outside.hidden = !isOutside(entry, value);
     }
     this.asked = request;
@@ -59,6 +62,11 @@ export class Panel {
     }
   }
 
+  /** Whether a pointer below a slider shows what was measured. */
+  get points() {
+    return [...this.shown.values()].some(({ pointer }) => pointer);
+  }
+
   /** One sentence on each request with a measure, for a screen reader. */
   sentences(readout) {
     return this.measures
@@ -66,7 +74,7 @@ export class Panel {
       .map((measure) => {
         const entry = this.entries.find(({ name }) => name === measure.parameter);
         const mean = textOfMeasure(measure, readout.mean(measure.name));
-        return `${entry.label}: ${textOf(entry, this.asked[entry.name])} requested, ${measure.text} ${mean}.`;
+        return `${entry.label}: ${askedOf(entry, this.asked[entry.name])} requested, ${measure.text} ${mean}.`;
       })
       .join(" ");
   }

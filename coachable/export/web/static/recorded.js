@@ -20,7 +20,6 @@ class RecordedPage extends Page {
     at("where").textContent = "Everything comes from this site.";
     at("scale").hidden = true;
     at("trained").hidden = true;
-    at("legend").classList.add("recorded");
     at("scene").setAttribute("aria-label", "Recording of the agent. Arrow keys turn the camera.");
     at("keys").textContent = "Keys: Space pauses, R starts again, arrows move the slider in focus or turn the camera.";
     this.explain(manifest.legend);

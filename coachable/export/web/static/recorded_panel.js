@@ -70,7 +70,7 @@ export class RecordedPanel {
     });
     this.show.push(({ style }) => {
       input.value = values.indexOf(style[name]);
-      asked.textContent = textOf(parameter, style[name]);
+      asked.textContent = `${parameter.weight ? "weight " : ""}${textOf(parameter, style[name])}`;
       input.setAttribute("aria-valuetext", asked.textContent);
     });
     const top = make("div", { class: "row" }, make("label", { class: "name", for: id }, words(parameter.text)), asked);

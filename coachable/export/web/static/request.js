@@ -4,7 +4,8 @@ const MARGIN = 0.2; // share of the trained range by which a slider exceeds it t
 
 /** One entry per parameter and control, in the order of the declaration. */
 export function entriesOf(manifest) {
-  const styles = manifest.style_space.parameters.map((parameter) => ({ default: 0, ...parameter, style: true }));
+  const idle = new Set(manifest.idle);
+  const styles = manifest.style_space.parameters.map((parameter) => ({ default: 0, ...parameter, style: true, idle: idle.has(parameter.name) }));
   const controls = manifest.controls.map((control) => ({ ...control, kind: "control" }));
   return [...styles, ...controls].map((entry) => ({ ...entry, label: words(manifest.names?.[entry.name] ?? entry.name), ...sliderOf(entry) }));
 }
@@ -78,6 +79,11 @@ export function fromFragment(entries, fragment, request) {
 /** A value as text, with the digits of the slider's step, and its unit. */
 export function textOf(entry, value) {
   return entry.options ? words(value) : withUnit(plain(entry, value), entry.unit);
+}
+
+/** A requested value as text; a weight has no unit and says what it is. */
+export function askedOf(entry, value) {
+  return entry.kind === "weight" ? `weight ${textOf(entry, value)}` : textOf(entry, value);
 }
 
 /** A number with its unit. */

@@ -62,9 +62,9 @@ export class SimulatedPage extends Page {
     at("scene").setAttribute("aria-label", `${manifest.picture}. Arrow keys turn the camera.`);
     this.explain(manifest.legend);
     this.readout = new Readout(manifest.measures, manifest.window);
-    this.panel = new Panel(at("requests"), at("others"), this.entries, manifest.measures, (name, value) =>
-      this.ask({ ...this.request, [name]: value }),
-    );
+    const ask = (name, value) => this.ask({ ...this.request, [name]: value });
+    this.panel = new Panel(at("requests"), at("others"), this.entries, manifest.measures, ask, manifest.idle_note);
+    at("legend").classList.toggle("pointing", this.panel.points);
     this.request = fromFragment(this.entries, location.hash, { ...defaultsOf(this.entries), ...manifest.opens });
     this.episode = 0;
     this.ask(this.request);
