@@ -81,7 +81,9 @@ def _parser() -> argparse.ArgumentParser:
         "arguments", nargs=argparse.REMAINDER, help="KEY=VALUE ... seeds=0,1,2, or --help for all of them"
     )
 
-    evaluate = command("evaluate", _evaluate, "measure every style of an agent: tables and a figure", SOURCE_HELP)
+    evaluate = command("evaluate", _evaluate, "measure every style of an agent: tables and a figure")
+    text = f"{SOURCE_HELP}; several: one per training seed, with a table of all of them"
+    evaluate.add_argument("sources", nargs="+", metavar="source", help=text)
     _add_out(evaluate, "evaluation", "folder")
     _add_number(evaluate, "--episodes", 20, "per style")
     _add_number(evaluate, "--switch-episodes", 60, "with switching styles, 0 for none", lowest=0)
@@ -202,9 +204,9 @@ def _train_seeds(file: Path, arguments: list[str], seeds: str) -> int:
 
 
 def _evaluate(options: argparse.Namespace) -> int:
-    from coachable.evaluation.evaluate import evaluate
+    from coachable.evaluation.many_agents import evaluate_agents
 
-    return _measure(evaluate, options)
+    return _measure(evaluate_agents, options)
 
 
 def _explain(options: argparse.Namespace) -> int:

@@ -34,10 +34,11 @@ def test_the_command_starts_without_loading_torch():
     subprocess.run([sys.executable, "-c", code], check=True, cwd=REPOSITORY)
 
 
-@pytest.mark.parametrize("further", ["--track", "own.csv", "--track --other"])
+@pytest.mark.parametrize("further", ["evaluate --track", "coach own.csv", "evaluate --track --other"])
 def test_an_option_of_a_domain_has_a_value(further, capsys):
+    command, *rest = further.split()
     with pytest.raises(SystemExit):
-        main(["evaluate", "racing_resources", *further.split()])
+        main([command, "racing_resources", *rest])
     assert "unrecognized arguments" in capsys.readouterr().err
 
 
@@ -169,6 +170,12 @@ def test_a_machine_that_cannot_draw_is_told_what_to_install(capsys, monkeypatch,
     monkeypatch.setenv("MUJOCO_GL", "disable")
     assert main(["render", "humanoid", "--seconds", "0.1", "--out", str(tmp_path / "film.gif")]) == 2
     assert "no OpenGL library was found" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_agents_of_other_domains_are_not_evaluated_together(capsys, tmp_path):
+    assert main(["evaluate", "humanoid", "racing_drift", "--out", str(tmp_path / "out")]) == 2
+    assert "agents of humanoid and racing_drift given: expected agents of one domain" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 

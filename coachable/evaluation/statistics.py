@@ -85,6 +85,28 @@ def bootstrap_interval(
     return float(low), float(high)
 
 
+def comparison_interval(
+    values: np.ndarray, others: np.ndarray, compare: Callable[[np.ndarray, np.ndarray], np.ndarray]
+) -> tuple[float, float]:
+    """Compute the 95 % percentile bootstrap interval of a comparison of two means, such as their ratio.
+
+    Args:
+        values: Numbers (n,); NaN are left out.
+        others: Numbers (m,) that they are compared with, independent of them; NaN are left out.
+        compare: Function of both means, elementwise.
+
+    Returns:
+        Lower and upper bound; NaN if there are no values.
+    """
+    kept = [numbers[~np.isnan(numbers)] for numbers in (values, others)]
+    if not all(map(len, kept)):
+        return float("nan"), float("nan")
+    generator = np.random.default_rng(0)
+    means = (numbers[generator.integers(0, len(numbers), (2000, len(numbers)))].mean(1) for numbers in kept)
+    low, high = np.percentile(compare(*means), [2.5, 97.5])
+    return float(low), float(high)
+
+
 def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
     """Compute Wilson's 95 % interval of a probability from the number of successes and trials.
 

@@ -122,6 +122,20 @@ def mean_of(values: np.ndarray) -> float:
     return float(np.nanmean(values)) if not np.isnan(values).all() else float("nan")
 
 
+def rows_where(rows: Sequence[Mapping[str, Any]], **values: Any) -> list[Mapping[str, Any]]:
+    """Return the rows that have the given values.
+
+    Args:
+        rows: Rows with the same keys.
+        **values: Values by column name.
+
+    Example:
+        >>> rows_where([{"weight": 0, "lap": 90.1}, {"weight": 1, "lap": 91.7}], weight=1)
+        [{'weight': 1, 'lap': 91.7}]
+    """
+    return [row for row in rows if all(row[name] == value for name, value in values.items())]
+
+
 def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Write rows with the same keys as CSV.
 

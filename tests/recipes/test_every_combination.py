@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from recipe_checks import typed_settings
 from recipe_config import compose_config, config_groups, run_recipe
 from tensordict import TensorDict
 
@@ -166,6 +167,17 @@ def test_the_stages_of_races_are_of_their_family(stage, margins, tmp_path):
         ValueError, match=f"style_reward has {', '.join(sorted(margins))}: racing_drift takes in_corners"
     ):
         import_module("racing_qr_sac").build(config)
+
+
+@pytest.mark.parametrize("stage", ["alone", "clean", "races"])
+def test_a_driver_of_races_learns_alone_on_the_observation_of_races(stage):
+    config = compose_config("racing_qr_sac", ["preset=aggressiveness", f"stage={stage}", "env.num_envs=3"])
+    among_others = stage == "races"
+    assert config["impersonation"]["n"] == (2 if among_others else 0) and config["init_new_observations"] == 0
+    settings = typed_settings(config)
+    env = settings.env.build(num_envs=3, seed=0, track="ring")
+    assert env.cars == (5 if among_others else 1) and env.observation_size == 190
+    assert env.reset()["style_features"].shape[-1] == 9 + 3 * (env.cars - 1)
 
 
 @pytest.mark.parametrize("stage", ["laps", "corners"])

@@ -8,20 +8,30 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from coachable.domains.racing.bounds import bounds_report, bounds_summary, drift_bounds, lap_bounds
+from coachable.domains.racing.families import home_track
 from coachable.domains.racing.laps import circuits_report, circuits_summary, drive_circuits
 from coachable.domains.racing.metrics import DRIFT_DEG, DRIFT_SPEED, GRIP_DEG
 from coachable.envs.racing.race.features import CORNER_RADIUS, DRIFT_NAMES
 from coachable.envs.racing.race.scenarios import Scenario
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import drawing
-from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
-from coachable.evaluation.style_grid import evaluate_grid, markdown_table, mean_of, policy_sentence, write_results
+from coachable.evaluation.statistics import bootstrap_interval, comparison_interval, rank_correlation
+from coachable.evaluation.style_grid import (
+    evaluate_grid,
+    markdown_table,
+    mean_of,
+    policy_sentence,
+    rows_where,
+    write_results,
+)
 
 if TYPE_CHECKING:
     from coachable.domain import Domain
     from coachable.training.weights import LoadedPolicy
 
 ANGLE = "sideslip_corners"
+JUDGED = "rear slip angle"  # sweep of the weight that the slider of drifting moves
 SWEEPS = {  # weights that rise together
     "rear slip angle": ("slip_angle_rear",),
     "rear slip angle and ratio": ("slip_angle_rear", "slip_ratio_rear"),
@@ -30,7 +40,7 @@ SWEEPS = {  # weights that rise together
 WEIGHTS = (-0.4, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
 _STARTS = (Scenario("solo", 1.0, "solo"),)
 _METRICS = (
-    *("sideslip_corners", "sideslip_straights", "drift_corners", "drift_straights", "slip_angle_rear"),
+    *("sideslip", "sideslip_corners", "sideslip_straights", "drift_corners", "drift_straights", "slip_angle_rear"),
     *("pace", "off", "turned_per_km", "backwards", "turns", "survived"),
 )
 _MIDDLE = 3.0  # a middle request
@@ -41,7 +51,8 @@ def evaluate_drift(domain: Domain, agent: LoadedPolicy, out: Path, settings: Eva
     """Evaluate an agent under rising drift weights, from ordinary starts, and write the results.
 
     The weights of the rear slip angle, of the rear slip angle and ratio, and of all four quantities rise in turn. The
-    files are `drift.csv` (by weight), `circuits.csv` (laps of `drive_circuits`), `drift.png`, `report.md` and
+    files are `drift.csv` (by weight), `circuits.csv` (laps of `drive_circuits`), `bounds.csv` (the targets of the
+    family and what was measured while the weight of the rear slip angle rises), `drift.png`, `report.md` and
     `summary.json`.
 
     Args:
@@ -82,20 +93,24 @@ def evaluate_drift(domain: Domain, agent: LoadedPolicy, out: Path, settings: Eva
     summary |= {"episodes_per_weight": settings.episodes, "seed": settings.seed}
     draw_drift(rows, out / "drift.png")
     circuits = drive_circuits(domain, agent, settings)
-    summary["circuits"] = circuits_summary(circuits)
-    report = _report(agent, rows, summary, grid.steps) + circuits_report(circuits)
-    return write_results(out, report, summary, {"drift": rows, "circuits": circuits})
+    home = home_track("drift", agent.config.get("env", {}))
+    bounds = drift_bounds(rows_where(rows, sweep=JUDGED), _MIDDLE) + lap_bounds(circuits, home)
+    summary |= {"circuits": circuits_summary(circuits), "bounds": bounds_summary(bounds)}
+    report = _report(agent, rows, summary, grid.steps) + circuits_report(circuits) + bounds_report(bounds)
+    return write_results(out, report, summary, {"bounds": bounds, "drift": rows, "circuits": circuits})
 
 
 def _rows(sweep: str, episodes: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
-    """Return the means of values (weights, episodes) by weight, with 95 % intervals of the sideslip in corners."""
-    neutral = float(np.nanmean(episodes["pace"][WEIGHTS.index(0.0)]))
+    """Return the means of values (weights, episodes) by weight, with 95 % intervals."""
+    neutral = episodes["pace"][WEIGHTS.index(0.0)]
     rows = []
     for index, weight in enumerate(WEIGHTS):
-        low, high = bootstrap_interval(episodes[ANGLE][index])
         row: dict[str, Any] = {"sweep": sweep, "weight": weight}
-        row |= {name: mean_of(episodes[name][index]) for name in _METRICS}
-        row |= {"angle_low": low, "angle_high": high, "pace_kept": row["pace"] / max(neutral, 1e-9)}
+        for name in _METRICS:
+            low, high = bootstrap_interval(episodes[name][index])
+            row |= {name: mean_of(episodes[name][index]), f"{name}_low": low, f"{name}_high": high}
+        low, high = comparison_interval(episodes["pace"][index], neutral, np.divide)
+        row |= {"pace_kept": row["pace"] / mean_of(neutral), "pace_kept_low": low, "pace_kept_high": high}
         rows.append(row | {"most_turns": float(np.nanmax(episodes["turns"][index]))})
     return rows
 
@@ -109,9 +124,9 @@ def draw_drift(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """
     with drawing(path, 1, 2, size=(9.0, 3.8)) as ((left, right),):
         for sweep, marker in zip(SWEEPS, "ovs", strict=True):
-            own = [row for row in rows if row["sweep"] == sweep]
+            own = rows_where(rows, sweep=sweep)
             weights, angle = [row["weight"] for row in own], np.array([row[ANGLE] for row in own])
-            error = np.abs(np.array([[row["angle_low"], row["angle_high"]] for row in own]) - angle[:, None]).T
+            error = np.abs(np.array([[row[f"{ANGLE}_low"], row[f"{ANGLE}_high"]] for row in own]) - angle[:, None]).T
             left.errorbar(weights, angle, error, marker=marker, capsize=3)
             right.plot(weights, [row["pace_kept"] for row in own], marker=marker, label=sweep)
         for line in (*DRIFT_DEG, GRIP_DEG):

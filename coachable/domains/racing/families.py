@@ -54,7 +54,7 @@ def resource_env(num_envs: int = 64, **options: Any) -> RacingEnv:
     cars = options.get("cars", 1)
     controlled = options.get("controlled") or (1 if num_envs % cars else cars)
     if controlled < cars:
-        driver = _line_follower(options, HOME["resources"], CAR["resources"])[1]
+        driver = _line_follower(options, "resources")[1]
         options = {"driver": driver} | options | {"controlled": controlled}
     defaults: dict[str, Any] = {
         "track": HOME["resources"],
@@ -70,15 +70,15 @@ def rival_env(num_envs: int = AGENTS * 21, **options: Any) -> RacingEnv:
     """Make races of GT3 cars against rivals, which are scripted or copies of the policy, from all kinds of starts.
 
     Args:
-        num_envs: Number of cars that the agent drives: three of the five cars of each race, or one if it is not a
-            multiple of three.
+        num_envs: Number of cars that the agent drives: three of the five cars of each race (fewer if `cars` is less),
+            or one if it is not a multiple of three.
         **options: Options of `RacingEnv`.
     """
-    tracks, driver = _line_follower(options, HOME["aggressiveness"], CAR["aggressiveness"])
+    tracks, driver = _line_follower(options, "aggressiveness")
     space = styles.aggressiveness_style_space()
     defaults: dict[str, Any] = {
         "cars": CARS,
-        "controlled": AGENTS if num_envs % AGENTS == 0 else 1,
+        "controlled": min(AGENTS, options.get("cars", CARS)) if num_envs % AGENTS == 0 else 1,
         "driver": Rivals(driver, (space.low, space.high), slowest=0.8 / RIVALS_GRIP),
         "car": CAR["aggressiveness"],
         "scenarios": race_scenarios(CARS),
@@ -86,10 +86,10 @@ def rival_env(num_envs: int = AGENTS * 21, **options: Any) -> RacingEnv:
     return RacingEnv(num_envs, **{**defaults, **options, "track": tracks})
 
 
-def _line_follower(options: Mapping[str, Any], track: str, car: str) -> tuple[tuple[Track, ...], LineFollower]:
+def _line_follower(options: Mapping[str, Any], family: str) -> tuple[tuple[Track, ...], LineFollower]:
     """Return the circuits of an environment with these options, and the fastest scripted opponent on them."""
-    tracks = load_tracks(options.get("track", track))
-    return tracks, LineFollower(tracks, load_car(options.get("car", car)), grip=RIVALS_GRIP, lanes=(0.0, 2.2, -2.2))
+    tracks, car = load_tracks(options.get("track", HOME[family])), load_car(typical_car(family, options))
+    return tracks, LineFollower(tracks, car, grip=RIVALS_GRIP, lanes=(0.0, 2.2, -2.2))
 
 
 class Family(NamedTuple):

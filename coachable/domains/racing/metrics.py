@@ -93,7 +93,7 @@ class RacingMeasures:
             for name, column in (("overtake", OVERTAKE), ("defend", DEFEND)):
                 found[name] = torch.where(near, features[:, column] / CONTROL_STEP, torch.nan)
         else:
-            found["longitudinal"], found["lateral"] = _distances(features)
+            found["longitudinal"], found["lateral"] = nearest_gaps(features)
             found["complied"] = torch.where(anyone_near(features), _margins_kept(features, theta).float(), torch.nan)
         return found
 
@@ -222,7 +222,7 @@ def _margins_kept(features: Tensor, theta: Tensor) -> Tensor:
     return ~((near > 0.0) & (long < theta[:, :1]) & (lat < theta[:, 1:2])).any(-1)
 
 
-def _distances(features: Tensor) -> tuple[Tensor, Tensor]:
+def nearest_gaps(features: Tensor) -> tuple[Tensor, Tensor]:
     """Return the distances to the nearest car straight ahead or behind and to the nearest one beside, (N,) each [m]."""
     long, lat, near = gap_columns(features)
     return _nearest(long, (near > 0.0) & (lat == 0.0)), _nearest(lat, (near > 0.0) & (long == 0.0))

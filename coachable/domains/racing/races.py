@@ -16,8 +16,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from coachable.domains.racing.bounds import FOLLOWS, bound, bounds_report, bounds_summary, lap_bounds, rank_interval
+from coachable.domains.racing.families import home_track
 from coachable.domains.racing.laps import circuits_report, circuits_summary, drive_circuits
-from coachable.domains.racing.metrics import TelemetryMeasures
+from coachable.domains.racing.metrics import TelemetryMeasures, nearest_gaps
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
 from coachable.envs.racing.race.features import anyone_beside, anyone_in_line
 from coachable.envs.racing.race.run import Run
@@ -26,7 +28,7 @@ from coachable.evaluation.episode_records import record_episodes
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import drawing, shade
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation, wilson_interval
-from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_results
+from coachable.evaluation.style_grid import markdown_table, mean_of, policy_sentence, rows_where, write_results
 from coachable.keys import STYLE_FEATURES
 
 if TYPE_CHECKING:
@@ -54,16 +56,20 @@ _RANKED = _METRICS | {
     "beside": "time beside others",
     "in_line": "time close ahead or behind",
 }
+_MEANS = ("places_gained", "places_later", "overtakes", "contacts", "contacts_per_minute", "beside", "in_line")
+_MEANS += ("gap_beside", "gap_in_line", "stranded")
 
 
 class _RaceMeasures(TelemetryMeasures):
-    """Telemetry, and whether an opponent is closer than the largest margin, beside the car or in line with it."""
+    """Telemetry, the gaps to opponents beside the car and in line with it, and whether they are below all margins."""
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
         features = transition.get(("next", STYLE_FEATURES))
         beside = anyone_beside(features, within=MARGINS["lateral"][-1])
         in_line = anyone_in_line(features, within=MARGINS["longitudinal"][-1])
-        return super().step(transition) | {"beside": beside.float(), "in_line": in_line.float()}
+        ahead, aside = nearest_gaps(features)
+        found = {"beside": beside.float(), "in_line": in_line.float(), "gap_beside": aside, "gap_in_line": ahead}
+        return super().step(transition) | found
 
 
 def evaluate_aggressiveness(domain: Domain, agent: LoadedPolicy, out: Path, settings: EvaluationSettings) -> str:
@@ -71,7 +77,8 @@ def evaluate_aggressiveness(domain: Domain, agent: LoadedPolicy, out: Path, sett
 
     The lateral margin of the pair rises while its longitudinal one is 0, as in the paper; then the longitudinal margin
     rises while the lateral one is 0.5 m. The files are `races.csv` (by margin, setting and requested value),
-    `circuits.csv` (laps of `drive_circuits`), `radar.png`, `report.md` and `summary.json`.
+    `circuits.csv` (laps of `drive_circuits`), `bounds.csv` (the targets of the family with what was measured),
+    `radar.png`, `report.md` and `summary.json`.
 
     Args:
         domain: Domain racing_aggressiveness, as the agent was trained in.
@@ -89,19 +96,36 @@ def evaluate_aggressiveness(domain: Domain, agent: LoadedPolicy, out: Path, sett
     cells = [(setting, name, metres) for name, margins in MARGINS.items() for setting in SETTINGS for metres in margins]
     races = [(*cell, others) for cell in cells for others in OTHERS for _ in range(episodes)]
     found = _race(domain, agent, races, len(cells), settings)
-    rows = _rows(cells, {name: values.reshape(len(cells), -1, 2) for name, values in found.items()})
+    values = {name: value.reshape(len(cells), -1, 2) for name, value in found.items()}
+    rows = _rows(cells, values)
     summary: dict[str, Any] = {}
     for margin, setting in product(MARGINS, SETTINGS):
-        own = [row for row in rows if (row["margin"], row["setting"]) == (margin, setting)]
+        own = rows_where(rows, margin=margin, setting=setting)
         gained = {name: np.array([row[name] for row in own]) for name in ("requested", *_RANKED)}
         ranks = {name: rank_correlation(gained["requested"], gained[name]) for name in _RANKED}
         summary.setdefault(margin, {})[setting] = ranks
     summary |= {"races_per_row": len(OTHERS) * episodes, "seed": seed}
     draw_radar(rows, out / "radar.png")
     circuits = drive_circuits(domain, agent, settings)
-    report = _report(agent, rows, summary) + circuits_report(circuits)
-    summary["circuits"] = circuits_summary(circuits)
-    return write_results(out, report, summary, {"races": rows, "circuits": circuits})
+    bounds = _bounds(cells, values) + lap_bounds(circuits, home_track("aggressiveness", agent.config.get("env", {})))
+    summary |= {"circuits": circuits_summary(circuits), "bounds": bounds_summary(bounds)}
+    report = _report(agent, rows, summary) + circuits_report(circuits) + bounds_report(bounds)
+    return write_results(out, report, summary, {"bounds": bounds, "races": rows, "circuits": circuits})
+
+
+def _bounds(cells: Sequence[tuple[str, str, float]], values: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
+    """Return the bounds of values (cells, races, 2): rank correlations with the margins, and stranded cars."""
+    judged = {"contacts": "contacts", "overtakes": "overtakes", "places_gained": "places gained", "top_two": "wins"}
+    asked = [("lateral", name, text) for name, text in judged.items()]
+    asked.append(("longitudinal", "in_line", _RANKED["in_line"]))
+    rows = []
+    for (margin, name, text), setting in product(asked, SETTINGS):
+        own = [index for index, cell in enumerate(cells) if cell[:2] == (setting, margin)]
+        requested, races = np.array(MARGINS[margin]), values[name][own].mean(2)
+        rank, interval = rank_correlation(requested, races.mean(1)), rank_interval(requested, races)
+        label = f"{setting}: rank correlation of {text} and {margin} margin"
+        rows.append(bound(label, rank, interval, at_most=-FOLLOWS))
+    return [*rows, bound("stranded cars, per car and race", values["stranded"].mean(), at_most=0.0)]
 
 
 def _race(
@@ -127,7 +151,7 @@ def _race(
         domain,
         agent,
         theta,
-        _RaceMeasures("distance", "contact", "off"),
+        _RaceMeasures("distance", "contact", "off", "stranded"),
         settings,
         copies=cells,
         steps=settings.steps or RACE_STEPS,
@@ -212,21 +236,25 @@ def _pair_results(
     end = int(done[0]) + 1 if len(done) else len(distance)
     places, early = ((-distance[step - 1]).argsort().argsort() for step in (end, min(START_STEPS, end)))
     cars = np.flatnonzero(chosen).tolist()
-    touched = race["contact"][:end] > 0
+    touched, stranded = (race[name][:end] > 0 for name in ("contact", "stranded"))
+    contacts = np.array([_count(touched[:, car]) for car in cars], dtype=float)
     return {
         "top_two": (places < 2)[chosen].astype(float),
         "won": (places == 0)[chosen].astype(float),
         "places_gained": (slots - places)[chosen].astype(float),
         "places_later": (early - places)[chosen].astype(float),
         "overtakes": np.array([_overtakes(distance[:end], car) for car in cars], dtype=float),
-        "contacts": np.array([_count(touched[:, car]) for car in cars], dtype=float),
+        "contacts": contacts,
+        "contacts_per_minute": contacts / (end * CONTROL_STEP / 60.0),
+        "stranded": np.array([_count(stranded[:, car]) for car in cars], dtype=float),
         **{name: race[name][:end, chosen].mean(0) for name in ("beside", "in_line", "off")},
+        **{name: np.array([mean_of(race[name][:end, car]) for car in cars]) for name in ("gap_beside", "gap_in_line")},
         "metres": distance[end - 1, chosen].astype(float),
     }
 
 
 def _count(touched: np.ndarray) -> int:
-    """Count the contacts of a car from its steps (T,) bool; a contact within a second of the last one is the same."""
+    """Count events of a car from its steps (T,) bool; an event within a second of the last one is the same."""
     steps = np.flatnonzero(touched)
     return int((np.diff(steps, prepend=-np.inf) > _AGAIN / CONTROL_STEP).sum()) if len(steps) else 0
 
@@ -246,9 +274,9 @@ def _rows(cells: Sequence[tuple[str, str, float]], found: Mapping[str, np.ndarra
         row["win_rate"] = float(of["top_two"].mean())
         row["win_rate_low"], row["win_rate_high"] = wilson_interval(int(of["top_two"].sum()), of["top_two"].size)
         row["either_won"] = float(of["won"].max(1).mean())
-        for name in ("places_gained", "places_later", "overtakes", "contacts", "beside", "in_line"):
-            per_race = of[name].mean(1)
-            row[name] = float(per_race.mean())
+        for name in _MEANS:
+            per_race = np.array([mean_of(pair) for pair in of[name]])
+            row[name] = mean_of(per_race)
             row[f"{name}_low"], row[f"{name}_high"] = bootstrap_interval(per_race)
         rows.append(row | {"off": float(of["off"].mean()), "kilometres": float(of["metres"].mean() / 1000.0)})
     return rows
@@ -267,7 +295,7 @@ def draw_radar(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     shape = (len(MARGINS), len(SETTINGS))
     with drawing(path, *shape, size=(9.5, 9.2), grid=False, subplot_kw={"projection": "polar"}) as panels:
         for panel, (margin, setting) in zip(panels.flat, product(MARGINS, SETTINGS), strict=True):
-            own = [row for row in rows if (row["margin"], row["setting"]) == (margin, setting)]
+            own = rows_where(rows, margin=margin, setting=setting)
             table = np.array([[row[name] for name in _METRICS] for row in own])
             low, high = table.min(0), table.max(0)
             scaled = 0.15 + 0.85 * (table - low) / np.maximum(high - low, 1e-9)
@@ -292,19 +320,30 @@ def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Map
     text += f"requested margin; their lateral margin is {FIXED['lateral']:g} m and their longitudinal one "
     text += f"{FIXED['longitudinal']:g} m otherwise. The other three keep 0.5 or 0.75 m laterally.\n\n"
     text += "![radar](radar.png)\n\n"
-    formats = {"margin": "", "setting": "", "requested": "g", "win_rate": ".0%", "either_won": ".0%"}
-    formats |= {"places_gained": "+.2f", "places_later": "+.2f", "overtakes": ".1f", "contacts": ".1f"}
-    formats |= {"beside": ".1%", "in_line": ".1%", "off": ".1%", "kilometres": ".1f"}
-    text += markdown_table(rows, formats, {"requested": "m"})
+    formats = {"win_rate": ".0%", "places_gained": "+.2f", "places_later": "+.2f", "overtakes": ".1f"}
+    formats |= {"contacts": ".1f", "contacts_per_minute": ".2f", "beside": ".1%", "in_line": ".1%"}
+    formats |= {"gap_beside": ".2f", "gap_in_line": ".2f", "stranded": ".2f"}
+    shown = [{**row, **{name: _with_interval(row, name, form) for name, form in formats.items()}} for row in rows]
+    columns = {"margin": "", "setting": "", "requested": "g", **dict.fromkeys(formats, ""), "either_won": ".0%"}
+    columns |= {"off": ".1%", "kilometres": ".1f"}
+    text += markdown_table(shown, columns, dict.fromkeys(("requested", "gap_beside", "gap_in_line"), "m"))
     text += "\nWin rate: share of the pair that ends among the first two. Overtakes, contacts: per car and race; a "
     text += f"car has overtaken another when it is {_PASSED:g} m ahead; contacts within a second count once. "
     text += "Places later: gained after the first minute. "
     beside, in_line = MARGINS["lateral"][-1], MARGINS["longitudinal"][-1]
     text += f"Beside: share of the time with another car alongside, less than {beside:g} m away. "
-    text += f"In line: share of the time with another car straight ahead or behind, less than {in_line:g} m away."
+    text += f"In line: share of the time with another car straight ahead or behind, less than {in_line:g} m away. "
+    text += "Gap beside, in line: mean distance to the nearest car there, of those within 10 m. "
+    text += "Stranded: how often a car had to be put back on the track. Brackets: 95 % intervals over races."
     text += "\n\nRank correlation with the margin: "
     parts = []
     for margin, setting in product(MARGINS, SETTINGS):
         ranks = ", ".join(f"{_RANKED[name]} {value:.2f}" for name, value in summary[margin][setting].items())
         parts.append(f"{margin}, {setting}: {ranks}")
     return text + "; ".join(parts) + ".\n"
+
+
+def _with_interval(row: Mapping[str, Any], name: str, form: str) -> str:
+    """Return a value of a row with its interval, such as "1.3 [1.1, 1.6]"."""
+    value, low, high = (format(row[key], form) for key in (name, f"{name}_low", f"{name}_high"))
+    return f"{value} [{low}, {high}]"

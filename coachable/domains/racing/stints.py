@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coachable.domains.racing.families import home_track
+from coachable.domains.racing.bounds import (
+    bounds_report,
+    bounds_summary,
+    lap_bounds,
+    saving_bounds,
+    traffic_bounds,
+)
+from coachable.domains.racing.families import home_track, typical_car
 from coachable.domains.racing.frontier import TANK, WORN, sweep
 from coachable.domains.racing.laps import SOLO, TRIAL_STEPS, circuits_report, circuits_summary, cut_laps, drive_circuits
 from coachable.domains.racing.metrics import TelemetryMeasures
@@ -21,8 +28,8 @@ from coachable.envs.racing.race.scenarios import Conditions
 from coachable.evaluation.episode_records import record_styles
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import drawing, shade
-from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
-from coachable.evaluation.style_grid import markdown_table, mean_of, policy_sentence, write_results
+from coachable.evaluation.statistics import bootstrap_interval, comparison_interval, rank_correlation
+from coachable.evaluation.style_grid import markdown_table, mean_of, policy_sentence, rows_where, write_results
 
 if TYPE_CHECKING:
     from coachable.domain import Domain
@@ -68,7 +75,7 @@ def evaluate_resources(domain: Domain, agent: LoadedPolicy, out: Path, settings:
     `laps.csv` (every lap), `stints.png` (resource left and lap times over laps, on the first circuit), `tradeoff.png`
     (range against pace, with the frontier), `report.md` and `summary.json`. An agent that was trained with several cars
     also races in traffic, see `race_in_traffic`, which adds `traffic.csv` and `traffic.png`. `circuits.csv` has the
-    laps of `drive_circuits`.
+    laps of `drive_circuits`, and `bounds.csv` the targets of the family with what was measured.
 
     Args:
         domain: Domain racing_resources, as the agent was trained in.
@@ -82,7 +89,7 @@ def evaluate_resources(domain: Domain, agent: LoadedPolicy, out: Path, settings:
     """
     out.mkdir(parents=True, exist_ok=True)
     trained, episodes, seed = agent.config.get("env", {}), settings.episodes, settings.seed
-    car, home = trained.get("car", "x2019"), home_track("resources", trained)
+    car, home = typical_car("resources", trained), home_track("resources", trained)
     rates, length = Resources.calibrated(car), load_track(home).length
     options: dict[str, Any] = {**settings.rollout, "steps": settings.steps or STINT_STEPS}
     rows: list[dict[str, Any]] = []
@@ -116,15 +123,18 @@ def evaluate_resources(domain: Domain, agent: LoadedPolicy, out: Path, settings:
     traffic = race_in_traffic(domain, agent, settings) if trained.get("cars", 1) > 1 else []
     circuits = drive_circuits(domain, agent, settings)
     summary["circuits"] = circuits_summary(circuits)
+    response = traffic_response(traffic)
+    bounds = lap_bounds(circuits, home) + saving_bounds(rows) + traffic_bounds(response)
+    summary["bounds"] = bounds_summary(bounds)
     report = _report(agent, rows, summary, seed, episodes) + circuits_report(circuits)
     if traffic:
-        summary["traffic"] = traffic_response(traffic)
-        report += traffic_report(traffic, summary["traffic"])
+        summary["traffic"] = response
+        report += traffic_report(traffic, response)
         draw_traffic(traffic, out / "traffic.png")
-    draw_stints([lap for lap in every if lap["circuit"] == home], out / "stints.png")
+    draw_stints(rows_where(every, circuit=home), out / "stints.png")
     draw_tradeoff(rows, frontiers, out / "tradeoff.png")
-    tables = {"stints": rows, "laps": every, "traffic": traffic, "circuits": circuits}
-    return write_results(out, report, summary, tables)
+    tables = {"bounds": bounds, "stints": rows, "laps": every, "traffic": traffic, "circuits": circuits}
+    return write_results(out, report + bounds_report(bounds), summary, tables)
 
 
 def frontier(track: str, car: str, resource: str) -> list[dict[str, float]]:
@@ -199,6 +209,8 @@ def _rows(
     pace = np.array([[stint.compared for stint in group] for group in stints])
     for index, weight in enumerate(weights):
         low, high = bootstrap_interval(reach[index])
+        gain = comparison_interval(reach[index], reach[0], lambda own, neutral: own / neutral - 1.0)
+        lost = comparison_interval(pace[index], pace[0], np.subtract)
         lap_time = mean_of(pace[index])
         clean = np.concatenate([stint.clean for stint in stints[index]])
         rows.append(
@@ -208,8 +220,12 @@ def _rows(
                 "range_km_low": low,
                 "range_km_high": high,
                 "range_gain": float(reach[index].mean() / reach[0].mean() - 1.0),
+                "range_gain_low": gain[0],
+                "range_gain_high": gain[1],
                 "lap_time": lap_time,
                 "seconds_lost": lap_time - mean_of(pace[0]),
+                "seconds_lost_low": lost[0],
+                "seconds_lost_high": lost[1],
                 "frontier_km": range_at(bound, lap_time),
                 "laps": len(clean),
                 "clean_laps": float(clean.mean()) if len(clean) else 0.0,
@@ -245,7 +261,7 @@ def _summary(
         }
     }
     for track, resource in dict.fromkeys((row["circuit"], row["resource"]) for row in rows):
-        own = [row for row in rows if (row["circuit"], row["resource"]) == (track, resource)]
+        own = rows_where(rows, circuit=track, resource=resource)
         weights, reach = (np.array([row[name] for row in own]) for name in ("weight", "range_km"))
         summary.setdefault(track, {})[resource] = {
             "rank_correlation": rank_correlation(weights, reach),
@@ -265,7 +281,7 @@ def draw_stints(laps: Sequence[Mapping[str, Any]], path: Path) -> None:
     labels = {"fuel": "fuel left [l]", "tyre": "mean tyre wear"}
     with drawing(path, 2, len(WEIGHTS), size=(9.5, 6.4)) as axes:
         for column, (resource, name) in enumerate(WEIGHTS.items()):
-            own = [lap for lap in laps if lap["resource"] == resource]
+            own = rows_where(laps, resource=resource)
             weights = sorted({lap["weight"] for lap in own})
             for index, weight in enumerate(weights):
                 color = shade(index, len(weights))
@@ -296,7 +312,7 @@ def draw_tradeoff(
     tracks = list(dict.fromkeys(track for track, _ in frontiers))
     with drawing(path, len(tracks), len(WEIGHTS), size=(9.5, 4.0 * len(tracks))) as panels:
         for axes, ((track, resource), bound) in zip(panels.flat, frontiers.items(), strict=True):
-            own = [row for row in rows if (row["circuit"], row["resource"]) == (track, resource)]
+            own = rows_where(rows, circuit=track, resource=resource)
             times, ranges = ([point[name] for point in bound] for name in ("lap_time", "range_km"))
             axes.plot(times, ranges, ls="--", label="point mass on a fixed line")
             axes.plot([row["lap_time"] for row in own], [row["range_km"] for row in own], marker="o", label="agent")

@@ -18,7 +18,7 @@ from coachable.envs.racing.race.scenarios import Conditions, Scenario
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import drawing, shade
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
-from coachable.evaluation.style_grid import markdown_table
+from coachable.evaluation.style_grid import markdown_table, rows_where
 from coachable.keys import STYLE_FEATURES
 
 if TYPE_CHECKING:
@@ -121,7 +121,7 @@ def traffic_response(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     response = []
     for sweep in SLOTS:
         for start, savers in dict.fromkeys((row["start"], row["savers"]) for row in rows):
-            own = [row for row in rows if (row["sweep"], row["start"], row["savers"]) == (sweep, start, savers)]
+            own = rows_where(rows, sweep=sweep, start=start, savers=savers)
             first, last = own[0], own[-1]
             weights = np.array([row["weight"] for row in own])
             follows = {
@@ -173,7 +173,7 @@ def draw_traffic(rows: Sequence[dict[str, Any]], path: Path) -> None:
     with drawing(path, 2, len(SLOTS), size=(9.5, 6.4), sharex=True) as panels:
         for column, name in zip(panels.T, SLOTS, strict=True):
             for start, savers in kinds:
-                own = [row for row in rows if (row["sweep"], row["start"], row["savers"]) == (name, start, savers)]
+                own = rows_where(rows, sweep=name, start=start, savers=savers)
                 weights = [row["weight"] for row in own]
                 color = shade(TRAFFIC_STARTS.index(start), len(TRAFFIC_STARTS))
                 style = {"color": color, "ls": "--" if savers == "all" else "-"}

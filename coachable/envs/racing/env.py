@@ -59,7 +59,8 @@ class RacingEnv(EnvBase):
         track: Name of a circuit, a `Track`, several of them, or the name of a set, see `load_tracks`. With several
             circuits, races take turns on them: race b drives its episode e on circuit b + e, counted from 0 and round
             and round.
-        car: Name of a shipped car, or "pool" for cars drawn from a pool, one model per race.
+        car: Name of a shipped car, or "pool" for cars drawn from a pool, one model per race and episode.
+        adaptive: Whether cars of the pool that spin are drawn more often; otherwise all are equally likely.
         scenarios: Kinds of starts of the episodes; by default the mixture of `race_scenarios`.
         conditions: Tyres and fuel at the start.
         resources: Wear and fuel rates.
@@ -83,7 +84,7 @@ class RacingEnv(EnvBase):
         seed: Seed of the starts; each race, up to `copies`, has a random stream of its own.
         num_threads: Ignored; torch's own threads are used.
 
-    Keys written: `observation` (N, D), `task_reward` (N, 1), `style_features` (N, 9 + 3 (A - 1)), `telemetry` (N, 13),
+    Keys written: `observation` (N, D), `task_reward` (N, 1), `style_features` (N, 9 + 3 (A - 1)), `telemetry` (N, 14),
     `scenario` (N, 1) int64, `done`, `terminated`, `truncated` (N, 1).
 
     Raises:
@@ -104,6 +105,7 @@ class RacingEnv(EnvBase):
         driver: Driver | None = None,
         track: str | Track | Sequence[str | Track] = "lakeside",
         car: str = "gt3",
+        adaptive: bool = True,
         scenarios: Sequence[Scenario] | None = None,
         conditions: Conditions | None = None,
         resources: Resources | None = None,
@@ -144,7 +146,7 @@ class RacingEnv(EnvBase):
         self.tracks = load_tracks(track)
         place = torch.device(device)
         self.course = Course(self.tracks, place)
-        self.garage = Garage(car, cars, self.races, place)
+        self.garage = Garage(car, cars, self.races, place, adaptive=adaptive)
         self.simulation = Simulation(
             self.garage.car, resources or Resources(), cars=cars, substeps=substeps, compile=compiled, device=place
         )

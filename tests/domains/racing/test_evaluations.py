@@ -116,19 +116,24 @@ def test_whoever_is_ahead_by_a_length_after_being_behind_has_overtaken():
 
 def test_a_race_ends_when_the_first_car_does():
     distance = np.array([[90.0, 80.0, 70.0], [101.0, 95.0, 99.0], [110.0, 140.0, 150.0]])
-    race = dict.fromkeys(("contact", "beside", "in_line"), np.eye(3)) | {"distance": distance, "off": np.zeros((3, 3))}
+    race = dict.fromkeys(("contact", "stranded", "beside", "in_line"), np.eye(3))
+    race |= {"distance": distance, "off": np.zeros((3, 3)), "gap_in_line": np.full((3, 3), np.nan)}
+    race["gap_beside"] = np.array([[2.0, 0.0, np.nan], [4.0, 0.0, np.nan], [9.0, 0.0, 7.0]])
     result = _pair_results(race, np.array([2, 0, 1]), np.array([True, False, True]), 100.0)
     assert result["top_two"].tolist() == [1.0, 1.0]
     assert result["won"].tolist() == [1.0, 0.0]
     assert result["places_gained"].tolist() == [2.0, 0.0]
-    assert result["contacts"].tolist() == [1.0, 0.0]  # the last one came after the end
+    assert result["contacts"].tolist() == result["stranded"].tolist() == [1.0, 0.0]  # the last one came after the end
+    assert result["contacts_per_minute"].tolist() == pytest.approx([300.0, 0.0])  # one in 0.2 s
+    assert result["gap_beside"][0] == 3.0 and np.isnan([result["gap_beside"][1], *result["gap_in_line"]]).all()
     assert result["beside"].tolist() == result["in_line"].tolist() == [0.5, 0.0]
 
 
 def test_places_of_the_first_minute_count_apart():
     steps = np.arange(700.0)
     distance = np.stack([40 * steps, 41 * steps - 25, 20 * steps + 13_100], axis=1)  # the third is passed at 655, 625
-    race = {name: np.zeros((700, 3)) for name in ("contact", "beside", "in_line", "off")}
+    names = ("contact", "stranded", "beside", "in_line", "off", "gap_beside", "gap_in_line")
+    race = {name: np.zeros((700, 3)) for name in names}
     result = _pair_results({"distance": distance, **race}, np.array([1, 2, 0]), np.array([True, True, False]), 1e9)
     assert result["places_gained"].tolist() == [0.0, 2.0]
     assert result["places_later"].tolist() == [1.0, 1.0]

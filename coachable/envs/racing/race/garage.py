@@ -18,20 +18,21 @@ class Garage:
     """One shipped car for all races, or a pool from which each race draws one model for all of its cars.
 
     Models that spin are drawn more often, with p proportional to 0.1 + EMA(spins per car and episode) (our choice, for
-    the paper's adaptive sampling).
+    the paper's adaptive sampling), unless `adaptive` is False.
 
     Args:
         name: Name of a shipped car, or "pool".
         cars: Number A of cars in a race.
         races: Number B of races.
         device: Device of the parameters.
+        adaptive: Whether models that spin are drawn more often.
 
     Raises:
         ValueError: If there is no such car.
     """
 
-    def __init__(self, name: str, cars: int, races: int, device: torch.device) -> None:
-        self.pooled = name == POOL
+    def __init__(self, name: str, cars: int, races: int, device: torch.device, *, adaptive: bool = True) -> None:
+        self.pooled, self.adaptive = name == POOL, adaptive
         self.typical = load_car("gt3" if self.pooled else name)
         self.cars, self.device = cars, device
         self.car: Car = self.typical
@@ -61,7 +62,7 @@ class Garage:
         count = torch.zeros_like(self.spinning).index_add_(0, self.model, ended.to(mean.dtype))
         change = total / count.clamp(min=1.0) - self.spinning
         self.spinning = self.spinning + _RATE * torch.where(count > 0, change, 0.0)
-        odds = (_BASE + self.spinning).cumsum(0)
+        odds = (_BASE + (self.spinning if self.adaptive else 0.0 * self.spinning)).cumsum(0)
         u = uniforms(seeds ^ 0x5DEECE66D, episode, 1, 1)[0, 0]
         drawn = torch.bucketize(u * odds[-1], odds[:-1], right=True)
         self.model = torch.where(races, drawn, self.model)

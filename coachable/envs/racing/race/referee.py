@@ -55,6 +55,7 @@ TELEMETRY = (
     "sideslip",  # angle from the heading to the velocity, in (-π, π] [rad]
     "heading",  # relative to the track [rad]
     "curvature",  # of the track [1/m]
+    "stranded",  # flag: the car gives up, or waits to be put back
 )
 
 
@@ -66,7 +67,7 @@ class Verdict(NamedTuple):
     observation: Tensor  # (N, D)
     reward: Tensor  # (N,) of the task
     features: Tensor  # (N, F)
-    telemetry: Tensor  # (N, 13)
+    telemetry: Tensor  # (N, 14)
     terminated: Tensor  # (N,) bool
 
 
@@ -200,7 +201,13 @@ class Referee:
         packed_run = torch.stack(list(run))
         observation = self.observe(new, packed_run, compound, car, wheels, group)
         return Verdict(
-            new, packed_run, observation, reward, features, self._telemetry(new, run, progress, group), terminated
+            new,
+            packed_run,
+            observation,
+            reward,
+            features,
+            self._telemetry(new, run, progress, stranded, group),
+            terminated,
         )
 
     def observe(
@@ -282,7 +289,7 @@ class Referee:
         length = self._split(car.length) if isinstance(car.length, Tensor) else car.length
         return slipstream(others, length).reshape(-1)
 
-    def _telemetry(self, packed: Tensor, run: Run, progress: Tensor, group: Tensor | None) -> Tensor:
+    def _telemetry(self, packed: Tensor, run: Run, progress: Tensor, stranded: Tensor, group: Tensor | None) -> Tensor:
         s = CarState(*packed.unbind(0))
         rank = torch.ones_like(s.x)
         if group is not None:
@@ -305,6 +312,7 @@ class Referee:
                 sideslip(s.vx, s.vy),
                 torch.atan2(run.across, run.along),
                 run.curvature,
+                stranded.to(progress.dtype),
             ],
             dim=-1,
         )
