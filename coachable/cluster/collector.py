@@ -103,7 +103,9 @@ class ClusterCollector(AsyncCollector):
         self._open: dict[int, Tensor] = {}  # running trajectories by worker
         self._closed: list[Tensor] = []
         self._staleness: list[int] = []
-        self._connection = Connection(address, num_collectors, cpus_per_worker, patience, min(group_size, num_collectors))
+        self._connection = Connection(
+            address, num_collectors, cpus_per_worker, patience, min(group_size, num_collectors)
+        )
         code = code_version()
 
         def settings(worker: int, start: int) -> WorkerSettings:
