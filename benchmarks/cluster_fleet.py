@@ -1,11 +1,12 @@
 """A fleet of slow workers on Ray, some of which are killed all the time, as a table and plots.
 
-    python benchmarks/cluster_fleet.py                                          100 workers, half an hour per environment
+    python benchmarks/cluster_fleet.py                                  100 workers, half an hour per environment
     python benchmarks/cluster_fleet.py --workers 25 --minutes 3 --only pendulum
 
-Each worker is held to 5 env-steps/s, as a game console is, and the learner updates all the time. Measured are the humanoid, a fight and
-Gymnasium's pendulum, from when all workers work. What was measured is written to `--out`; an environment that has been
-measured to its end is not measured again, so that the same command continues after an interruption.
+Each worker is held to 5 env-steps/s, as a game console is, and the learner updates all the time. Measured are the
+humanoid, a fight and Gymnasium's pendulum, from when all workers work. What was measured is written to `--out`; an
+environment that has been measured to its end is not measured again, so that the same command continues after an
+interruption.
 
 The machine is not driven out of memory: workers are started one after the other, and the measurement ends with an
 error as soon as less than `--reserve` GB are left.
@@ -90,13 +91,10 @@ class Fleet:
 
     def __init__(self, name: str, options: argparse.Namespace) -> None:
         recipe, arguments = ENVIRONMENTS[name]
-        cores = os.cpu_count() or 1
+        share = min(1.0, (os.cpu_count() or 1) / (2 * options.workers))
         arguments = [*arguments, *QUICK, "collector=ray", f"collector.num_collectors={options.workers}"]
         arguments += [f"collector.group_size={options.group}", f"collector.worker_throttle={options.rate}"]
-        arguments += [
-            f"collector.cpus_per_worker={min(1.0, cores / (2 * options.workers))}",
-            "collector.steps_per_batch=8",
-        ]
+        arguments += [f"collector.cpus_per_worker={share}", "collector.steps_per_batch=8"]
         arguments += [f"train.throttle={2 * options.rate * options.workers}"]  # more than the workers give
         arguments += [f"run_dir={options.out / f'{name}_{time.time():.0f}'}"]
         self.options = options

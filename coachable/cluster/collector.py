@@ -42,8 +42,8 @@ class ClusterCollector(AsyncCollector):
         address: HOST:PORT of a cluster, "auto" for the one on this host, or None for `RAY_ADDRESS` and without it a
             local Ray.
         cpus_per_worker: Number of cores that each worker reserves; a share such as 0.1 puts several on one core.
-        group_size: Number of workers of one Ray actor. If there are several, each is a process that shares with the others
-            the memory of whatever is loaded before it starts; they reserve their cores on one node.
+        group_size: Number of workers of one Ray actor, which reserves the cores of all on one node. If there are
+            several, each is a process that shares the memory of Python and torch with the others.
         weights_every: Number of updates between two offers of weights to the workers.
         queue_size: Number of batches that wait for the learner before workers are no longer asked for more.
         worker_throttle: Highest rate of each worker [env-steps/s]; None for no limit.
