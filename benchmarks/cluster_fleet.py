@@ -20,6 +20,7 @@ import random
 import signal
 import statistics
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Iterable
@@ -110,10 +111,24 @@ class Fleet:
 
     def run(self) -> list[Row]:
         """Returns the rows of the log from when all workers worked; the last one has what is measured once."""
+        threading.Thread(target=self._wait_for_all, args=(self.workers.queue_size,), daemon=True).start()
+        self.workers.queue_size = 0  # workers that have started wait for the others
         self.train.run()
         if self._last_row().get("done") != 1.0:
             sys.exit("the measurement was interrupted: the same command starts this environment again")
         return self.rows
+
+    def _wait_for_all(self, queue_size: int) -> None:
+        alive = -1
+        while alive < self.options.workers:
+            time.sleep(1.0)
+            if (free := memory_left()) < self.options.reserve:
+                self.workers.error = MemoryError(f"only {free:.1f} GB of memory are left with {alive} workers")
+                return
+            if alive // 10 < self.workers.alive() // 10:
+                print(f"{self.workers.alive()} workers have started, {free:.1f} GB left", file=sys.stderr, flush=True)
+            alive = self.workers.alive()
+        self.workers.queue_size = queue_size
 
     def _last_row(self) -> Row:
         return self.rows[-1] if self.rows else {}
@@ -121,17 +136,13 @@ class Fleet:
     def _observe(self, row: Row) -> None:
         self._write(row)
         now = time.monotonic()
-        free = memory_left()
-        if free < self.options.reserve:
+        if (free := memory_left()) < self.options.reserve:
             self._end()
-            print(f"only {free:.1f} GB of memory are left with {self.workers.alive()} workers", file=sys.stderr)
+            print(f"only {free:.1f} GB of memory are left", file=sys.stderr)
             return
         if "workers/queue" not in row or self._last_row().get("done"):
             return
         if not self.began:
-            print(f"{self.workers.alive()} workers, {free:.1f} GB left", file=sys.stderr, flush=True)
-            if self.workers.alive() < self.options.workers:
-                return
             self.began, self.next_kill = now, now + 60.0 / self.options.kills
             self.cpu = {slot.pid: cpu_seconds(slot.pid) for slot in self.workers.slots}
         wanted = ("frames", "updates", "seconds/update")

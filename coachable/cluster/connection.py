@@ -83,7 +83,12 @@ class Connection:
         _remove_leftovers()
         self._folder = tempfile.mkdtemp(prefix=f"{_FOLDER}{os.getpid()}_")
         try:
-            self._init(object_store_memory=_STORE, include_dashboard=False, _temp_dir=self._folder)
+            self._init(
+                object_store_memory=_STORE,
+                include_dashboard=False,
+                _temp_dir=self._folder,
+                _system_config={"worker_niceness": 0},  # Ray's 15 starves workers where all cores are busy
+            )
         except Exception as error:  # Ray raises many types here, plain `Exception` among them
             raise ClusterError(f"collector=ray: Ray does not start on this host: {_last_line(error)}") from error
 

@@ -127,6 +127,8 @@ def test_a_local_ray_leaves_nothing_behind(monkeypatch, tmp_path):
         assert not killed.exists() and len(os.listdir(folder)) == 1
         started = set(here.children(recursive=True)) - before
         assert started
+        niceness = connection.ray.remote(lambda: os.nice(0)).options(num_cpus=0.1).remote()
+        assert connection.ray.get(niceness) == os.nice(0), "workers are not slower than the learner's other processes"
         connection.close()
         psutil.wait_procs(started, timeout=30.0)
         assert not set(here.children(recursive=True)) - before

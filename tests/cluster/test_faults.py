@@ -182,6 +182,32 @@ def test_without_any_worker_the_training_ends_with_one_sentence_and_its_checkpoi
     watch.require_nothing_lost()
 
 
+def parent(pid):
+    return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+
+
+def test_a_group_whose_actor_is_killed_starts_again(cluster, tmp_path):
+    killed = []
+
+    def kill(watch):
+        if not killed and len(watch.serials()) == 2:
+            killed.extend(slot.pid for slot in watch.train.collector.workers.slots)
+            actors = {parent(parent(pid)) for pid in killed}  # below it is the process that forks
+            assert len(actors) == 1
+            killed.extend(actors)
+            os.kill(killed[-1], signal.SIGKILL)
+        elif {(0, 1), (1, 1)} <= set(watch.serials()):
+            end(watch)
+
+    train = cluster_train(tmp_path, total_frames=10**6, group_size=2)
+    watch = Watch(train, kill)
+    latest = train.run()
+    assert latest["workers/restarts"] == 2
+    watch.require_nothing_lost()
+    watch.require_sums_within_trajectories()
+    assert not wait_for_end(killed), "workers end with their actor"
+
+
 def test_an_error_of_all_workers_at_once_is_told_at_once(cluster, tmp_path):
     train = cluster_train(tmp_path, "raise always", patience=10_000.0)
     with pytest.raises(ClusterError, match=r"every Ray worker fails before its first batch; worker .* has no length"):
