@@ -42,6 +42,8 @@ class ClusterCollector(AsyncCollector):
         address: HOST:PORT of a cluster, "auto" for the one on this host, or None for `RAY_ADDRESS` and without it a
             local Ray.
         cpus_per_worker: Number of cores that each worker reserves; a share such as 0.1 puts several on one core.
+        group_size: Number of workers of one Ray actor, which reserves the cores of all on one node. If there are
+            several, each is a process that shares the memory of Python and torch with the others.
         weights_every: Number of updates between two offers of weights to the workers.
         queue_size: Number of batches that wait for the learner before workers are no longer asked for more.
         worker_throttle: Highest rate of each worker [env-steps/s]; None for no limit.
@@ -67,6 +69,7 @@ class ClusterCollector(AsyncCollector):
         policy_device: torch.device | str | None = None,
         address: str | None = None,
         cpus_per_worker: float = 1.0,
+        group_size: int = 1,
         weights_every: int = 1,
         queue_size: int = 16,
         worker_throttle: float | None = None,
@@ -74,6 +77,8 @@ class ClusterCollector(AsyncCollector):
     ) -> None:
         if num_collectors > MAX_WORKERS:
             raise ValueError(f"collector.num_collectors={num_collectors}: expected at most {MAX_WORKERS}")
+        if group_size < 1:
+            raise ValueError(f"collector.group_size={group_size}: expected at least 1")
         frames = frames_per_batch // num_collectors * steps_per_batch
         if worker_throttle is not None and 2 * frames / worker_throttle >= patience / 2:
             raise ValueError(
@@ -98,7 +103,9 @@ class ClusterCollector(AsyncCollector):
         self._open: dict[int, Tensor] = {}  # running trajectories by worker
         self._closed: list[Tensor] = []
         self._staleness: list[int] = []
-        self._connection = Connection(address, num_collectors, cpus_per_worker, patience)
+        self._connection = Connection(
+            address, num_collectors, cpus_per_worker, patience, min(group_size, num_collectors)
+        )
         code = code_version()
 
         def settings(worker: int, start: int) -> WorkerSettings:
@@ -110,6 +117,7 @@ class ClusterCollector(AsyncCollector):
             num_collectors,
             settings,
             cpus_per_worker,
+            group_size,
             queue_size,
             patience,
             self._connection.starts_at_once(),

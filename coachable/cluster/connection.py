@@ -36,13 +36,16 @@ class Connection:
         num_workers: Number of workers.
         cpus_per_worker: Number of cores that each worker reserves.
         patience: Time for a node to answer [s].
+        group_size: Number of workers that have to be on the same node.
 
     Raises:
         ImportError: If Ray is not installed.
         ClusterError: If no cluster answers, it has too few cores, or a node has other code.
     """
 
-    def __init__(self, address: str | None, num_workers: int, cpus_per_worker: float, patience: float) -> None:
+    def __init__(
+        self, address: str | None, num_workers: int, cpus_per_worker: float, patience: float, group_size: int = 1
+    ) -> None:
         if find_spec("ray") is None:
             raise ImportError(f"collector=ray needs Ray: {how_to_install('cluster')}, or choose collector=process")
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray reports its use over the network otherwise
@@ -57,7 +60,7 @@ class Connection:
                 self._join(address)
             elif self._is_ours:
                 self._start()
-            self._check_cores(num_workers, cpus_per_worker)
+            self._check_cores(num_workers, cpus_per_worker, group_size)
             if self._folder is None:  # a Ray that was started here runs the code of this process
                 self._check_code(patience)
         except BaseException:
@@ -80,7 +83,12 @@ class Connection:
         _remove_leftovers()
         self._folder = tempfile.mkdtemp(prefix=f"{_FOLDER}{os.getpid()}_")
         try:
-            self._init(object_store_memory=_STORE, include_dashboard=False, _temp_dir=self._folder)
+            self._init(
+                object_store_memory=_STORE,
+                include_dashboard=False,
+                _temp_dir=self._folder,
+                _system_config={"worker_niceness": 0},  # Ray's 15 starves workers where all cores are busy
+            )
         except Exception as error:  # Ray raises many types here, plain `Exception` among them
             raise ClusterError(f"collector=ray: Ray does not start on this host: {_last_line(error)}") from error
 
@@ -104,12 +112,18 @@ class Connection:
     def _init(self, **options: Any) -> None:
         self.ray.init(log_to_driver=False, logging_level=logging.ERROR, **options)
 
-    def _check_cores(self, num_workers: int, cpus_per_worker: float) -> None:
+    def _check_cores(self, num_workers: int, cpus_per_worker: float, group_size: int) -> None:
         cores, needed = self.ray.cluster_resources().get("CPU", 0.0), num_workers * cpus_per_worker
         if cores + 1e-6 < needed:
             raise ClusterError(
                 f"collector.num_collectors={num_workers} with collector.cpus_per_worker={cpus_per_worker:g} need "
                 f"{needed:g} cores: the cluster has {cores:g}; expected fewer workers, or a share of a core for each"
+            )
+        largest = max(node["Resources"].get("CPU", 0.0) for node in self.ray.nodes() if node["Alive"])
+        if largest + 1e-6 < group_size * cpus_per_worker:
+            raise ClusterError(
+                f"collector.group_size={group_size} with collector.cpus_per_worker={cpus_per_worker:g} needs "
+                f"{group_size * cpus_per_worker:g} cores of one node: the largest has {largest:g}"
             )
 
     def _check_code(self, patience: float) -> None:

@@ -1,5 +1,6 @@
-"""Rollout worker, which runs in a Ray actor: environments, a copy of the policy, and TorchRL's collector."""
+"""Rollout worker, which runs in or below a Ray actor: environments, a copy of the policy, and TorchRL's collector."""
 
+import mmap
 import os
 import sys
 from collections.abc import Iterator
@@ -125,19 +126,26 @@ class RolloutWorker:
             simulation.follow(self.policy)
         self.serial = 0
         self.version = -1
-        self._coming: tuple[int, Any] | None = None
         self._batches: Iterator[TensorDictBase] = iter(self.collector)
         return os.getpid(), os.uname().nodename
 
-    def collect(self, version: int, weights: list[Any], random: bool) -> Batch:
+    def load(self, version: int, file: int) -> None:
+        """Load weights.
+
+        Args:
+            version: Number of updates that they have seen.
+            file: Descriptor of a file that holds them as `flat_weights` returns them.
+        """
+        pages = mmap.mmap(file, 0, access=mmap.ACCESS_COPY)  # not copied, but torch wants memory that it may write to
+        load_flat_weights(self.policy, torch.frombuffer(pages, dtype=torch.float32))
+        self.version = version
+
+    def collect(self, random: bool) -> Batch:
         """Collect a batch.
 
         Args:
-            version: Number of updates that the newest weights have seen.
-            weights: The reference of these weights, in a list, so that Ray does not wait for them.
             random: Whether to act with uniformly random actions.
         """
-        self._take((version, weights[0]))
         self.collector.init_random_frames = sys.maxsize if random else 0
         data = next(self._batches).contiguous()
         number = self.settings.start * MAX_WORKERS + self.settings.worker
@@ -149,18 +157,3 @@ class RolloutWorker:
         }
         self.serial += 1
         return Batch(self.serial - 1, self.version, tuple(data.shape), entries)
-
-    def _take(self, newest: tuple[int, Any]) -> None:
-        """Load the newest weights that have arrived at this node; only the first ones are waited for."""
-        import ray
-
-        for _ in range(2):  # those that were on their way, then those that the learner offers now
-            if self._coming is None and newest[0] > self.version:
-                self._coming = newest
-            if self._coming is None:
-                return
-            version, reference = self._coming
-            if self.version >= 0 and not ray.wait([reference], timeout=0)[0]:
-                return
-            load_flat_weights(self.policy, torch.from_numpy(ray.get(reference).copy()))
-            self.version, self._coming = version, None

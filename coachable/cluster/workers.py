@@ -10,7 +10,9 @@ from typing import Any
 from torch import Tensor
 
 from coachable.cluster.connection import ClusterError
-from coachable.cluster.worker import Batch, RolloutWorker, WorkerSettings
+from coachable.cluster.forked_worker import ProcessDiedError
+from coachable.cluster.worker import Batch, WorkerSettings
+from coachable.cluster.worker_host import WorkerHost
 
 __all__ = ["Arrival", "Loss", "Slot", "Workers"]
 
@@ -43,7 +45,7 @@ class Slot:
     Attributes:
         worker: Number of the worker.
         starts: How often it was started in the whole run.
-        actor: Its Ray actor, or None until it is started again.
+        actor: The Ray actor that it belongs to, or None until it is started again.
         call: Reference of the answer that it owes, or None while it is idle.
         is_ready: Whether it has started, so that `call` is a batch.
         since: Time of the call [s].
@@ -63,6 +65,10 @@ class Slot:
     retry: float = 0.0
     pid: int = 0
     host: str = ""
+
+    def key(self) -> tuple[int, int]:
+        """Return what `WorkerHost` knows the worker by: its number, and how often it had been started before."""
+        return self.worker, self.starts - 1
 
 
 @dataclass
@@ -89,6 +95,7 @@ class Workers:
         count: Number of workers.
         settings: Returns the settings of a worker from its number and start.
         cpus_per_worker: Number of cores that each reserves.
+        group_size: Number of workers that one Ray actor starts, each in a process of its own if there are several.
         queue_size: Number of batches that wait before workers are no longer asked.
         patience: Time without any batch or start after which the training ends [s].
         starts_at_once: Number of workers that may start at the same time, because each keeps a core busy for seconds.
@@ -100,6 +107,7 @@ class Workers:
     count: int
     settings: Callable[[int, int], WorkerSettings]
     cpus_per_worker: float
+    group_size: int
     queue_size: int
     patience: float
     starts_at_once: int
@@ -111,6 +119,7 @@ class Workers:
     def __post_init__(self) -> None:
         self.slots = [Slot(number) for number in range(self.count)]
         self._offer = _Offer()
+        self._actors: dict[int, Any] = {}  # by group
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
         self._last = 0.0  # when a batch arrived, a worker started, or the queue was full [s]
@@ -140,6 +149,8 @@ class Workers:
             self._thread.join()
         for slot in self.slots:
             self._kill(slot)
+        for actor in self._actors.values():
+            self.ray.kill(actor, no_restart=True)
 
     def alive(self) -> int:
         """Return the number of workers that have started and were not lost."""
@@ -167,10 +178,18 @@ class Workers:
         return self.patience / 2 if slot.is_ready else self.patience
 
     def _launch(self, slot: Slot) -> None:
-        actor = self.ray.remote(RolloutWorker).options(
-            num_cpus=self.cpus_per_worker, scheduling_strategy="SPREAD", max_restarts=0, max_task_retries=0
-        )
-        slot.actor = actor.remote()
+        group = slot.worker // self.group_size
+        if group not in self._actors:
+            size = min(self.group_size, self.count - group * self.group_size)
+            actor = self.ray.remote(WorkerHost).options(
+                num_cpus=self.cpus_per_worker * size,
+                max_concurrency=1 if self.group_size == 1 else 2 * size,  # also for ending workers that hang
+                scheduling_strategy="SPREAD",
+                max_restarts=0,
+                max_task_retries=0,
+            )
+            self._actors[group] = actor.remote(self.group_size > 1)
+        slot.actor = self._actors[group]
         slot.call = slot.actor.start.remote(self.task, self.settings(slot.worker, slot.starts))
         slot.starts += 1
         slot.since = time.monotonic()
@@ -189,7 +208,9 @@ class Workers:
             try:
                 answer = self.ray.get(reference)
             except self.ray.exceptions.RayError as error:
-                self._lose(slot, self._reason_of(error), raised=isinstance(error, self.ray.exceptions.RayTaskError))
+                if isinstance(error, self.ray.exceptions.RayActorError):
+                    self._forget(slot.actor)
+                self._lose(slot, self._reason_of(error), raised=self._is_raised(error))
                 continue
             slot.call = None
             if not slot.is_ready:
@@ -209,7 +230,7 @@ class Workers:
                 self._last = time.monotonic()  # the workers wait for the learner, not the other way round
                 return
             version, reference = self._stored_weights()
-            slot.call = slot.actor.collect.remote(version, [reference], self.is_random())
+            slot.call = slot.actor.collect.remote(slot.key(), version, [reference], self.is_random())
             slot.since = time.monotonic()
 
     def _stored_weights(self) -> tuple[int, Any]:
@@ -243,10 +264,18 @@ class Workers:
                 raise ClusterError(f"every Ray worker fails before its first batch; {self._reason}.")
 
     def _kill(self, slot: Slot) -> None:
-        if slot.actor is not None:
-            self.ray.kill(slot.actor, no_restart=True)
+        group = slot.worker // self.group_size
+        if slot.actor is not None and slot.actor is self._actors.get(group):
+            if self.group_size == 1:
+                self.ray.kill(self._actors.pop(group), no_restart=True)
+            else:
+                slot.actor.end.remote(slot.key())
         slot.actor = slot.call = None
         slot.is_ready = False
+
+    def _forget(self, actor: Any) -> None:
+        """Do without an actor that has died, so that its workers start in a new one."""
+        self._actors = {group: other for group, other in self._actors.items() if other is not actor}
 
     def _check_patience(self) -> None:
         if time.monotonic() - self._last > self.patience:
@@ -254,10 +283,16 @@ class Workers:
                 f"no Ray worker delivered a batch for {self.patience:g} s (collector.patience); {self._reason}."
             )
 
+    def _is_raised(self, error: Any) -> bool:
+        """Return whether a worker has raised an error, and did not just end."""
+        return isinstance(error, self.ray.exceptions.RayTaskError) and not isinstance(error.cause, ProcessDiedError)
+
     def _reason_of(self, error: Any) -> str:
         exceptions = self.ray.exceptions
         if isinstance(error, exceptions.RayTaskError):
             cause = error.cause if isinstance(error.cause, BaseException) else error
+            if isinstance(cause, ProcessDiedError):
+                return str(cause)
             lines = [line.strip() for line in str(cause).splitlines() if line.strip()] or [""]
             return f"{type(cause).__name__}: {lines[-1] if cause is error else lines[0]}".rstrip(".")
         if isinstance(error, exceptions.RayActorError):

@@ -157,6 +157,7 @@ class Settings:
         num_collectors=COUNT,
         steps_per_batch=COUNT,
         cpus_per_worker=POSITIVE,
+        group_size=COUNT,
         weights_every=COUNT,
         queue_size=COUNT,
         worker_throttle=Range("(0, inf)", optional=True),

@@ -42,6 +42,7 @@ def running_cluster():
         patch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), str(ROOT / "recipes")]))
         patch.setenv("RAY_AUTH_MODE", "disabled")
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        patch.setenv("RAY_worker_niceness", "0")  # with Ray's 15 workers get nothing while all cores are busy
         patch.setenv("RAY_TMPDIR", folder)
         cluster = LocalCluster()
         patch.setenv("RAY_ADDRESS", cluster.address)

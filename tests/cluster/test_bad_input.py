@@ -67,6 +67,15 @@ def test_fewer_cores_than_workers(cluster):
 
 
 @pytest.mark.ray
+def test_a_group_that_is_larger_than_every_node(cluster):
+    with pytest.raises(
+        ClusterError,
+        match=r"^collector.group_size=3 with collector.cpus_per_worker=1 needs 3 cores of one node: the largest has 2$",
+    ):
+        collector(num_collectors=4, group_size=3)
+
+
+@pytest.mark.ray
 def test_a_node_with_another_coachable(cluster, tmp_path):
     """The node's processes find a changed copy of the package first."""
     other = tmp_path / "other"
@@ -94,6 +103,11 @@ def test_a_node_that_does_not_answer(cluster):
     assert not ray.is_initialized()
 
 
+def shared_memory():
+    """Files in shared memory, without the semaphores of other programs."""
+    return {name for name in os.listdir("/dev/shm") if not name.startswith("sem.")}
+
+
 @pytest.mark.ray
 def test_a_local_ray_leaves_nothing_behind(monkeypatch, tmp_path):
     pytest.importorskip("ray")
@@ -106,14 +120,16 @@ def test_a_local_ray_leaves_nothing_behind(monkeypatch, tmp_path):
         monkeypatch.setattr(tempfile, "tempdir", folder)
         killed = Path(folder) / "coachable_ray_4194305_x"  # above the largest number of a process
         killed.mkdir()
-        shared = set(os.listdir("/dev/shm"))
+        shared = shared_memory()
         here = psutil.Process()
         before = set(here.children(recursive=True))
         connection = Connection(None, 1, 0.1, 60.0)
         assert not killed.exists() and len(os.listdir(folder)) == 1
         started = set(here.children(recursive=True)) - before
         assert started
+        niceness = connection.ray.remote(lambda: os.nice(0)).options(num_cpus=0.1).remote()
+        assert connection.ray.get(niceness) == os.nice(0), "workers are not slower than the learner's other processes"
         connection.close()
         psutil.wait_procs(started, timeout=30.0)
         assert not set(here.children(recursive=True)) - before
-        assert os.listdir(folder) == [] and set(os.listdir("/dev/shm")) <= shared
+        assert os.listdir(folder) == [] and shared_memory() <= shared

@@ -17,6 +17,8 @@ from tests.cluster.workers_of_tests import Watch, cluster_train
 
 pytestmark = [pytest.mark.ray, pytest.mark.filterwarnings("ignore:a Ray worker was lost")]
 
+one_or_two = pytest.mark.parametrize("group_size", [1, 2])
+
 
 def is_alive(pid):
     try:
@@ -41,8 +43,9 @@ def end_after_restart(watch):
         end(watch)
 
 
-def test_every_batch_comes_with_the_weights_of_its_version(cluster, tmp_path):
-    train = cluster_train(tmp_path)
+@one_or_two
+def test_every_batch_comes_with_the_weights_of_its_version(cluster, tmp_path, group_size):
+    train = cluster_train(tmp_path, group_size=group_size)
     actor, weights = train.learner.loss_module.actor_network, {0: None}
     offer = train.collector.workers.offer
 
@@ -68,7 +71,8 @@ def test_every_batch_comes_with_the_weights_of_its_version(cluster, tmp_path):
     watch.require_sums_within_trajectories()
 
 
-def test_workers_killed_in_the_middle_of_a_batch_are_replaced(cluster, tmp_path):
+@one_or_two
+def test_workers_killed_in_the_middle_of_a_batch_are_replaced(cluster, tmp_path, group_size):
     killed = []
 
     def kill(watch):
@@ -80,7 +84,7 @@ def test_workers_killed_in_the_middle_of_a_batch_are_replaced(cluster, tmp_path)
             time.sleep(0.02)  # of the 0.05 s that a batch takes
             os.kill(killed[-1], signal.SIGKILL)
 
-    train = cluster_train(tmp_path, total_frames=10**6)
+    train = cluster_train(tmp_path, total_frames=10**6, group_size=group_size)
     watch = Watch(train, kill)
     latest = train.run()
     assert latest["workers/restarts"] == 2
@@ -89,8 +93,9 @@ def test_workers_killed_in_the_middle_of_a_batch_are_replaced(cluster, tmp_path)
     assert not wait_for_end(killed)
 
 
-def test_an_error_in_one_worker_and_its_replacement(cluster, tmp_path):
-    train = cluster_train(tmp_path, "raise", total_frames=10**6)
+@one_or_two
+def test_an_error_in_one_worker_and_its_replacement(cluster, tmp_path, group_size):
+    train = cluster_train(tmp_path, "raise", total_frames=10**6, group_size=group_size)
 
     watch = Watch(train, end_after_restart)
     with pytest.warns(
@@ -101,10 +106,11 @@ def test_an_error_in_one_worker_and_its_replacement(cluster, tmp_path):
     watch.require_sums_within_trajectories()
 
 
-def test_nobody_waits_for_a_slow_worker_and_one_that_never_answers_is_replaced(cluster, tmp_path):
+@one_or_two
+def test_nobody_waits_for_a_slow_worker_and_one_that_never_answers_is_replaced(cluster, tmp_path, group_size):
     (tmp_path / "slow").mkdir()
     (tmp_path / "hang").mkdir()
-    train = cluster_train(tmp_path / "slow", "slow", total_frames=600)
+    train = cluster_train(tmp_path / "slow", "slow", total_frames=600, group_size=group_size)
     watch = Watch(train)
     train.run()
     counts = sorted(len(serials) for serials in watch.serials().values())
@@ -116,7 +122,7 @@ def test_nobody_waits_for_a_slow_worker_and_one_that_never_answers_is_replaced(c
         workers.patience = 20.0 if len(watch.serials()) == 2 and not workers.restarts else 600.0
         end_after_restart(watch)
 
-    train = cluster_train(tmp_path / "hang", "hang", total_frames=10**6)
+    train = cluster_train(tmp_path / "hang", "hang", total_frames=10**6, group_size=group_size)
     watch = Watch(train, lose_patience)
     with pytest.warns(UserWarning, match=r"it did not answer for 10 s \(see collector\.patience\)"):
         train.run()
@@ -176,6 +182,32 @@ def test_without_any_worker_the_training_ends_with_one_sentence_and_its_checkpoi
     watch.require_nothing_lost()
 
 
+def parent(pid):
+    return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+
+
+def test_a_group_whose_actor_is_killed_starts_again(cluster, tmp_path):
+    killed = []
+
+    def kill(watch):
+        if not killed and len(watch.serials()) == 2:
+            killed.extend(slot.pid for slot in watch.train.collector.workers.slots)
+            actors = {parent(parent(pid)) for pid in killed}  # below it is the process that forks
+            assert len(actors) == 1
+            killed.extend(actors)
+            os.kill(killed[-1], signal.SIGKILL)
+        elif {(0, 1), (1, 1)} <= set(watch.serials()):
+            end(watch)
+
+    train = cluster_train(tmp_path, total_frames=10**6, group_size=2)
+    watch = Watch(train, kill)
+    latest = train.run()
+    assert latest["workers/restarts"] == 2
+    watch.require_nothing_lost()
+    watch.require_sums_within_trajectories()
+    assert not wait_for_end(killed), "workers end with their actor"
+
+
 def test_an_error_of_all_workers_at_once_is_told_at_once(cluster, tmp_path):
     train = cluster_train(tmp_path, "raise always", patience=10_000.0)
     with pytest.raises(ClusterError, match=r"every Ray worker fails before its first batch; worker .* has no length"):
@@ -188,7 +220,8 @@ from pathlib import Path
 from tests.cluster.workers_of_tests import Watch, cluster_train
 warnings.simplefilter("ignore")
 folder = Path(sys.argv[1])
-train = cluster_train(folder, total_frames=10**6, checkpoint_interval=0.0, address=sys.argv[2])
+options = {"address": sys.argv[2], "group_size": int(sys.argv[3])}
+train = cluster_train(folder, total_frames=10**6, checkpoint_interval=0.0, **options)
 
 def tell(watch):
     pids = [slot.pid for slot in watch.train.collector.workers.slots]
@@ -201,8 +234,9 @@ train.run()
 """
 
 
-def test_a_killed_learner_resumes_from_its_checkpoint(cluster, tmp_path):
-    command = [sys.executable, "-c", LEARNER, str(tmp_path), cluster.address]
+@one_or_two
+def test_a_killed_learner_resumes_from_its_checkpoint(cluster, tmp_path, group_size):
+    command = [sys.executable, "-c", LEARNER, str(tmp_path), cluster.address, str(group_size)]
     with subprocess.Popen(command, cwd=Path(__file__).parents[2]) as learner:
         while not (tmp_path / "pids").exists() and learner.poll() is None:
             time.sleep(0.1)
@@ -210,7 +244,7 @@ def test_a_killed_learner_resumes_from_its_checkpoint(cluster, tmp_path):
     pids = [int(pid) for pid in (tmp_path / "pids").read_text().split()]
     assert len(pids) == 2
     assert not wait_for_end([pid for pid in pids if pid]), "workers do not outlive their learner"
-    train = cluster_train(tmp_path)
+    train = cluster_train(tmp_path, group_size=group_size)
     with pytest.warns(UserWarning, match="episodes of echo are not restored: environments in other processes"):
         train.resume(tmp_path / "run")
     frames, updates = train.frames, train.learner.updates

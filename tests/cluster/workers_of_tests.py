@@ -61,7 +61,7 @@ def far(steps):
 def cluster_train(folder: Path, fault: str = "", workers: int = 2, **settings: Any) -> Trainer:
     """A training with event tables and n-step sums; `settings` are those of the collector and of the loop."""
     own = {"patience": 600.0, "queue_size": 4}
-    own |= {name: settings.pop(name) for name in (*own, "address", "cpus_per_worker") if name in settings}
+    own |= {name: settings.pop(name) for name in (*own, "address", "cpus_per_worker", "group_size") if name in settings}
     defaults: dict[str, Any] = {"total_frames": 400, "utd_ratio": 0.1, "log_interval": 0.0, "warmup_frames": 20}
     train = make_train(folder / "run", **{**defaults, **settings})
     example = train.collector.env

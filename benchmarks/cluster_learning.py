@@ -1,0 +1,104 @@
+"""What a fight learns with workers on Ray, and with weights of a certain age, beside the training in one process.
+
+    python benchmarks/cluster_learning.py                                         preset small, seeds 0 to 2: hours
+    python benchmarks/cluster_learning.py --frames 20_000 --seeds 0 --only local workers      to try it out
+
+All trainings have the same env-steps and the same updates per env-step. `workers` are 8 on Ray with 16 environments
+each; `every_10`, `every_100` and `every_1000` are the same with that many updates between two offers of weights. A
+training that was interrupted is continued by the same command, one that has ended is not repeated. The table is
+printed, and learning curves with their range over the seeds are drawn in `--out`.
+"""
+
+import argparse
+import statistics
+import sys
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import numpy as np
+from matplotlib import pyplot as plt
+
+from coachable.evaluation.curves import read_metric
+from coachable.evaluation.many_seeds import train_seeds
+
+RECIPE = Path(__file__).resolve().parent.parent / "recipes" / "combat_cat_rac.py"
+WORKERS = ["collector=ray", "collector.num_collectors=8", "collector.group_size=8", "env.num_envs=16"]
+WORKERS += ["collector.cpus_per_worker=0.1"]
+VARIANTS = {
+    "local": [],
+    "workers": WORKERS,
+    **{f"every_{n}": [*WORKERS, f"collector.weights_every={n}"] for n in (10, 100, 1000)},
+}
+HEADINGS = (
+    "weights",
+    "seeds",
+    "return",
+    "std",
+    "style return",
+    "staleness [updates]",
+    "env-steps",
+    "updates",
+    "minutes",
+)
+MEASURES = ("eval/return", "eval/style_return", "frames", "updates", "minutes")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="(%(default)s)")
+    parser.add_argument("--only", nargs="+", choices=VARIANTS, default=list(VARIANTS))
+    parser.add_argument("--frames", type=int, help="env-steps of each training; those of the preset")
+    parser.add_argument("--out", type=Path, default=Path("runs/cluster_learning"))
+    options = parser.parse_args()
+    common = [
+        "preset=small",
+        "wandb.mode=off",
+        "threads.learner=1",
+        "threads.simulator=1",
+        "train.checkpoint_interval=300",
+    ]
+    if options.frames:
+        common += [f"train.total_frames={options.frames}", f"train.eval_interval={max(1, options.frames // 4)}"]
+        common += [f"train.warmup_frames={options.frames // 10}"]
+    print("| " + " | ".join(HEADINGS) + " |\n|" + "-|" * len(HEADINGS))
+    for name in options.only:
+        folder = options.out / name
+        if failed := train_seeds(RECIPE, [*common, *VARIANTS[name]], options.seeds, folder):
+            sys.exit(f"{name}: {failed}")
+        runs = [folder / f"seed_{seed}" for seed in options.seeds]
+        print("| " + " | ".join([name, f"{len(runs)}", *cells(runs, VARIANTS[name])]) + " |", flush=True)
+        draw([name for name in options.only if (options.out / name).exists()], options)
+
+
+def cells(runs: list[Path], arguments: list[str]) -> list[str]:
+    last = {measure: [read_metric(run, "frames", measure)[1][-1] for run in runs] for measure in MEASURES}
+    returns = last["eval/return"]
+    stale = [read_metric(run, "frames", "workers/staleness")[1].mean() for run in runs] if arguments else [0.0]
+    return [
+        f"{statistics.mean(returns):.1f}",
+        f"{statistics.stdev(returns):.1f}" if len(returns) > 1 else "",
+        f"{statistics.mean(last['eval/style_return']):.1f}",
+        f"{statistics.mean(stale):.0f}",
+        *(f"{statistics.mean(last[measure]):.0f}" for measure in ("frames", "updates")),
+        f"{statistics.mean(last['minutes']):.1f}",
+    ]
+
+
+def draw(names: list[str], options: argparse.Namespace) -> None:
+    figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
+    for name in names:
+        curves = [read_metric(options.out / name / f"seed_{seed}", "frames", "eval/return") for seed in options.seeds]
+        points = min(len(at) for at, _ in curves)
+        frames, returns = curves[0][0][:points], np.array([values[:points] for _, values in curves])
+        (line,) = axes.plot(frames, returns.mean(0), marker="o", label=name)
+        axes.fill_between(frames, returns.min(0), returns.max(0), color=line.get_color(), alpha=0.15, linewidth=0)
+    axes.set(xlabel="env-steps", ylabel="return of an evaluation", ylim=(None, None))
+    axes.legend()
+    figure.savefig(options.out / "learning.png", dpi=120)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    main()
