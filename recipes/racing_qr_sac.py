@@ -63,15 +63,10 @@ def build(config: dict[str, Any]) -> Trainer:
         replay.append_transform(TaskImpersonation(style_reward, n=cfg.impersonation.n, seed=cfg.seed))
     boxes.open_run_dir(run, example, replay)  # files are written from here on
 
-    # Collector, evaluation, what checkpoints say about the agent, and the training loop
+    # Collector, evaluation and the training loop, which continues where a resumed run stopped
     collector = boxes.make_collector(run, make_env, actor)
     evaluate = boxes.make_evaluation(run, make_env, actor)
-    describe = boxes.make_description(run, space, actor, loss, network)
-    trainer = boxes.make_trainer(run, example, collector, replay, learner, evaluate, describe, style_reward)
-    boxes.close_example(run, example)
-    if cfg.resume:
-        trainer.resume(cfg.resume)
-    return trainer
+    return boxes.make_trainer(run, example, style_reward, actor, learner, replay, collector, evaluate)
 
 
 if __name__ == "__main__":

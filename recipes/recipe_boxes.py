@@ -191,21 +191,6 @@ def make_evaluation(run: Run, make_env: Callable[..., EnvBase], actor: nn.Module
     return evaluate
 
 
-def make_description(
-    run: Run, space: StyleSpace, actor: TensorDictModuleBase, loss: LossModule, network: Network
-) -> Callable[[], dict[str, Any]]:
-    """Return a function that returns the agent's description for checkpoints; see `agent_state`."""
-    return partial(
-        agent_state,
-        domain=run.settings.domain,
-        space=space,
-        actor=actor,
-        loss_module=loss,
-        network={"actor": dict(network.actor), "critic": dict(network.critic)},
-        config=run.config,
-    )
-
-
 def open_run_dir(run: Run, env: EnvBase, replay: ReplayBuffer) -> None:
     """Make the run's folder and write the configuration into it.
 
@@ -241,45 +226,54 @@ def _has_scenario_tables(settings: Settings) -> bool:
 def make_trainer(
     run: Run,
     env: EnvBase,
-    collector: BaseCollector | AsyncCollector,
-    replay: ReplayBuffer,
-    learner: Learner,
-    evaluate: Callable[[], dict[str, float]],
-    describe: Callable[[], dict[str, Any]],
     style_reward: StyleReward,
+    actor: TensorDictModuleBase,
+    learner: Learner,
+    replay: ReplayBuffer,
+    collector: BaseCollector | AsyncCollector,
+    evaluate: Callable[[], dict[str, float]],
 ) -> Trainer:
-    """Make the training loop, with its log and its checkpoints in the run's folder.
+    """Make the training loop, with its log and its checkpoints in the run's folder; resume the run of `resume`.
 
     Args:
         run: The training.
-        env: One environment, whose specification shows which entries are stored.
-        collector: Collector of transitions.
-        replay: Replay buffer that stores them.
-        learner: Learner that is trained on them.
-        evaluate: Function that returns metrics of the current actor.
-        describe: Function that returns the agent's description for checkpoints.
+        env: One environment, whose specification shows which entries are stored. It is closed.
         style_reward: Style reward, whose terms are logged as metrics.
+        actor: Policy, which checkpoints describe.
+        learner: Learner that trains it.
+        replay: Replay buffer that stores transitions.
+        collector: Collector of transitions.
+        evaluate: Function that returns metrics of the current actor.
+
+    Raises:
+        CheckpointError: If the run of `resume` is damaged or does not fit.
     """
     settings, run_dir = run.settings, Path(run.settings.run_dir)
-    return Trainer(
+    network = fitted_network(run, env)
+    trainer = Trainer(
         settings=settings.train,
         collector=collector,
         replay=replay,
         learner=learner,
         evaluate=evaluate,
-        describe=describe,
+        describe=partial(
+            agent_state,
+            domain=settings.domain,
+            space=style_reward.space,
+            actor=actor,
+            loss_module=learner.loss_module,
+            network={"actor": dict(network.actor), "critic": dict(network.critic)},
+            config=run.config,
+        ),
         style_terms=style_reward.terms_of,
         log=MetricsLog(run_dir, wandb_logger(settings.domain, run_dir, **asdict(settings.wandb))),
         progress=Progress(settings.train.total_frames),
         checkpoints=CheckpointStore(run_dir / "checkpoints", **asdict(settings.checkpoint)),
         replay_keys=stored_keys(run, env, replay),
     )
-
-
-def close_example(run: Run, env: EnvBase) -> None:
-    """Close the environment that showed the sizes, and restore the number of threads, which closing may change.
-
-    TorchRL changes it when a `SerialEnv` is closed, so that this must not be left to garbage collection.
-    """
+    # TorchRL changes the number of threads when a `SerialEnv` is closed, which must not be left to garbage collection.
     env.close()
-    torch.set_num_threads(run.settings.threads.learner)
+    torch.set_num_threads(settings.threads.learner)
+    if settings.resume:
+        trainer.resume(settings.resume)
+    return trainer

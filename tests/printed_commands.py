@@ -121,6 +121,7 @@ def main() -> None:
             print(
                 f"{time.monotonic() - start:5.1f} s  {command}{'  FAILED: ' + mistake if mistake else ''}", flush=True
             )
+    print(f"{sum(map(bool, commands.values()))} other commands are not run; --list names them, each with the reason")
     sys.exit(f"{failed} commands failed" if failed else 0)
 
 

@@ -85,7 +85,7 @@ OUTSIDE = [
     ]),
     *(("Learner", lambda **kw: Learner(make_loss(width=8), **kw), name, value) for name, value in [
         ("actor_lr", -1e-4), ("critic_lr", math.inf), ("alpha_lr", math.nan), ("adam_eps", 0.0), ("tau", 0.0),
-        ("tau", 2), ("max_grad_norm", 0.0), ("max_grad_norm", -1.0), ("check_every", -1),
+        ("tau", 2), ("max_grad_norm", 0.0), ("max_grad_norm", -1.0),
     ]),
     *(("QRSACLoss", _quantile_loss, name, value) for name, value in [
         ("alpha", -0.1), ("alpha", math.inf), ("kappa", -1.0), ("kappa", math.nan),

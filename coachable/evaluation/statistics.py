@@ -29,17 +29,14 @@ def interquartile_mean(values: np.ndarray, axis: int = -1) -> np.ndarray:
     return np.divide(total, kept, out=np.full(total.shape, np.nan), where=kept > 0)
 
 
-def stratified_interval(
-    scores: np.ndarray, *, confidence: float = 0.95, resamples: int = 2000, seed: int = 0
-) -> tuple[float, float]:
-    """Compute the percentile bootstrap interval of the interquartile mean of several runs on several tasks.
+def stratified_interval(scores: np.ndarray, *, resamples: int = 2000, seed: int = 0) -> tuple[float, float]:
+    """Compute the 95 % percentile bootstrap interval of the interquartile mean of several runs on several tasks.
 
     Runs are drawn with replacement for each task separately, so every resample has every task (Agarwal et al. 2021,
     arXiv 2108.13264).
 
     Args:
         scores: Scores (runs, tasks); NaN are left out.
-        confidence: Confidence level of the interval.
         resamples: Number of bootstrap samples.
         seed: Seed of the resampling.
 
@@ -51,8 +48,7 @@ def stratified_interval(
     runs, tasks = scores.shape
     draws = np.random.default_rng(seed).integers(0, runs, (resamples, runs, tasks))
     spread = interquartile_mean(scores[draws, np.arange(tasks)].reshape(resamples, -1))
-    tail = 50 * (1 - confidence)
-    low, high = np.nanpercentile(spread, [tail, 100 - tail])
+    low, high = np.nanpercentile(spread, [2.5, 97.5])
     return float(low), float(high)
 
 
@@ -60,16 +56,14 @@ def bootstrap_interval(
     values: np.ndarray,
     statistic: Callable[..., np.ndarray] = np.mean,
     *,
-    confidence: float = 0.95,
     resamples: int = 2000,
     seed: int = 0,
 ) -> tuple[float, float]:
-    """Compute the percentile bootstrap interval of a statistic of independent values.
+    """Compute the 95 % percentile bootstrap interval of a statistic of independent values.
 
     Args:
         values: Numbers (n,); NaN are left out.
         statistic: Function that is called as `statistic(samples, axis=-1)`.
-        confidence: Confidence level of the interval.
         resamples: Number of bootstrap samples.
         seed: Seed of the resampling.
 
@@ -80,7 +74,7 @@ def bootstrap_interval(
     if len(values) < 2:  # nothing to draw from
         only = float(statistic(values, axis=-1)) if len(values) else float("nan")
         return only, only
-    options = {"n_resamples": resamples, "confidence_level": confidence, "method": "percentile", "vectorized": True}
+    options = {"n_resamples": resamples, "confidence_level": 0.95, "method": "percentile", "vectorized": True}
     low, high = stats.bootstrap((values,), statistic, rng=np.random.default_rng(seed), **options).confidence_interval
     return float(low), float(high)
 

@@ -115,16 +115,7 @@ class StyleSpace:
     def sample(
         self, shape: Sequence[int] = (), generator: Generator | None = None, device: torch.device | str | None = None
     ) -> Tensor:
-        """Draw training styles.
-
-        Args:
-            shape: Batch shape.
-            generator: Generator to draw from; None for torch's global one.
-            device: Device of the result; None for that of the generator, or without one the CPU.
-
-        Returns:
-            Styles `(*shape, dim)`, float32, not encoded.
-        """
+        """Draw training styles `(*shape, dim)`, float32, not encoded; see `Sampler.sample` for the arguments."""
         return self.sampler.sample(shape, generator, device)
 
     def with_sampler(self, sampler: Sampler) -> "StyleSpace":

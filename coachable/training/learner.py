@@ -13,13 +13,15 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule, SoftUpdate
 
 from coachable.finite import NonFiniteError
-from coachable.ranges import AMOUNT, NOT_NEGATIVE, POSITIVE, Range
+from coachable.ranges import NOT_NEGATIVE, POSITIVE, Range
 from coachable.training.backend import Backend
 from coachable.training.loss_functions import check_loss, compiled, loss_functions
 from coachable.training.precision import Precision, resolve_precision
 from coachable.training.trained_parameters import Watch, adopt_actor, follow, loaded, share_actor, trained_parameters
 
 _ADVICE = "Look for extreme rewards or observations, lower the learning rates, or set max_grad_norm."
+
+CHECK_EVERY = 100  # updates on a GPU between checks for skipped ones, which wait for the device
 
 UpdateOrder = Literal["simultaneous", "policy_first"]
 
@@ -42,7 +44,7 @@ class Learner:
       target whose next actions come from the updated policy.
 
     No weight is changed by losses or gradients that are infinite or NaN. On a CPU such an update raises. On a GPU it is
-    skipped, and the next check raises (see `check_every`).
+    skipped, and the next check raises: every 100th update checks, as does :meth:`check_finite`.
 
     Args:
         loss_module: The loss.
@@ -57,8 +59,6 @@ class Learner:
             in float32; `"auto"` chooses it where the device has it in hardware.
         compile: Compile the loss functions with `torch.compile`. On a CPU this needs a C++ compiler; without one it has
             no effect and logs a warning.
-        check_every: On a GPU, number of updates between checks for skipped ones, which wait for the device. With 0 only
-            calls of :meth:`check_finite` check. On a CPU every update is checked.
 
     Attributes:
         backend: How networks are evaluated and parameters stepped, see :meth:`use_backend`.
@@ -83,7 +83,6 @@ class Learner:
         update_order: UpdateOrder = "simultaneous",
         precision: Precision = "auto",
         compile: bool = False,
-        check_every: int = 100,
     ) -> None:
         self._options = {name: value for name, value in locals().items() if name not in ("self", "loss_module")}
         if update_order not in get_args(UpdateOrder):
@@ -94,12 +93,10 @@ class Learner:
         POSITIVE.check("adam_eps", adam_eps)
         Range("(0, 1]").check("tau", tau)
         Range("(0, inf)", optional=True).check("max_grad_norm", max_grad_norm)
-        AMOUNT.check("check_every", check_every)
         check_loss(loss_module)
         self.loss_module = loss_module
         self.update_order: UpdateOrder = update_order
         self.max_grad_norm = max_grad_norm
-        self.check_every = check_every
         self.updates = 0
         share_actor(loss_module)
         self._watch = Watch(loss_module)
@@ -154,7 +151,7 @@ class Learner:
 
         Raises:
             NonFiniteLossError: If a loss or a gradient is infinite or NaN; on a GPU, if one was in an update since the
-                last check, see `check_every`. No weight has been changed by it.
+                last check. No weight has been changed by it.
         """
         self._follow()
         if self._to_compile:
@@ -164,7 +161,7 @@ class Learner:
             metrics = update(batch)
         self.backend.move_targets()
         self.updates += 1
-        if self.check_every and self.updates % self.check_every == 0:
+        if self.updates % CHECK_EVERY == 0:
             self.check_finite()
         if "entropy" in metrics and "alpha" in metrics:
             metrics["q_policy"] = -(metrics["loss_actor"] + metrics["alpha"] * metrics["entropy"])

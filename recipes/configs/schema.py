@@ -150,8 +150,8 @@ class Settings:
     mirror: float = within(SHARE)
     impersonation: Impersonation
     learner: Learner
-    network: Network
     loss: Target = arguments(alpha_init=POSITIVE, num_quantiles=COUNT, num_atoms=ATOMS, sigma_ratio=POSITIVE)
+    network: Network  # after `loss`, whose numbers it takes, so that a wrong one is reported where it was set
     replay: Target = arguments(table_capacities=[COUNT], table_proportions=[SHARE], capacity=COUNT)
     collector: Target = arguments(
         num_collectors=COUNT,

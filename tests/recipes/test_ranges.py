@@ -145,6 +145,12 @@ def test_on_the_command_line(argument, message):
         compose_config("humanoid_sac", ["preset=smoke", argument])
 
 
+def test_a_wrong_number_is_reported_where_it_was_set():
+    """The critics take the number of quantiles from the loss."""
+    with pytest.raises(ValueError, match=r"^loss.num_quantiles=many: expected a whole number of at least 1"):
+        compose_config("racing_qr_sac", ["preset=smoke", "loss.num_quantiles=many"])
+
+
 def test_shares_above_one():
     for argument in ("event_share=1.1", "replay.event_share=1", "+replay.table_proportions={default: 1.5}"):
         with pytest.raises(ValueError, match="expected a number in"):

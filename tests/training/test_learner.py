@@ -187,9 +187,10 @@ def test_a_temperature_that_is_not_finite_does_not_move(make_learner):
     assert loss.log_alpha.item() == before
 
 
-def test_a_gpu_skips_the_step_and_the_next_check_raises():
+def test_a_gpu_skips_the_step_and_the_next_check_raises(monkeypatch):
     """The part of the device, on a CPU, whose fused Adam also skips a step where `found_inf` is set."""
-    learner = Learner(make_loss(), precision="fp32", check_every=2)
+    monkeypatch.setattr("coachable.training.learner.CHECK_EVERY", 2)
+    learner = Learner(make_loss(), precision="fp32")
     learner._device_type = "cuda"
     before = copy.deepcopy(learner.state_dict())
     data = make_batch(16)

@@ -29,6 +29,7 @@ __all__ = ["SOURCES", "STATES", "CoachedFights", "draw_timeline", "fight_coached
 SOURCES = STYLES[:8]
 STATES = tuple(style for style in STYLES if style in ELEMENTS)
 _OUTCOMES = ("won", "died", "out_of_bounds")
+_BAR = 1.0  # [s], width of the bars of a timeline
 
 
 @dataclass(frozen=True)
@@ -181,13 +182,12 @@ def _draw_requests(styles: int, windows: int, sequences: int, seed: int) -> torc
     return further.cumsum(0) % styles
 
 
-def draw_timeline(rows: Sequence[Mapping[str, Any]], path: Path, *, bin_seconds: float = 1.0) -> None:
+def draw_timeline(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Draw damage by source and health over time, under bands of the requested style (paper, timeline of a fight).
 
     Args:
         rows: Result of `CoachedFights.timeline`; steps in which a row says `brittle` are hatched.
         path: PNG file to write.
-        bin_seconds: Width of the bars [s].
     """
     times = np.array([row["seconds"] for row in rows])
     step = float(times[0])
@@ -195,15 +195,15 @@ def draw_timeline(rows: Sequence[Mapping[str, Any]], path: Path, *, bin_seconds:
     size = (min(24.0, 4.0 + 0.09 * float(times[-1])), 5.0)
     panels = drawing(path, 3, size=size, grid=False, sharex=True, height_ratios=[3, 0.4, 2])
     with panels as ((top,), (ticks,), (bottom,)):
-        edges = np.arange(0.0, times[-1] + bin_seconds, bin_seconds)
+        edges = np.arange(0.0, times[-1] + _BAR, _BAR)
         requested = {row["requested"] for row in rows}
         base = np.zeros(len(edges) - 1)
         for source in SOURCES:
             done = np.array([row[source] for row in rows])
-            height = np.histogram(times - step / 2, edges, weights=done)[0] / bin_seconds
+            height = np.histogram(times - step / 2, edges, weights=done)[0] / _BAR
             if done.any() or source in requested:
                 style = {"align": "edge", "color": colours[source], "label": readable(source)}
-                top.bar(edges[:-1], height, bin_seconds, base, **style)
+                top.bar(edges[:-1], height, _BAR, base, **style)
             base += height
         damage = np.array([sum(row[source] for source in SOURCES) for row in rows])
         counted = np.array([row["counted"] for row in rows])

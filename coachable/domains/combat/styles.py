@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import get_args
 
 from coachable.envs.combat.rewards import REWARD_SCALES
 from coachable.envs.combat.tables import check_styles, load_table
 from coachable.styles import StyleReward, StyleSpace, Weight, WeightedSum
-from coachable.styles.mixtures import Single, style_mixture
+from coachable.styles.mixtures import style_mixture
 
 
-def combat_style_space(
-    styles: Sequence[str] | None = None, reward_scale: str = "sim", combat_component: Single = "continuous_one_hot"
-) -> StyleSpace:
+def combat_style_space(styles: Sequence[str] | None = None, reward_scale: str = "sim") -> StyleSpace:
     """Return the space of the style weights with the mixture from which they are drawn at a reset.
 
     Args:
         styles: Names of the weights, as in `CombatEnv(styles=...)`; all 18 by default.
         reward_scale: "sim" for ranges that fit the damage rates of this simulator, or "paper" for the paper's.
-        combat_component: Third component of the mixture, see `coachable.styles.mixtures.style_mixture`.
 
     Raises:
         ValueError: If a name or an option is unknown.
@@ -27,8 +23,6 @@ def combat_style_space(
     names = check_styles(styles)
     if reward_scale not in REWARD_SCALES:
         raise ValueError(f"reward_scale is {reward_scale!r}: expected one of {REWARD_SCALES}")
-    if combat_component not in get_args(Single):
-        raise ValueError(f"combat_component is {combat_component!r}: expected one of {get_args(Single)}")
     table = load_table("styles")
     low = [table.number(name, f"{reward_scale}_low") for name in names]
     high = [table.number(name, f"{reward_scale}_high") for name in names]
@@ -37,7 +31,7 @@ def combat_style_space(
         for name, a, b in zip(names, low, high, strict=True)
     ]
     space = StyleSpace(weights, name="combat")
-    return space.with_sampler(style_mixture(space, combat_component))
+    return space.with_sampler(style_mixture(space))
 
 
 def single_styles(space: StyleSpace) -> list[dict[str, float]]:

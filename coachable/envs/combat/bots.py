@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 
 from coachable.envs.combat import constants as c
@@ -112,54 +110,3 @@ class Bot:
 
 BOTS: dict[str, Bot] = {bot.name: bot for bot in (*(Bot(a, a) for names in AMMO for a in names), Bot("Spear"))}
 """Bots by name: one per ammo, and one with the spear."""
-
-
-@torch.no_grad()
-def fight_all(
-    bot: Bot, machines: Sequence[str], fights: int = 8, steps: int = 2400, seed: int = 0, **options: object
-) -> dict[str, dict[str, float]]:
-    """Let a bot fight every machine.
-
-    Args:
-        bot: Scripted player.
-        machines: Machine types.
-        fights: Number of fights per machine, spread evenly over the three sites.
-        steps: Largest number of steps of a fight.
-        seed: Seed of the fights and of the bot's decisions.
-        **options: Options of `CombatEnv`.
-
-    Returns:
-        For each machine: `won`, the share of fights; `dealt` and `taken`, the damage per second [HP/s]; `seconds`, the
-        mean length of a fight [s].
-    """
-    rows = [machine for machine in machines for _ in range(fights)]
-    env = CombatEnv(len(rows), seed=seed, machines=machines, episode_steps=steps, **options)  # type: ignore[arg-type]
-    sites = ("Ice-lake", "Shining-wastes", "Arena")
-    env.assign(rows, [sites[i % 3] for i in range(len(rows))])
-    env.reset()
-    generator = torch.Generator().manual_seed(seed)
-    running = torch.ones(len(rows), dtype=torch.bool)
-    won, length, dealt, taken = (torch.zeros(len(rows)) for _ in range(4))
-    for _ in range(steps):
-        hp, enemy_hp = env.state.hp.clone(), env.state.enemy_hp.sum(0)
-        action = bot.act(env, generator)
-        after = env._step(TensorDict({"action": action}, [len(rows)]))
-        length += running
-        dealt += (enemy_hp - env.state.enemy_hp.sum(0)) * running
-        taken += (hp - env.state.hp).clamp(min=0.0) * running
-        dead = (env.state.enemy_hp <= 0).all(0) & (env.state.hp > 0)
-        won += dead & running
-        running &= ~after["done"][:, 0]
-        if not running.any():
-            break
-    report = {}
-    for i, machine in enumerate(machines):
-        row = slice(i * fights, (i + 1) * fights)
-        seconds = float(length[row].sum()) * c.CONTROL_STEP
-        report[machine] = {
-            "won": float(won[row].mean()),
-            "dealt": float(dealt[row].sum()) / seconds,
-            "taken": float(taken[row].sum()) / seconds,
-            "seconds": seconds / fights,
-        }
-    return report

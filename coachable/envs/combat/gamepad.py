@@ -7,7 +7,6 @@ on its buttons. `canonical` maps every raw action to the one that the game uses.
 
 from __future__ import annotations
 
-from itertools import product
 from typing import NamedTuple
 
 import torch
@@ -44,9 +43,6 @@ ACTION_GROUPS = (
 )
 """Blocks of the action tensor, in order."""
 
-NUM_COMBINATIONS = 315
-"""Legal combinations of the buttons and thumb positions (paper)."""
-
 _SYMBOLS: dict[str, str] = {
     "cross": "✕",
     "circle": "○",
@@ -66,14 +62,6 @@ def _legal(face: str, dpad: str, left_mode: str, right_mode: str) -> bool:
     """Return whether the thumbs reach the buttons; a thumb on its stick reaches only L3, which needs the left thumb."""
     left = dpad in ("none", "L3") if left_mode == "joystick" else dpad != "L3"
     return left and (face == "none" or right_mode == "buttons")
-
-
-# Combinations as tuples of head indices, in the order of the raw product.
-_COMBINATIONS = [
-    choice
-    for choice in product(*(range(len(values)) for values in HEADS.values()))
-    if _legal(FACE[choice[0]], DPAD[choice[1]], MODE[choice[4]], MODE[choice[5]])
-]
 
 
 class Pad(NamedTuple):
@@ -134,16 +122,6 @@ def read_pad(rows: Tensor) -> Pad:
         *("left_shoulder.L1", "left_shoulder.L2", "right_shoulder.R1", "right_shoulder.R2"),
     )
     return Pad(*(rows[_ROWS[name]] for name in names), left_stick=rows[20:22], right_stick=rows[22:24])
-
-
-def combination_index(action: Tensor) -> Tensor:
-    """Return the number of the legal combination of raw or canonical actions `(..., 24)`, as `(...,)` in [0, 315)."""
-    choices = GAMEPAD.choices(canonical(action))
-    sizes = GAMEPAD.categorical
-    table = torch.full(sizes, -1, dtype=torch.int64, device=action.device)
-    for index, combination in enumerate(_COMBINATIONS):
-        table[combination] = index
-    return table[tuple(choices.unbind(-1))]
 
 
 def press(*buttons: str, left: tuple[float, float] | None = None, right: tuple[float, float] | None = None) -> Tensor:

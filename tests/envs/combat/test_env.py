@@ -14,6 +14,7 @@ from coachable.envs.combat.rewards import COMPONENT_SLICES
 from coachable.envs.combat.state import State
 from coachable.envs.combat.step_frames import Noise
 from coachable.envs.combat.tables import MACHINES, STYLES
+from coachable.styles.mixtures import style_mixture
 from coachable.transforms import coachable_env
 from tests.envs.contract import assert_set_seed_restarts_the_stream, roll
 
@@ -301,14 +302,12 @@ def test_the_papers_mixture():
     for wanted, share in ((0, 0.03), (1, 0.87), (18, 0.10)):
         found = (count == wanted).float().mean().item()
         assert abs(found - share) < 5 * (share * (1 - share) / 20000) ** 0.5
-    hot = combat_style_space(combat_component="one_hot").sample((2000,), torch.Generator().manual_seed(0))
+    hot = style_mixture(space, "one_hot").sample((2000,), torch.Generator().manual_seed(0))
     single = (hot != 0).sum(-1) == 1
     assert ((hot[single] == 0) | (hot[single] == space.high)).all()
-    independent = combat_style_space(combat_component="independent").sample((2000,), torch.Generator().manual_seed(0))
+    independent = style_mixture(space, "independent").sample((2000,), torch.Generator().manual_seed(0))
     assert set((independent != 0).sum(-1).tolist()) == {0, 18}
     assert len(combat_style_space(styles=("melee", "skykiller")).names) == 2
-    with pytest.raises(ValueError, match="combat_component is 'two_hot'"):
-        combat_style_space(combat_component="two_hot")
     with pytest.raises(ValueError, match="reward_scale is 'real'"):
         combat_style_space(reward_scale="real")
 
