@@ -82,7 +82,7 @@ def test_export(run, guest, tmp_path):
     onnx = pytest.importorskip("onnx")
     pytest.importorskip("onnxruntime")
     file = tmp_path / "policy.onnx"
-    assert main(["export", run, "--out", str(file)]) == 0
+    assert main(["export", "onnx", run, "--out", str(file)]) == 0
     metadata = {entry.key: entry.value for entry in onnx.load(str(file)).metadata_props}
     assert metadata["domain"] == guest and float(metadata["control_step"]) in (0.05, 0.01)
 

@@ -175,7 +175,7 @@ def test_the_command(short_run, traced, tmp_path, capsys, monkeypatch):
     """An agent of a domain that is not built in: everything but the control step."""
     monkeypatch.setattr("coachable.export.onnx._trace", lambda _: traced[1])  # takes seconds
     out = tmp_path / "echo.onnx"
-    assert main(["export", str(short_run), "--out", str(out)]) == 0
+    assert main(["export", "onnx", str(short_run), "--out", str(out)]) == 0
     assert re.search(r"wrote .*echo\.onnx .* from torch", capsys.readouterr().out)
     metadata = onnxruntime.InferenceSession(str(out)).get_modelmeta().custom_metadata_map
     assert metadata["domain"] == "echo" and "control_step" not in metadata
@@ -183,7 +183,7 @@ def test_the_command(short_run, traced, tmp_path, capsys, monkeypatch):
 
 def test_a_missing_extra_is_named(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    assert main(["export", "humanoid"]) == 2
+    assert main(["export", "onnx", "humanoid"]) == 2
     assert "pip install 'coachable[export]'" in capsys.readouterr().err
 
 
