@@ -32,6 +32,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "recipes"))
 import matplotlib
 
 matplotlib.use("Agg")
+from cluster import QUICK
 from matplotlib import pyplot as plt
 from recipe_config import compose_config
 
@@ -40,10 +41,8 @@ ENVIRONMENTS = {
     "combat": ("combat_cat_rac", ["preset=small"]),
     "pendulum": ("cheetah_speed", ["preset=cpu", "env._target_=cluster_pendulum.pendulum", "~env.seconds"]),
 }
-QUICK = ["train.eval_interval=0", "checkpoint.replay=false", "device=cpu", "wandb.mode=off", "init_random_frames=0"]
-QUICK += ["train.warmup_frames=0", "replay_capacity=100_000", "train.total_frames=1_000_000_000"]
-QUICK += ["train.utd_ratio=null", "train.log_interval=1", "train.checkpoint_interval=1e9", "env.num_envs=1"]
-QUICK += ["threads.simulator=1", "threads.learner=1"]
+SLOW = ["train.utd_ratio=null", "train.log_interval=1", "train.checkpoint_interval=1e9", "env.num_envs=1"]
+SLOW += ["threads.simulator=1", "threads.learner=1"]
 TICKS = os.sysconf("SC_CLK_TCK")  # [1/s]
 HEADINGS = (
     "environment",
@@ -93,7 +92,7 @@ class Fleet:
     def __init__(self, name: str, options: argparse.Namespace) -> None:
         recipe, arguments = ENVIRONMENTS[name]
         share = min(1.0, (os.cpu_count() or 1) / (2 * options.workers))
-        arguments = [*arguments, *QUICK, "collector=ray", f"collector.num_collectors={options.workers}"]
+        arguments = [*arguments, *QUICK, *SLOW, "collector=ray", f"collector.num_collectors={options.workers}"]
         arguments += [f"collector.group_size={options.group}", f"collector.worker_throttle={options.rate}"]
         arguments += [f"collector.cpus_per_worker={share}", "collector.steps_per_batch=8"]
         arguments += [f"train.throttle={2 * options.rate * options.workers}"]  # more than the workers give
