@@ -12,6 +12,7 @@ from recipe_config import compose_config, config_groups, run_recipe
 from tensordict import TensorDict
 
 from coachable.domains.racing.families import racing_family
+from coachable.envs.racing.race.features import style_features_size
 from coachable.envs.racing.race.observation import COURSE_POINTS
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
 from coachable.training.trainer import REPLAY_KEYS
@@ -164,7 +165,7 @@ def test_the_stages_of_races_are_of_their_family(stage, margins, tmp_path):
     arguments = ["preset=aggressiveness", f"stage={stage}", "family=drift", f"run_dir={tmp_path}"]
     config = compose_config("racing_qr_sac", arguments)
     with pytest.raises(
-        ValueError, match=f"style_reward has {', '.join(sorted(margins))}: racing_drift takes in_corners"
+        ValueError, match=f"style_reward has {', '.join(sorted(margins))}: racing_drift takes angle_scale, in_corners"
     ):
         import_module("racing_qr_sac").build(config)
 
@@ -177,13 +178,13 @@ def test_a_driver_of_races_learns_alone_on_the_observation_of_races(stage):
     settings = typed_settings(config)
     env = settings.env.build(num_envs=3, seed=0, track="ring")
     assert env.cars == (5 if among_others else 1) and env.observation_size == 190
-    assert env.reset()["style_features"].shape[-1] == 9 + 3 * (env.cars - 1)
+    assert env.reset()["style_features"].shape[-1] == style_features_size(env.cars)
 
 
 @pytest.mark.parametrize("stage", ["laps", "corners"])
 def test_the_stages_of_drifting_pay_for_corners_on_many_circuits(stage):
     config = compose_config("racing_qr_sac", ["preset=drift", f"stage={stage}"])
-    assert config["domain"] == "racing_drift" and config["style_reward"] == {"in_corners": 1.0}
+    assert config["domain"] == "racing_drift" and config["style_reward"] == {"in_corners": 1.0, "angle_scale": 2.5}
     assert config["env"]["track"] == "training" and config["env"]["curvature"] is True
     shares = {name: config["sampler"][name] for name in ("positive", "full", "neutral")}
     assert sum(shares.values()) < 1.0 and config["sampler"]["_target_"].endswith("with_requests")

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from coachable.envs.racing.race.features import (
     CORNER_DRIFT,
+    CORNERING,
     DEFEND,
     DRIFT,
     DRIFT_NAMES,
@@ -71,34 +72,37 @@ def aggressiveness_style_space(cars: int = 1) -> StyleSpace:
     return StyleSpace(parameters, law if cars == 1 else Shared(law, cars), name="racing_aggressiveness")
 
 
-def drift_style_reward(space: StyleSpace, *, in_corners: float = 0.0) -> StyleReward:
+def drift_style_reward(space: StyleSpace, *, in_corners: float = 0.0, angle_scale: float = 1.0) -> StyleReward:
     """Return the reward Σ w_i g_i of mean slip angles [rad] and slip ratios of the axles.
 
     Args:
         space: Result of `drift_style_space`.
-        in_corners: Share of a positive weight of the rear slip angle that pays for `corner_drift` (our choice), which
-            is what the car drifts through corners while it makes way. The rest pays for the slip angle, as does a
-            negative weight. 0 is the paper's literal reward, of which spinning anywhere earns most.
+        in_corners: Share of the positive weights that pays in corners only (our choice). There g_i counts in
+            proportion to `cornering`, and the slip angle of the rear tyres is replaced by the `inward_angle` of the
+            car. The rest pays everywhere, as do negative weights. 0 is the paper's literal reward, of which spinning
+            anywhere earns most.
+        angle_scale: Factor of a positive weight of the rear slip angle; 1 in the paper.
 
     Raises:
         ValueError: If `in_corners` is not in [0, 1].
     """
     if not 0.0 <= in_corners <= 1.0:
         raise ValueError(f"in_corners is {in_corners}: expected a share between 0 and 1")
-    if in_corners == 0.0:
+    if in_corners == 0.0 and angle_scale == 1.0:
         return StyleReward(space, {"drift": WeightedSum(DRIFT_NAMES, DRIFT)})
-    front, rear, *ratios = DRIFT_NAMES
 
-    def rear_angle(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
-        weight, angle = style[rear], features[..., DRIFT_NAMES.index(rear)]
-        return weight * torch.where(weight > 0.0, angle.lerp(features[..., CORNER_DRIFT], in_corners), angle)
+    def requested(name: str) -> Term:
+        column, rear_angle = DRIFT_NAMES.index(name), name == "slip_angle_rear"
 
-    terms = {
-        "front_angle": WeightedSum((front,), slice(0, 1)),
-        "rear_angle": Term(rear_angle, parameters=(rear,)),
-        "ratios": WeightedSum(tuple(ratios), slice(2, 4)),
-    }
-    return StyleReward(space, terms)
+        def reward(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
+            weight, slip = style[name], features[..., column]
+            inside = features[..., CORNER_DRIFT] if rear_angle else slip * features[..., CORNERING]
+            asked = slip.lerp(inside, in_corners) * (angle_scale if rear_angle else 1.0)
+            return weight * torch.where(weight > 0.0, asked, slip)
+
+        return Term(reward, parameters=(name,))
+
+    return StyleReward(space, {name: requested(name) for name in DRIFT_NAMES})
 
 
 def resource_style_reward(space: StyleSpace, *, gained: float = 1.0, defended: float | None = None) -> StyleReward:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from coachable.domains.racing import styles
-from coachable.envs.racing.race.features import GAPS, anyone_beside, anyone_in_line, corner_drift
+from coachable.envs.racing.race.features import GAPS, anyone_beside, anyone_in_line, cornering, inward_angle
 from coachable.styles import Shared, StyleSpace
 
 N = 40000
@@ -71,14 +71,16 @@ def test_drift_reward_by_hand():
     assert reward.item() == pytest.approx(0.1 + 1.0 - 0.08 + 1.5)
 
 
-def test_drifts_in_corners_replace_a_requested_rear_angle():
+def test_positive_weights_of_drift_pay_in_corners():
     space = styles.drift_style_space()
-    features = torch.tensor([[0.1, 0.5, 0.2, 0.3, 9.0, 9.0, 9.0, 9.0, 0.7]] * 2)
-    theta = torch.tensor([[1.0, 2.0, -0.4, 5.0], [1.0, -0.2, -0.4, 5.0]])
+    features = torch.tensor([[0.1, 0.5, 0.2, 0.3, 9.0, 9.0, 9.0, 9.0, 0.7, 0.6]] * 2)
+    theta = torch.tensor([[1.0, 2.0, -0.4, 5.0], [-0.1, -0.2, 4.0, 5.0]])
     reward = styles.drift_style_reward(space, in_corners=1.0)(features, theta)
-    assert reward[:, 0].tolist() == pytest.approx([0.1 + 2 * 0.7 - 0.08 + 1.5, 0.1 - 0.2 * 0.5 - 0.08 + 1.5])
-    half = styles.drift_style_reward(space, in_corners=0.5)(features, theta)
-    assert half[:, 0].tolist() == pytest.approx([0.1 + 2 * 0.6 - 0.08 + 1.5, 0.1 - 0.2 * 0.5 - 0.08 + 1.5])
+    expected = [0.06 + 2 * 0.7 - 0.08 + 5 * 0.18, -0.01 - 0.2 * 0.5 + 4 * 0.12 + 5 * 0.18]
+    assert reward[:, 0].tolist() == pytest.approx(expected)
+    half = styles.drift_style_reward(space, in_corners=0.5, angle_scale=3.0)(features, theta)
+    expected = [0.08 + 3 * 2 * 0.6 - 0.08 + 5 * 0.24, -0.01 - 0.2 * 0.5 + 4 * 0.16 + 5 * 0.24]
+    assert half[:, 0].tolist() == pytest.approx(expected)
     with pytest.raises(ValueError, match="in_corners is 2: expected a share"):
         styles.drift_style_reward(space, in_corners=2)
 
@@ -99,7 +101,8 @@ def test_drifts_in_corners_replace_a_requested_rear_angle():
     ],
 )
 def test_what_counts_as_a_drift_in_a_corner(degrees, radius, pace, expected):
-    found = corner_drift(torch.tensor(degrees).deg2rad(), torch.tensor(1.0 / radius), torch.tensor(pace))
+    curvature = torch.tensor(1.0 / radius)
+    found = inward_angle(torch.tensor(degrees).deg2rad(), curvature) * cornering(curvature, torch.tensor(pace))
     assert found.rad2deg().item() == pytest.approx(expected, abs=1e-4)
 
 

@@ -8,13 +8,13 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-# Columns of `style_features`: four of slip, four of gains and resources, the drift in corners. Then three per
-# opponent: longitudinal and lateral gap [m], near.
+# Columns of `style_features`: four of slip, four of gains and resources, the drift in corners, how much the corner
+# counts. Then three per opponent: longitudinal and lateral gap [m], near.
 DRIFT_NAMES = ("slip_angle_front", "slip_angle_rear", "slip_ratio_front", "slip_ratio_rear")
 DRIFT = slice(0, 4)
 OVERTAKE, DEFEND, TIRE, FUEL = range(4, 8)
-CORNER_DRIFT = 8
-GAPS = 9
+CORNER_DRIFT, CORNERING = 8, 9
+GAPS = 10
 GAP_COLUMNS = ("longitudinal", "lateral", "near")
 
 NEAR_DISTANCE = 10.0  # [m] between centres; the paper leaves "nearby" open
@@ -77,37 +77,47 @@ def sideslip(vx: Tensor, vy: Tensor) -> Tensor:
     return torch.atan2(vy, vx)
 
 
-def corner_drift(angle: Tensor, curvature: Tensor, pace: Tensor) -> Tensor:
-    """Return how far cars drift through a corner, (N,) from 0 to π / 4 [rad].
+def cornering(curvature: Tensor, pace: Tensor) -> Tensor:
+    """Return how far cars make way through a corner, (N,) from 0 to 1.
 
-    What counts is the angle by which the nose points further into the corner than the car moves. It counts fully up to
-    45 degrees and ever less beyond, to nothing at 90 degrees, so that spinning pays less than drifting. It counts in
-    proportion to the curvature up to that of a radius of 100 m, not on straights, and in proportion to the speed
+    It is proportional to the curvature up to that of a radius of 100 m, 0 on straights, and proportional to the speed
     along the track up to 10 m/s.
+
+    Args:
+        curvature: Curvature of the track (N,) [1/m].
+        pace: Speed along the track (N,) [m/s].
+    """
+    bend = curvature.abs()
+    counted = torch.where(bend * CORNER_RADIUS >= 1.0, (bend * _FULL_CORNER).clamp(max=1.0), 0.0)
+    return counted * (pace / _FULL_WAY).clamp(0.0, 1.0)
+
+
+def inward_angle(angle: Tensor, curvature: Tensor) -> Tensor:
+    """Return by how much noses point further into the corner than the cars move, (N,) from 0 to π / 4 [rad].
+
+    The angle counts fully up to 45 degrees and ever less beyond, to nothing at 90 degrees, so that spinning counts less
+    than drifting.
 
     Args:
         angle: Sideslip (N,) [rad].
         curvature: Curvature of the track, positive to the left (N,) [1/m].
-        pace: Speed along the track (N,) [m/s].
     """
     inwards = -angle * torch.sign(curvature)
-    counted = torch.minimum(inwards, 0.5 * math.pi - inwards).clamp(min=0.0)
-    bend = torch.where(curvature.abs() * CORNER_RADIUS >= 1.0, (curvature.abs() * _FULL_CORNER).clamp(max=1.0), 0.0)
-    return counted * bend * (pace / _FULL_WAY).clamp(0.0, 1.0)
+    return torch.minimum(inwards, 0.5 * math.pi - inwards).clamp(min=0.0)
 
 
 def pack_style_features(
-    drift: Sequence[Tensor], resources: Sequence[Tensor], in_corner: Tensor, gaps: Sequence[Tensor]
+    drift: Sequence[Tensor], resources: Sequence[Tensor], corner: Sequence[Tensor], gaps: Sequence[Tensor]
 ) -> Tensor:
     """Stack tensors (N,) to the columns of `style_features`, (N, F).
 
     Args:
         drift: Quantities of drifting, (N,) each.
         resources: Quantities of tyres and fuel, (N,) each.
-        in_corner: (N,).
+        corner: Drift in corners, and how much the corner counts, (N,) each.
         gaps: Distances to opponents, (N,) each [m].
 
     Returns:
         (N, F).
     """
-    return torch.stack([*drift, *resources, in_corner, *gaps], dim=-1)
+    return torch.stack([*drift, *resources, *corner, *gaps], dim=-1)

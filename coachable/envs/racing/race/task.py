@@ -14,7 +14,8 @@ from coachable.envs.racing.physics.state import WEARS, CarState
 from coachable.envs.racing.race.features import (
     DRIFT_SPEED_MIN,
     NEAR_DISTANCE,
-    corner_drift,
+    cornering,
+    inward_angle,
     pack_style_features,
     sideslip,
 )
@@ -182,5 +183,6 @@ def style_features(
             apart = (other.x - bodies.x) ** 2 + (other.y - bodies.y) ** 2
             near = (apart <= NEAR_DISTANCE * NEAR_DISTANCE) & (group == group.roll(-k, 0))
             gaps += [long.reshape(-1), lat.reshape(-1), near.to(new.dtype).reshape(-1)]
-    in_corner = corner_drift(sideslip(state.vx, state.vy), curvature, outcome.progress / CONTROL_STEP)
-    return pack_style_features(drift, [outcome.overtake, outcome.defend, tire, burnt], in_corner, gaps)
+    share = cornering(curvature, outcome.progress / CONTROL_STEP)
+    corner = [share * inward_angle(sideslip(state.vx, state.vy), curvature), share]
+    return pack_style_features(drift, [outcome.overtake, outcome.defend, tire, burnt], corner, gaps)
