@@ -1,7 +1,8 @@
 """Sphinx extension that writes the pages of the API: one per folder of the package, from its public modules.
 
 The pages are written to `docs/api/` before Sphinx reads its sources. Names in single backticks become links if exactly
-one public class, function or method has this name.
+one public class, function or method has this name. Classes of PyTorch, TensorDict and TorchRL that signatures often
+name are links to the documentation of these libraries.
 """
 
 import ast
@@ -31,6 +32,19 @@ FIRST = [
     "coachable.evaluation",
     "coachable.export",
 ]
+
+_PYTORCH = "https://docs.pytorch.org"
+_TORCHRL = f"{_PYTORCH}/rl/0.14/reference/generated/torchrl"
+ELSEWHERE = {
+    "Tensor": f"{_PYTORCH}/docs/stable/tensors.html",
+    "Module": f"{_PYTORCH}/docs/stable/generated/torch.nn.Module.html",
+    "TensorDictBase": f"{_PYTORCH}/tensordict/stable/reference/generated/tensordict.TensorDictBase.html",
+    "TensorDictModule": f"{_PYTORCH}/tensordict/stable/reference/generated/tensordict.nn.TensorDictModule.html",
+    "EnvBase": f"{_TORCHRL}.envs.EnvBase.html",
+    "TransformedEnv": f"{_TORCHRL}.envs.transforms.TransformedEnv.html",
+    "LossModule": f"{_TORCHRL}.objectives.LossModule.html",
+    "SACLoss": f"{_TORCHRL}.objectives.SACLoss.html",
+}
 
 INDEX = """API
 ===
@@ -102,7 +116,7 @@ def write_pages(app: Sphinx) -> None:
 
 
 def link_name(app: Sphinx, env: BuildEnvironment, node: Any, content: nodes.TextElement) -> nodes.reference | None:
-    """Link a name that is written without its module, if it looks like one of ours and only one object has it."""
+    """Link a name that is written without its module if only one of our objects has it, and classes of `ELSEWHERE`."""
     target = node.get("reftarget", "")
     if node.get("refdomain") != "py" or not re.fullmatch(r"\w*[A-Z_.][\w.]*", target) or app.builder is None:
         return None
@@ -110,7 +124,9 @@ def link_name(app: Sphinx, env: BuildEnvironment, node: Any, content: nodes.Text
     wanted = ("class", "exception", "function", "data") if "." not in target else ("method", "property", "attribute")
     found = [name for name, entry in objects.items() if name.endswith(f".{target}") and entry.objtype in wanted]
     if len(found) != 1:
-        return None
+        module, _, name = target.rpartition(".")
+        known = not module or module.split(".")[0] in ("torch", "tensordict", "torchrl")
+        return nodes.reference("", "", content, refuri=ELSEWHERE[name]) if known and name in ELSEWHERE else None
     entry = objects[found[0]]
     return make_refnode(app.builder, node["refdoc"], entry.docname, entry.node_id, content, found[0])
 

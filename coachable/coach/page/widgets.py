@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -133,7 +133,8 @@ class Chart:
     """Chart of the requested and measured values of one parameter over the last seconds.
 
     The time axis has a fixed range, because viser's plot otherwise keeps the visible share of the data from before the
-    first points were drawn, and may show a part of the axis without data.
+    first points were drawn, and may show a part of the axis without data. The axis of the request shows the whole
+    trained range, so that small deviations look small.
 
     Args:
         server: Server of the page.
@@ -158,8 +159,8 @@ class Chart:
             self.note = server.gui.add_markdown("", visible=False)
         self.choice.on_update(lambda _: redraw())
         self.plot: Any = None
-        # Parameter of the plot, whether it has anything measured, and whether requested and measured values are all 0.
-        self._drawn: tuple[str, bool, bool, bool] | None = None
+        # Parameter of the plot, the ends of its axis, whether it has anything measured, and whether that is all 0.
+        self._drawn: tuple[str, tuple[float, float], bool, bool] | None = None
 
     def follow(self, name: str) -> None:
         """Show a parameter that was just requested."""
@@ -190,14 +191,18 @@ class Chart:
         measured = [row for row in rows if math.isfinite(row[2])]  # uPlot draws nothing at all if there are NaN
         columns = np.array(measured or rows, dtype=float).T
         shown = tuple(columns if measured else columns[:2])
-        zero = [not line.any() for line in shown[1:]]
-        self._plot((self.shown, bool(measured), zero[0], zero[-1]), shown)
+        ends = _ends(self._space[self.shown], shown[1:2] if self._is_apart(bool(measured)) else shown[1:])
+        self._plot((self.shown, ends, bool(measured), not shown[-1].any()), shown)
         write(self.note, f"{self._domain.words.name(self.shown)}: nothing was measured in the last {_SPAN:g} s")
         if self.note.visible == bool(measured):
             self.note.visible = not measured
 
-    def _plot(self, kind: tuple[str, bool, bool, bool], data: tuple[np.ndarray, ...]) -> None:
-        """Draw data in the plot, or in a new one if the parameter changes, so that all its settings change together."""
+    def _is_apart(self, measured: bool) -> bool:
+        """Return whether the measure has an axis of its own: that of a weight has another unit."""
+        return measured and isinstance(self._space[self.shown], Weight)
+
+    def _plot(self, kind: tuple[str, tuple[float, float], bool, bool], data: tuple[np.ndarray, ...]) -> None:
+        """Draw data in the plot, or in a new one if its settings change, so that all change together."""
         if kind == self._drawn:
             self.plot.data = data
             return
@@ -207,26 +212,20 @@ class Chart:
             self.plot = self._server.gui.add_uplot(data=data, height=190, **self._layout(*kind))
         self._drawn = kind
 
-    def _layout(self, name: str, measured: bool, nothing_asked: bool, nothing_found: bool) -> dict[str, Any]:
-        """Return the layout of the plot; a weight and its measure have different units and get an axis each.
-
-        An axis of zeros, which the plot would let end at 100, has the parameter's range, or ends at 1.
-        """
+    def _layout(self, name: str, ends: tuple[float, float], measured: bool, nothing_found: bool) -> dict[str, Any]:
+        """Return the layout of the plot; an own axis of zeros, which the plot would let end at 100, ends at 1."""
         import viser.uplot as uplot
 
         series = [uplot.Series(label="seconds ago"), uplot.Series(label="requested", stroke=_REQUESTED, width=2)]
         axes = [uplot.Axis(size=34), uplot.Axis(size=48)]
-        apart = measured and isinstance(self._space[name], Weight)
+        apart = self._is_apart(measured)
         if apart:
             axes.append(uplot.Axis(scale="right", side=1, size=56, stroke=_MEASURED, grid=uplot.Axis_Grid(show=False)))
         if measured:
             label, scale = ("measured (right)", "right") if apart else ("measured", "y")
             dots = uplot.Series_Points(show=True, size=3, fill=_MEASURED)  # where it was measured; lines only join them
             series.append(uplot.Series(label=label, stroke=_MEASURED, width=2, scale=scale, points=dots))
-        scales = {"x": uplot.Scale(time=False, range=(-_SPAN, 0.0))}
-        parameter = self._space[name]
-        if nothing_asked and (apart or nothing_found) and not isinstance(parameter, Choice):
-            scales["y"] = uplot.Scale(range=(parameter.low, parameter.high))
+        scales = {"x": uplot.Scale(time=False, range=(-_SPAN, 0.0)), "y": uplot.Scale(range=ends)}
         if apart and nothing_found:
             scales["right"] = uplot.Scale(range=(0.0, 1.0))
         return {
@@ -242,6 +241,20 @@ class Chart:
     def _measured(self, report: StyleReport) -> float:
         measures = measures_by_parameter(self._space, report.measured, self._domain.beside)[self.shown]
         return report.measured[measures[0]] if measures else math.nan
+
+
+def _ends(parameter: Parameter, lines: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Return the ends of an axis that shows a parameter's range and all values, in steps, so that they seldom change.
+
+    Args:
+        parameter: The parameter; the axis of a choice shows shares.
+        lines: Values (n,), one array per line.
+    """
+    low, high = (0.0, 1.0) if isinstance(parameter, Choice) else (parameter.low, parameter.high)
+    step = 0.2 * (high - low)
+    below = max(0.5, math.ceil((low - min(line.min() for line in lines)) / step))
+    above = max(0.5, math.ceil((max(line.max() for line in lines) - high) / step))
+    return low - below * step, high + above * step
 
 
 def label(parameter: Parameter, words: Words) -> str:

@@ -2,6 +2,7 @@
 
 import warnings
 
+import numpy as np
 import pytest
 
 viser = pytest.importorskip("viser")
@@ -9,8 +10,10 @@ viser = pytest.importorskip("viser")
 
 from coachable.coach.page.coach_page import verdict  # noqa: E402
 from coachable.coach.page.looks import pad_page  # noqa: E402
+from coachable.coach.page.widgets import _ends  # noqa: E402
 from coachable.coach.session.readout import StyleReport  # noqa: E402
 from coachable.scene.look import icon_link, stylesheet  # noqa: E402
+from coachable.styles import Choice, Setpoint  # noqa: E402
 from tests.coach.page.driving import do, say, wait_for  # noqa: E402
 
 
@@ -137,16 +140,23 @@ def test_measures_that_the_domain_does_not_publish_are_folded(page):
     assert page.further.content.startswith("also measured: task reward **")
 
 
-def test_an_axis_of_zeros_has_the_range_of_the_request(page):
+def test_the_axis_of_the_request_shows_the_trained_range_and_what_was_measured(page):
     do(page, lambda session: session.set(target=0.0))
     page._press("Step")
     do(page)
+    target = page.session.space["target"]
+    assert page.chart.plot.scales["y"]["range"] == pytest.approx((1.2 * target.low, 1.2 * target.high))
     page.chart.choice.value = "fire"
     wait_for(lambda: len(page.chart.plot.axes) == 3)
-    assert page.chart.plot.scales["y"]["range"] == (-0.5, 2.0) and page.chart.plot.scales["right"]["range"] == (
-        0.0,
-        1.0,
-    )
+    assert page.chart.plot.scales["y"]["range"] == (-0.75, 2.25) and page.chart.plot.scales["right"]["range"] == (0, 1)
+
+
+def test_the_ends_of_an_axis_move_in_fifths_of_the_range():
+    number = Setpoint("length", 1.0, 2.0)
+    assert _ends(number, [np.array([1.4, 1.5]), np.array([1.45, 1.6])]) == pytest.approx((0.9, 2.1))
+    assert _ends(number, [np.array([1.5]), np.array([0.7])]) == pytest.approx((0.6, 2.1))
+    assert _ends(number, [np.array([1.5]), np.array([2.01])]) == pytest.approx((0.9, 2.2))
+    assert _ends(Choice("mood", ["calm", "wild"]), [np.array([1.0])]) == pytest.approx((-0.1, 1.1))
 
 
 def test_the_page_for_keys_has_the_shared_look():

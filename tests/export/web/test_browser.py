@@ -132,6 +132,10 @@ def test_the_page_follows_its_sliders_and_asks_no_other_site(browser, address):
     assert measured[1] - measured[0] == pytest.approx(LENGTHS[1] - LENGTHS[0], abs=0.05)
     assert float(browser.evaluate("document.getElementById('measured-pose_held').dataset.value")) > 0.8
     assert f"step_length={LENGTHS[-1]:.2f}" in browser.evaluate("location.hash")
+    browser.evaluate("document.getElementById('pause').click()")
+    browser.call("Emulation.setDeviceMetricsOverride", width=360, height=640, deviceScaleFactor=1, mobile=False)
+    widths = "(svg => [Number(svg.lastChild.getAttribute('x2')), svg.clientWidth])(document.querySelector('svg.steps'))"
+    wait_for(lambda: len(set(browser.evaluate(widths))) == 1, 60)
     sent = [e["params"]["request"]["url"] for e in browser.events if e.get("method") == "Network.requestWillBeSent"]
     foreign = [url for url in sent if not url.startswith((address, "data:", "blob:", "about:"))]
     assert len(sent) > 10 and foreign == []

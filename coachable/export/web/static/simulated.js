@@ -69,6 +69,7 @@ export class SimulatedPage extends Page {
     this.episode = 0;
     this.ask(this.request);
     this.again();
+    addEventListener("resize", () => this.panel.measured(this.readout));
     addEventListener("hashchange", () => this.ask(fromFragment(this.entries, location.hash, this.request)));
     this.listen(this.actions);
     this.pause(matchMedia("(prefers-reduced-motion: reduce)").matches);
