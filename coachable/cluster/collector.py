@@ -1,5 +1,6 @@
 """`ClusterCollector`: the collector of a training whose workers are Ray actors."""
 
+import contextlib
 import queue
 import warnings
 from collections.abc import Callable, Iterator
@@ -102,6 +103,7 @@ class ClusterCollector(AsyncCollector):
         self._offered = -1
         self._open: dict[int, Tensor] = {}  # running trajectories by worker
         self._closed: list[Tensor] = []
+        self._next: Arrival | None = None  # that `has_batch` took from the queue
         self._staleness: list[int] = []
         self._connection = Connection(
             address, num_collectors, cpus_per_worker, patience, min(group_size, num_collectors)
@@ -125,7 +127,7 @@ class ClusterCollector(AsyncCollector):
         )
 
     def __iter__(self) -> Iterator[TensorDictBase]:
-        """Start the workers and yield their batches `(num_envs, steps_per_batch)` without end.
+        """Start the workers, and return an iterator of their batches `(num_envs, steps_per_batch)` without end.
 
         Raises:
             ClusterError: If no worker could be had for `patience` seconds.
@@ -133,12 +135,22 @@ class ClusterCollector(AsyncCollector):
         if self._offered < 0:
             self.after_update(self._updates)
         self.workers.start()
-        while True:
-            yield self._take()
+        return iter(self._take, None)
 
-    def has_batch(self) -> bool:
-        """Return whether the next batch is here, so that taking it does not wait."""
-        return self.workers.arrivals.qsize() > 0 or self.workers.error is not None
+    def has_batch(self, wait: float = 0.0) -> bool:
+        """Return whether the next batch, or an error instead of it, is here, so that taking it does not wait.
+
+        Args:
+            wait: Longest time to wait for it [s].
+        """
+        with contextlib.suppress(queue.Empty):
+            while self._next is None:
+                item = self.workers.arrivals.get(timeout=wait)
+                if isinstance(item, Loss):
+                    self._close(item)
+                else:
+                    self._next = item
+        return self._next is not None or self.workers.error is not None
 
     def after_update(self, updates: int) -> None:
         """Offer the policy's weights to the workers, every `weights_every` updates."""
@@ -184,19 +196,18 @@ class ClusterCollector(AsyncCollector):
         return is_random
 
     def _take(self) -> TensorDictBase:
-        while True:
-            try:
-                item = self.workers.arrivals.get(timeout=_WAIT)
-            except queue.Empty:
-                if self.workers.error is not None:
-                    raise self.workers.error from None
-                continue
-            if isinstance(item, Loss):
-                warnings.warn(f"a Ray worker was lost: {item.text}", stacklevel=2)
-                if item.worker in self._open:
-                    self._closed.append(self._open.pop(item.worker))
-                continue
-            return self._batch(item)
+        while not self.has_batch(_WAIT):
+            pass
+        if self._next is None:
+            assert self.workers.error is not None
+            raise self.workers.error
+        item, self._next = self._next, None
+        return self._batch(item)
+
+    def _close(self, loss: Loss) -> None:
+        warnings.warn(f"a Ray worker was lost: {loss.text}", stacklevel=2)
+        if loss.worker in self._open:
+            self._closed.append(self._open.pop(loss.worker))
 
     def _batch(self, item: Arrival) -> TensorDictBase:
         batch = item.batch

@@ -18,11 +18,15 @@ class AsyncCollector(ABC):
 
     @abstractmethod
     def __iter__(self) -> Iterator[TensorDictBase]:
-        """Start the workers and yield their batches `(num_envs, time)` without end."""
+        """Start the workers, and return an iterator of their batches `(num_envs, time)` without end."""
 
     @abstractmethod
-    def has_batch(self) -> bool:
-        """Return whether the next batch is here, so that taking it does not wait."""
+    def has_batch(self, wait: float = 0.0) -> bool:
+        """Return whether the next batch, or an error instead of it, is here, so that taking it does not wait.
+
+        Args:
+            wait: Longest time to wait for it [s].
+        """
 
     @abstractmethod
     def after_update(self, updates: int) -> None:

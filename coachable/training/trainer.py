@@ -35,6 +35,8 @@ from coachable.training.worker_errors import WorkerError, update_workers, worker
 
 __all__ = ["REPLAY_KEYS", "Trainer", "replay_keys"]
 
+_WAIT = 0.5  # [s] for a batch of workers, after which a signal to stop is looked for
+
 REPLAY_KEYS: tuple[NestedKey, ...] = (
     "observation",
     "action",
@@ -138,11 +140,11 @@ class Trainer:
         self.progress.start(self.frames, self.learner.updates)
         if isinstance(self.collector, AsyncCollector):
             self.collector.after_update(self.learner.updates)  # of a checkpoint, if this training is resumed
-        batches = iter(self.collector)
         try:
             self.learner.check_weights()
             with stop_signals() as stop, worker_errors(self.collector):
-                while self.frames < self.settings.total_frames and not stop.is_set():
+                batches = iter(self.collector)
+                while self.frames < self.settings.total_frames and self._await_batch(stop):
                     data = self._collect(batches)
                     self._store(data)
                     self._update(data.numel(), stop)
@@ -157,6 +159,14 @@ class Trainer:
             self.progress.close()
             self.collector.shutdown()
         return self._latest
+
+    def _await_batch(self, stop: threading.Event) -> bool:
+        """Wait until workers have a batch or a signal asks to stop; return whether the training goes on."""
+        with self._timed("collect"):
+            while isinstance(self.collector, AsyncCollector) and not stop.is_set():
+                if self.collector.has_batch(wait=_WAIT):
+                    break
+        return not stop.is_set()
 
     def _collect(self, batches: Iterator[TensorDictBase]) -> TensorDictBase:
         with self._timed("wait"):

@@ -22,10 +22,16 @@ N_STEPS = 3
 
 
 class FaultyEnv(StyleEchoEnv):
-    """In the worker that creates the file `claim` first, or in all workers once `all_fail` exists, steps go wrong."""
+    """In the worker that creates the file `claim` first, or in all workers once `all_fail` exists, steps go wrong.
+
+    With the fault "start" no environment is ever made; each worker writes its process into a file `started_*` first.
+    """
 
     def __init__(self, folder: Path, fault: str, seed: int) -> None:
         super().__init__(NUM_ENVS, seed)
+        if fault == "start":
+            (folder / f"started_{os.getpid()}").touch()
+            time.sleep(1000.0)
         self.folder, self.fault, self.is_faulty = folder, fault, False
 
     def _claims(self) -> bool:
