@@ -173,8 +173,6 @@ class Trainer:
             self._throttle.wait()
         with self._timed("collect"):
             data = next(batches)
-        if isinstance(self.collector, AsyncCollector) and isinstance(self.replay, EventTableBuffer):
-            self.replay.finish(self.collector.interrupted())
         self.frames += data.numel()
         self._throttle.add(data.numel())
         return data
@@ -187,6 +185,8 @@ class Trainer:
             self._episodes.add(data.reshape(-1))
             # Flattening keeps the steps of each trajectory in order, as an EventTableBuffer requires.
             self.replay.extend(stored.reshape(-1))
+            if isinstance(self.collector, AsyncCollector) and isinstance(self.replay, EventTableBuffer):
+                self.replay.finish(self.collector.interrupted())
 
     def _update(self, new_frames: int, stop: threading.Event) -> None:
         warming_up = self.frames - self._filled_from <= self.settings.warmup_frames

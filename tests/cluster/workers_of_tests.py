@@ -86,14 +86,14 @@ def cluster_train(folder: Path, fault: str = "", workers: int = 2, **settings: A
 
 
 class Watch:
-    """What arrives at a training, batch by batch; `visit` is called after each batch is stored."""
+    """What arrives at a training, by the workers' batches; `visit` is called after one or more of them are stored."""
 
     def __init__(self, train: Trainer, visit=lambda watch: None) -> None:
         self.train, self.batches = train, []
         store = train._store
 
         def keep(data):
-            self.batches.append(data.contiguous().clone())
+            self.batches += [batch.contiguous().clone() for batch in data.split(NUM_ENVS)]
             store(data)
             visit(self)
 
