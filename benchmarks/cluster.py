@@ -77,7 +77,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2, 4, 8], help="(%(default)s)")
     parser.add_argument("--group", type=int, default=8, help="workers of one Ray actor, of coachable-ray (%(default)s)")
     parser.add_argument("--rounds", type=int, default=3, help="(%(default)s)")
-    parser.add_argument("--seconds", type=float, default=3.0, help="of each measurement (%(default)s)")
+    parser.add_argument("--seconds", type=float, default=2.0, help="of each measurement (%(default)s)")
     parser.add_argument("--utd", type=float, default=0.0625, help="updates per env-step (%(default)s)")
     parser.add_argument("--only", nargs="+", choices=CONTESTANTS, default=CONTESTANTS)
     parser.add_argument("--out", type=Path, default=Path("runs/cluster"))
