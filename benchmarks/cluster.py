@@ -7,10 +7,10 @@ All collectors of one number of workers are started, and measured in turn, in al
 Each number is the median over the rounds, and in parentheses is the median of its ratio to that of the collector in
 one process in the same round.
 
-`learner's share` is the part of the learner's thread that updates would take without any collector; its opposite is
-what taking and storing batches, offering weights and the collector's threads add. It is measured in seconds of the
-processor, so that other programs do not change it. `taking` is the time of that thread for taking and storing one
-env-step: in one process it includes the simulation.
+`learner's share` is the processor time that the updates would take without a collector, divided by the processor time
+of the learner's thread. The rest of that thread goes into taking and storing batches and into offering weights.
+`taking` is its processor time for taking and storing 1000 env-steps, which in one process includes the simulation, and
+`other threads` are all others of the learner's process, Ray's among them. Other programs hardly change these three.
 """
 
 import argparse
@@ -152,8 +152,8 @@ class Contestant:
         self.name, self.workers, self.bench, self.train = name, workers, bench, bench.train
         self.collector = bench.make(name, workers)
         self.batches = iter(self.collector)
+        self.train.collector, self.train.settings = self.collector, bench.collecting
         for _ in range(2 * workers):  # all have started
-            self.train.collector = self.collector
             self._step()
 
     def round(self) -> Row:
