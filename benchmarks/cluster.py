@@ -77,7 +77,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2, 4, 8], help="(%(default)s)")
     parser.add_argument("--group", type=int, default=8, help="workers of one Ray actor, of coachable-ray (%(default)s)")
     parser.add_argument("--rounds", type=int, default=3, help="(%(default)s)")
-    parser.add_argument("--seconds", type=float, default=2.0, help="of each measurement (%(default)s)")
+    parser.add_argument("--seconds", type=float, default=3.0, help="of each measurement (%(default)s)")
     parser.add_argument("--utd", type=float, default=0.0625, help="updates per env-step (%(default)s)")
     parser.add_argument("--only", nargs="+", choices=CONTESTANTS, default=CONTESTANTS)
     parser.add_argument("--out", type=Path, default=Path("runs/cluster"))
@@ -205,14 +205,15 @@ class Contestant:
         return row | {"thread": thread / max(updates, 1), "threads": 1e3 * others / max(updates, 1)}
 
     def _wake(self) -> None:
-        """Lets workers go on, and takes what they had ready, which would count as collected now."""
+        """Lets workers go on, and takes what they had ready and one more batch of each, so that all are busy."""
         if self.name == "coachable-ray":
-            self.collector.workers.queue_size = self.workers
             while self.collector.has_batch():
                 next(self.batches)
-        elif self.name == "torchrl-ray":
-            for _ in range(self.workers):
-                next(self.batches)
+            self.collector.workers.queue_size = self.workers
+        if self.name in ("coachable-ray", "torchrl-ray"):
+            wanted = self.workers if self.name == "coachable-ray" else 2 * self.workers
+            while wanted > 0:
+                wanted -= next(self.batches).numel() // (STEPS * self.bench.num_envs)
 
     def _rest(self) -> None:
         if self.name == "coachable-ray":
