@@ -200,7 +200,8 @@ class Trainer:
                     self._update_once()
             else:
                 self.pending_updates += new_frames * self.settings.utd_ratio
-                while self.pending_updates >= 1.0:
+                may_stop = isinstance(self.collector, AsyncCollector)  # other trainings resume at the end of a round
+                while self.pending_updates >= 1.0 and not (may_stop and stop.is_set()):
                     self._update_once()
                     self.pending_updates -= 1.0
             # A single-process collector shares the learner's weights, and an `AsyncCollector` hears of every update.
