@@ -36,13 +36,13 @@ HEADINGS = (
     "seeds",
     "return",
     "std",
-    "style return",
+    "style score",
     "staleness [updates]",
     "env-steps",
     "updates",
     "minutes",
 )
-MEASURES = ("eval/return", "eval/style_return", "frames", "updates", "minutes")
+MEASURES = ("eval/return", "eval/style_score", "frames", "updates", "minutes")
 
 
 def main() -> None:
@@ -79,7 +79,7 @@ def cells(runs: list[Path], arguments: list[str]) -> list[str]:
     return [
         f"{statistics.mean(returns):.1f}",
         f"{statistics.stdev(returns):.1f}" if len(returns) > 1 else "",
-        f"{statistics.mean(last['eval/style_return']):.1f}",
+        f"{statistics.mean(last['eval/style_score']):.2f}",
         f"{statistics.mean(stale):.0f}",
         *(f"{statistics.mean(last[measure]):.0f}" for measure in ("frames", "updates")),
         f"{statistics.mean(last['minutes']):.1f}",

@@ -1,18 +1,20 @@
 """`ClusterCollector`: the collector of a training whose workers are Ray actors."""
 
+import contextlib
 import queue
 import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import cloudpickle
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from coachable.cluster.connection import ClusterError, Connection
-from coachable.cluster.flat_weights import flat_weights, portable_copy
+from coachable.cluster.flat_weights import portable_copy, weights_of
 from coachable.cluster.worker import MAX_WORKERS, WorkerSettings
 from coachable.cluster.workers import Arrival, Loss, Workers
 from coachable.code_version import code_version
@@ -26,9 +28,11 @@ _WAIT = 0.5  # [s] for a batch, after which the workers' error is looked for
 class ClusterCollector(AsyncCollector):
     """Collector whose workers are Ray actors, on this host or on a cluster (docs/guides/cluster.md).
 
-    Each batch `(num_envs, steps_per_batch)` comes from one worker and carries, under `"collector"`, the numbers
-    `worker`, `restart` (how often the worker had been started before), `serial` (of the worker's batches since that
-    start) and `version` (updates that its weights had seen). Replay buffer and learner stay in this process.
+    A worker's batch has `num_envs` rows of `steps_per_batch` steps. All batches that wait are taken together, the rows
+    of one below those of another, because storing each on its own takes too much of the learner's time. Each step
+    carries, under `"collector"`, the numbers `worker`, `restart` (how often the worker had been started before),
+    `serial` (of the worker's batches since that start) and `version` (updates that its weights had seen). Replay buffer
+    and learner stay in this process.
 
     Args:
         make_env: Builds a seeded, batched environment `[N]` from a seed.
@@ -92,7 +96,7 @@ class ClusterCollector(AsyncCollector):
                 f"collector=ray cannot send make_env and the policy to its workers: {type(error).__name__}: {error}; "
                 "expected a make_env that makes its simulator itself, or collector=direct"
             ) from error
-        self.policy = policy
+        self._weights = weights_of(policy)
         self.weights_every = weights_every
         self.init_random_frames = init_random_frames
         self._frames_per_worker = frames
@@ -102,6 +106,7 @@ class ClusterCollector(AsyncCollector):
         self._offered = -1
         self._open: dict[int, Tensor] = {}  # running trajectories by worker
         self._closed: list[Tensor] = []
+        self._next: Arrival | None = None  # that `has_batch` took from the queue
         self._staleness: list[int] = []
         self._connection = Connection(
             address, num_collectors, cpus_per_worker, patience, min(group_size, num_collectors)
@@ -125,7 +130,7 @@ class ClusterCollector(AsyncCollector):
         )
 
     def __iter__(self) -> Iterator[TensorDictBase]:
-        """Start the workers and yield their batches `(num_envs, steps_per_batch)` without end.
+        """Start the workers, and return an endless iterator of batches `(num_envs * batches, steps_per_batch)`.
 
         Raises:
             ClusterError: If no worker could be had for `patience` seconds.
@@ -133,19 +138,29 @@ class ClusterCollector(AsyncCollector):
         if self._offered < 0:
             self.after_update(self._updates)
         self.workers.start()
-        while True:
-            yield self._take()
+        return self._all_batches()
 
-    def has_batch(self) -> bool:
-        """Return whether the next batch is here, so that taking it does not wait."""
-        return self.workers.arrivals.qsize() > 0 or self.workers.error is not None
+    def has_batch(self, wait: float = 0.0) -> bool:
+        """Return whether the next batch, or an error instead of it, is here, so that taking it does not wait.
+
+        Args:
+            wait: Longest time to wait for it [s].
+        """
+        with contextlib.suppress(queue.Empty):
+            while self._next is None:
+                item = self.workers.arrivals.get(timeout=wait)
+                if isinstance(item, Loss):
+                    self._close(item)
+                else:
+                    self._next = item
+        return self._next is not None or self.workers.error is not None
 
     def after_update(self, updates: int) -> None:
         """Offer the policy's weights to the workers, every `weights_every` updates."""
         self._updates = updates
         if self._offered < 0 or updates - self._offered >= self.weights_every:
             self._offered = updates
-            self.workers.offer(updates, flat_weights(self.policy))
+            self.workers.offer(updates, self._weights)
 
     def interrupted(self) -> Tensor:
         """Return the numbers `(trajectories,)` of those that ended with their worker since the last call."""
@@ -183,32 +198,50 @@ class ClusterCollector(AsyncCollector):
         self._asked += self._frames_per_worker
         return is_random
 
-    def _take(self) -> TensorDictBase:
+    def _all_batches(self) -> Iterator[TensorDictBase]:
         while True:
-            try:
-                item = self.workers.arrivals.get(timeout=_WAIT)
-            except queue.Empty:
-                if self.workers.error is not None:
-                    raise self.workers.error from None
-                continue
-            if isinstance(item, Loss):
-                warnings.warn(f"a Ray worker was lost: {item.text}", stacklevel=2)
-                if item.worker in self._open:
-                    self._closed.append(self._open.pop(item.worker))
-                continue
-            return self._batch(item)
+            yield self._take()
 
-    def _batch(self, item: Arrival) -> TensorDictBase:
+    def _take(self) -> TensorDictBase:
+        while not self.has_batch(_WAIT):
+            pass
+        if self._next is None:
+            assert self.workers.error is not None
+            raise self.workers.error
+        taken = []
+        while self._next is not None:
+            taken.append(self._next)
+            self._follow(self._next)
+            self._next = None
+            self.has_batch()
+        return _joined(taken)
+
+    def _follow(self, item: Arrival) -> None:
+        """Count the env-steps of a batch, and remember which trajectories run on after it."""
         batch = item.batch
-        # Copied, so that the object store can free the memory, and because its arrays are read-only.
-        entries = {key: torch.from_numpy(value.copy()) for key, value in batch.entries.items()}
-        data = TensorDict(entries, batch_size=batch.shape)  # pyright: ignore[reportArgumentType]
-        numbers = {"worker": item.worker, "restart": item.start, "serial": batch.serial, "version": batch.version}
-        for name, number in numbers.items():
-            data.set(("collector", name), torch.full(batch.shape, number))
-        last: Any = data[:, -1]
-        running = ~last.get(("next", "done")).reshape(len(last), -1).any(-1)
-        self._open[item.worker] = last.get(("collector", "traj_ids")).reshape(-1)[running]
-        self._frames += data.numel()
+        done = batch.entries["next", "done"][:, -1].reshape(batch.shape[0], -1).any(-1)
+        self._open[item.worker] = torch.from_numpy(batch.entries["collector", "traj_ids"][:, -1].reshape(-1)[~done])
+        self._frames += batch.shape[0] * batch.shape[1]
         self._staleness.append(self._updates - batch.version)
-        return data
+
+    def _close(self, loss: Loss) -> None:
+        warnings.warn(f"a Ray worker was lost: {loss.text}", stacklevel=2)
+        if loss.worker in self._open:
+            self._closed.append(self._open.pop(loss.worker))
+
+
+def _joined(items: list[Arrival]) -> TensorDictBase:
+    """Return batches one below the other, with the numbers of each beside the trajectory numbers.
+
+    The entries are those that all batches have: random actions come without what the policy would have written.
+    """
+    batches = [item.batch for item in items]
+    keys = [key for key in batches[0].entries if all(key in batch.entries for batch in batches)]
+    # Copied, so that the object store can free the memory, and because its arrays are read-only.
+    entries = {key: np.concatenate([batch.entries[key] for batch in batches]) for key in keys}
+    numbers = np.array([[item.worker, item.start, item.batch.serial, item.batch.version] for item in items])
+    num_envs, steps = batches[0].shape
+    rows = numbers.repeat(num_envs, axis=0)[:, None].repeat(steps, axis=1)  # (rows, steps, 4)
+    entries |= {("collector", name): rows[..., i] for i, name in enumerate(("worker", "restart", "serial", "version"))}
+    tensors = {key: torch.from_numpy(value) for key, value in entries.items()}
+    return TensorDict(tensors, batch_size=rows.shape[:2])  # pyright: ignore[reportArgumentType]

@@ -5,12 +5,28 @@ from copy import deepcopy
 import torch
 from torch import Tensor, nn
 
-__all__ = ["flat_weights", "load_flat_weights", "portable_copy"]
+__all__ = ["flat_weights", "load_flat_weights", "portable_copy", "weights_of"]
 
 
-def flat_weights(policy: nn.Module) -> Tensor:
-    """Return all parameters and buffers of floating point as one new vector `(n,)` float32 in the CPU's memory."""
-    return torch.cat([value.detach().reshape(-1).float() for value in _values(policy)]).cpu()
+def weights_of(policy: nn.Module) -> list[Tensor]:
+    """Return all parameters and buffers of floating point."""
+    return [value for value in (*policy.parameters(), *policy.buffers()) if value.is_floating_point()]
+
+
+@torch.no_grad()
+def flat_weights(weights: list[Tensor], out: Tensor | None = None) -> Tensor:
+    """Return weights from `weights_of` as one vector `(n,)` float32 in the CPU's memory.
+
+    Args:
+        weights: The weights.
+        out: An earlier result, to write to it instead of new memory, which takes ten times as long.
+    """
+    parts = [weight.reshape(-1) for weight in weights]
+    if out is None:
+        out = torch.empty(sum(map(len, parts)))
+    if parts[0].device == out.device:
+        return torch.cat(parts, out=out)
+    return out.copy_(torch.cat(parts))
 
 
 def load_flat_weights(policy: nn.Module, flat: Tensor) -> None:
@@ -23,7 +39,7 @@ def load_flat_weights(policy: nn.Module, flat: Tensor) -> None:
     Raises:
         ValueError: If the number of weights differs.
     """
-    values = _values(policy)
+    values = weights_of(policy)
     expected = sum(value.numel() for value in values)
     if flat.numel() != expected:
         raise ValueError(f"got {flat.numel()} weights: expected {expected}")
@@ -39,7 +55,3 @@ def portable_copy(policy: nn.Module) -> nn.Module:
         value.data = value.data.clone()  # parameters may be views of one vector, all of which would be pickled
         value.grad = None
     return copy
-
-
-def _values(policy: nn.Module) -> list[Tensor]:
-    return [value for value in (*policy.parameters(), *policy.buffers()) if value.is_floating_point()]

@@ -10,6 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from coachable.cluster.connection import ClusterError
+from coachable.cluster.flat_weights import flat_weights
 from coachable.cluster.forked_worker import ProcessDiedError
 from coachable.cluster.worker import Batch, WorkerSettings
 from coachable.cluster.worker_host import WorkerHost
@@ -72,16 +73,6 @@ class Slot:
 
 
 @dataclass
-class _Offer:
-    """Weights for the workers: the newest vector, and the reference of what was put into the object store."""
-
-    version: int = -1
-    flat: Tensor | None = None
-    stored: int = -1
-    reference: Any = None
-
-
-@dataclass
 class Workers:
     """Workers and the thread that serves them.
 
@@ -118,7 +109,11 @@ class Workers:
 
     def __post_init__(self) -> None:
         self.slots = [Slot(number) for number in range(self.count)]
-        self._offer = _Offer()
+        self._weights_lock = threading.Lock()
+        self._flat: Tensor | None = None  # the newest weights
+        self._version = -1  # theirs
+        self._stored = -1  # the version of those in the object store
+        self._reference: Any = None
         self._actors: dict[int, Any] = {}  # by group
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -127,14 +122,16 @@ class Workers:
         self._delivered = False
         self._reason = "none has started"
 
-    def offer(self, version: int, flat: Tensor) -> None:
+    def offer(self, version: int, weights: list[Tensor]) -> None:
         """Offer new weights, which workers get when they are asked for their next batch.
 
         Args:
             version: Number of the weights, which rises.
-            flat: Weights (n,) from `flat_weights`.
+            weights: Weights from `weights_of`. They are copied.
         """
-        self._offer = _Offer(version, flat, self._offer.stored, self._offer.reference)
+        with self._weights_lock:
+            self._flat = flat_weights(weights, self._flat)
+            self._version = version
 
     def start(self) -> None:
         """Start the workers and the thread."""
@@ -235,18 +232,18 @@ class Workers:
 
     def _stored_weights(self) -> tuple[int, Any]:
         """Return the version and the reference of the newest weights, which are put into the object store if new."""
-        offer = self._offer
-        if offer.version > offer.stored and offer.flat is not None:
-            try:
-                offer.reference = self.ray.put(offer.flat.numpy())
-                offer.stored = offer.version
-            except (self.ray.exceptions.ObjectStoreFullError, self.ray.exceptions.OutOfDiskError) as error:
-                if offer.reference is None:
-                    raise ClusterError(
-                        f"collector=ray: the weights ({offer.flat.numel() * 4 / 1e6:.0f} MB) do not fit into Ray's "
-                        "object store: start Ray with a larger --object-store-memory"
-                    ) from error
-        return offer.stored, offer.reference
+        with self._weights_lock:
+            if self._version > self._stored and self._flat is not None:
+                try:
+                    self._reference = self.ray.put(self._flat.numpy())
+                    self._stored = self._version
+                except (self.ray.exceptions.ObjectStoreFullError, self.ray.exceptions.OutOfDiskError) as error:
+                    if self._reference is None:
+                        raise ClusterError(
+                            f"collector=ray: the weights ({self._flat.numel() * 4 / 1e6:.0f} MB) do not fit into Ray's "
+                            "object store: start Ray with a larger --object-store-memory"
+                        ) from error
+        return self._stored, self._reference
 
     def _lose(self, slot: Slot, reason: str, raised: bool = False) -> None:
         """Give a worker up, and plan its replacement."""

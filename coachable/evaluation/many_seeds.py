@@ -1,6 +1,8 @@
 """Training of one recipe with several seeds, side by side in processes of their own, and a table of the results."""
 
+import ctypes
 import os
+import signal
 import statistics
 import subprocess
 import sys
@@ -14,6 +16,7 @@ from coachable.training.hardware import detect
 
 __all__ = ["parse_seeds", "seed_table", "train_seeds"]
 
+_PR_SET_PDEATHSIG = 1  # of <sys/prctl.h>
 _SHOWN = ("frames", "updates", "minutes", "episode/return", "eval/return")
 
 
@@ -105,8 +108,18 @@ def _start(script: Path, arguments: Sequence[str], seed: int, folder: Path) -> "
         chosen = [*arguments, f"seed={seed}", f"run_dir={run}"]
     with (folder / f"seed_{seed}.log").open("ab") as log:
         return subprocess.Popen(
-            [sys.executable, str(script), *chosen], stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=os.environ
+            [sys.executable, str(script), *chosen],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            env=os.environ,
+            preexec_fn=_stop_with_parent,
         )
+
+
+def _stop_with_parent() -> None:
+    """Ask for SIGTERM, which saves a checkpoint, when the process that started this one is killed."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def _has_ended(run: Path) -> bool:

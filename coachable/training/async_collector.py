@@ -11,18 +11,23 @@ __all__ = ["AsyncCollector"]
 
 
 class AsyncCollector(ABC):
-    """Iterator of batches that workers collect on their own, each batch by one worker.
+    """Iterator of batches that workers collect on their own.
 
-    The steps of a trajectory arrive in their order, and trajectory numbers, `("collector", "traj_ids")`, never repeat.
+    A batch has rows of one or more workers. Read row by row, the steps of a trajectory are in their order. Trajectory
+    numbers, `("collector", "traj_ids")`, never repeat.
     """
 
     @abstractmethod
     def __iter__(self) -> Iterator[TensorDictBase]:
-        """Start the workers and yield their batches `(num_envs, time)` without end."""
+        """Start the workers, and return an endless iterator of batches `(rows, time)`."""
 
     @abstractmethod
-    def has_batch(self) -> bool:
-        """Return whether the next batch is here, so that taking it does not wait."""
+    def has_batch(self, wait: float = 0.0) -> bool:
+        """Return whether the next batch, or an error instead of it, is here, so that taking it does not wait.
+
+        Args:
+            wait: Longest time to wait for it [s].
+        """
 
     @abstractmethod
     def after_update(self, updates: int) -> None:
@@ -37,7 +42,7 @@ class AsyncCollector(ABC):
         """Return the trajectories that ended with their worker since the last call.
 
         Returns:
-            Trajectory numbers `(trajectories,)` of which all steps that arrived were in earlier batches.
+            Trajectory numbers `(trajectories,)` of which all steps that arrived are in the batches so far.
         """
 
     @abstractmethod

@@ -35,6 +35,8 @@ from coachable.training.worker_errors import WorkerError, update_workers, worker
 
 __all__ = ["REPLAY_KEYS", "Trainer", "replay_keys"]
 
+_WAIT = 0.5  # [s] for a batch of workers, after which a signal to stop is looked for
+
 REPLAY_KEYS: tuple[NestedKey, ...] = (
     "observation",
     "action",
@@ -138,11 +140,11 @@ class Trainer:
         self.progress.start(self.frames, self.learner.updates)
         if isinstance(self.collector, AsyncCollector):
             self.collector.after_update(self.learner.updates)  # of a checkpoint, if this training is resumed
-        batches = iter(self.collector)
         try:
             self.learner.check_weights()
             with stop_signals() as stop, worker_errors(self.collector):
-                while self.frames < self.settings.total_frames and not stop.is_set():
+                batches = iter(self.collector)
+                while self.frames < self.settings.total_frames and self._await_batch(stop):
                     data = self._collect(batches)
                     self._store(data)
                     self._update(data.numel(), stop)
@@ -158,13 +160,19 @@ class Trainer:
             self.collector.shutdown()
         return self._latest
 
+    def _await_batch(self, stop: threading.Event) -> bool:
+        """Wait until workers have a batch or a signal asks to stop; return whether the training goes on."""
+        with self._timed("collect"):
+            while isinstance(self.collector, AsyncCollector) and not stop.is_set():
+                if self.collector.has_batch(wait=_WAIT):
+                    break
+        return not stop.is_set()
+
     def _collect(self, batches: Iterator[TensorDictBase]) -> TensorDictBase:
         with self._timed("wait"):
             self._throttle.wait()
         with self._timed("collect"):
             data = next(batches)
-        if isinstance(self.collector, AsyncCollector) and isinstance(self.replay, EventTableBuffer):
-            self.replay.finish(self.collector.interrupted())
         self.frames += data.numel()
         self._throttle.add(data.numel())
         return data
@@ -177,6 +185,8 @@ class Trainer:
             self._episodes.add(data.reshape(-1))
             # Flattening keeps the steps of each trajectory in order, as an EventTableBuffer requires.
             self.replay.extend(stored.reshape(-1))
+            if isinstance(self.collector, AsyncCollector) and isinstance(self.replay, EventTableBuffer):
+                self.replay.finish(self.collector.interrupted())
 
     def _update(self, new_frames: int, stop: threading.Event) -> None:
         warming_up = self.frames - self._filled_from <= self.settings.warmup_frames
@@ -190,7 +200,8 @@ class Trainer:
                     self._update_once()
             else:
                 self.pending_updates += new_frames * self.settings.utd_ratio
-                while self.pending_updates >= 1.0:
+                may_stop = isinstance(self.collector, AsyncCollector)  # other trainings resume at the end of a round
+                while self.pending_updates >= 1.0 and not (may_stop and stop.is_set()):
                     self._update_once()
                     self.pending_updates -= 1.0
             # A single-process collector shares the learner's weights, and an `AsyncCollector` hears of every update.

@@ -11,9 +11,11 @@ import pytest
 import torch
 
 from coachable.cluster import ClusterError
-from coachable.cluster.flat_weights import load_flat_weights, portable_copy
+from coachable.cluster.flat_weights import flat_weights, load_flat_weights, portable_copy
 from coachable.training.checkpoint import find_checkpoint, read_state
-from tests.cluster.workers_of_tests import Watch, cluster_train
+from tests.cluster.workers_of_tests import NUM_ENVS, STEPS, Watch, cluster_train
+
+LARGEST_TAKE = (4 + 2) * NUM_ENVS * STEPS  # [env-steps] the queue, and what two workers have just sent
 
 pytestmark = [pytest.mark.ray, pytest.mark.filterwarnings("ignore:a Ray worker was lost")]
 
@@ -49,14 +51,15 @@ def test_every_batch_comes_with_the_weights_of_its_version(cluster, tmp_path, gr
     actor, weights = train.learner.loss_module.actor_network, {0: None}
     offer = train.collector.workers.offer
 
-    def keep(version, flat):
-        weights[version] = flat.clone()
-        offer(version, flat)
+    def keep(version, offered):
+        weights[version] = flat_weights(offered)
+        offer(version, offered)
 
     train.collector.workers.offer = keep
     watch = Watch(train)
     latest = train.run()
-    assert train.frames == 400 and train.learner.updates == 38  # 0.1 of the 380 after the warm-up
+    assert 400 <= train.frames <= 400 + LARGEST_TAKE
+    assert 38 <= train.learner.updates <= train.frames // 10  # 0.1 per env-step after the warm-up
     assert set(watch.numbers("worker")) == {0, 1} and set(watch.numbers("restart")) == {0}
     versions = watch.numbers("version")
     assert len(set(versions)) > 5 and max(versions) > 20
@@ -66,7 +69,7 @@ def test_every_batch_comes_with_the_weights_of_its_version(cluster, tmp_path, gr
         with torch.no_grad():
             expected = copy[0](data.reshape(-1).select(*copy[0].in_keys))["loc"]
         torch.testing.assert_close(expected, data.reshape(-1)["loc"], rtol=1e-4, atol=1e-5)
-    assert 0.0 < latest["workers/staleness"] < 38 and latest["workers/restarts"] == 0
+    assert 0.0 < latest["workers/staleness"] < train.learner.updates and latest["workers/restarts"] == 0
     watch.require_nothing_lost()
     watch.require_sums_within_trajectories()
 
@@ -160,13 +163,13 @@ def test_a_full_object_store_stops_nobody(cluster, tmp_path):
     held = [ray.put(np.ones(40 * 2**20, np.uint8)) for _ in range(4)]  # twice what the store of a node holds
     watch = Watch(train)
     train.run()
-    assert train.frames == 400 and len(held) == 4
+    assert 400 <= train.frames <= 400 + LARGEST_TAKE and len(held) == 4
     watch.require_nothing_lost()
 
 
 def test_without_any_worker_the_training_ends_with_one_sentence_and_its_checkpoint(cluster, tmp_path):
     def break_all(watch):
-        if len(watch.batches) == 20:
+        if len(watch.batches) >= 20:
             (tmp_path / "all_fail").touch()
             watch.train.collector.workers.patience = 10.0
 
@@ -225,7 +228,7 @@ train = cluster_train(folder, total_frames=10**6, checkpoint_interval=0.0, **opt
 
 def tell(watch):
     pids = [slot.pid for slot in watch.train.collector.workers.slots]
-    if len(watch.batches) == 20:  # a checkpoint is written after each of them
+    if len(watch.batches) >= 20 and not (folder / "pids").exists():  # checkpoints were written before
         (folder / "pids.partial").write_text(" ".join(map(str, pids)))
         (folder / "pids.partial").rename(folder / "pids")
 

@@ -27,7 +27,7 @@ def test_a_recipe_trains_on_ray(recipe, cluster, tmp_path):
 
     train._store = watch
     latest = train.run()
-    assert train.frames == 80 and train.learner.updates > 0
+    assert train.frames >= 80 and train.learner.updates > 0
     assert workers <= {0, 1} and latest["workers/restarts"] == 0
     assert not torch.equal(before, torch.cat([p.detach().flatten() for p in actor.parameters()]))
     assert (tmp_path / "checkpoints" / "LATEST").exists()

@@ -22,10 +22,16 @@ N_STEPS = 3
 
 
 class FaultyEnv(StyleEchoEnv):
-    """In the worker that creates the file `claim` first, or in all workers once `all_fail` exists, steps go wrong."""
+    """In the worker that creates the file `claim` first, or in all workers once `all_fail` exists, steps go wrong.
+
+    With the fault "start" no environment is ever made; each worker writes its process into a file `started_*` first.
+    """
 
     def __init__(self, folder: Path, fault: str, seed: int) -> None:
         super().__init__(NUM_ENVS, seed)
+        if fault == "start":
+            (folder / f"started_{os.getpid()}").touch()
+            time.sleep(1000.0)
         self.folder, self.fault, self.is_faulty = folder, fault, False
 
     def _claims(self) -> bool:
@@ -80,14 +86,14 @@ def cluster_train(folder: Path, fault: str = "", workers: int = 2, **settings: A
 
 
 class Watch:
-    """What arrives at a training, batch by batch; `visit` is called after each batch is stored."""
+    """What arrives at a training, by the workers' batches; `visit` is called after one or more of them are stored."""
 
     def __init__(self, train: Trainer, visit=lambda watch: None) -> None:
         self.train, self.batches = train, []
         store = train._store
 
         def keep(data):
-            self.batches.append(data.contiguous().clone())
+            self.batches += [batch.contiguous().clone() for batch in data.split(NUM_ENVS)]
             store(data)
             visit(self)
 

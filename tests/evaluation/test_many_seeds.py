@@ -15,6 +15,7 @@ from recipe_config import compose_config
 from coachable.cli import main
 from coachable.evaluation.many_seeds import parse_seeds
 from coachable.training.checkpoint import find_checkpoint, read_state
+from tests.cluster.test_faults import wait_for_end
 
 TINY = ["preset=smoke", "train.total_frames=200", "threads.simulator=1", "threads.learner=1"]
 ROOT = Path(__file__).resolve().parents[2]
@@ -49,7 +50,8 @@ def test_finished_trainings_are_shown_and_not_repeated(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_the_same_command_continues_what_ctrl_c_interrupted(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL], ids=["ctrl_c", "killed"])
+def test_the_same_command_continues_what_was_interrupted(tmp_path, number):
     total = 1_500
     arguments = ["train", "rare_targets", *TINY, f"train.total_frames={total}", "train.checkpoint_interval=1"]
     command = [sys.executable, "-m", "coachable.cli", *arguments, "seeds=3,5", f"run_dir={tmp_path}"]
@@ -60,9 +62,16 @@ def test_the_same_command_continues_what_ctrl_c_interrupted(tmp_path):
     process = start()
     while not (tmp_path / "seed_3" / "checkpoints" / "LATEST").exists() and process.poll() is None:
         time.sleep(0.1)
-    os.killpg(process.pid, signal.SIGINT)
-    said, _ = process.communicate()
-    assert process.returncode == 1 and "interrupted: the same command continues" in said
+    if number == signal.SIGKILL:
+        children = [int(pid) for pid in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()]
+        process.kill()
+        process.communicate()
+        assert children and process.returncode == -signal.SIGKILL
+        assert not wait_for_end(children), "trainings save a checkpoint and end"
+    else:
+        os.killpg(process.pid, number)
+        said, _ = process.communicate()
+        assert process.returncode == 1 and "interrupted: the same command continues" in said
     assert 0 < read_state(find_checkpoint(tmp_path / "seed_3"))["loop"]["frames"] < total
     process = start()
     said, _ = process.communicate()
