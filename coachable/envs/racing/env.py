@@ -93,7 +93,7 @@ class RacingEnv(EnvBase):
     Example:
         >>> env = RacingEnv(num_envs=2, track="ring", seed=0)
         >>> env.rollout(3)["next", "style_features"].shape
-        torch.Size([2, 3, 9])
+        torch.Size([2, 3, 10])
     """
 
     def __init__(
