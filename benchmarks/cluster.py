@@ -30,6 +30,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "recipes"))
 
 import recipe_boxes
 import torch
+from contest import processor
 from recipe_config import compose_config
 
 from coachable.cluster import ClusterCollector
@@ -83,7 +84,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/cluster"))
     options = parser.parse_args()
     os.environ["PYTHONPATH"] = os.pathsep.join(map(str, (ROOT, ROOT / "recipes", ROOT / "benchmarks")))  # of workers
-    print(f"{options.env}, coachable {code_version()}, {processor()}, load {os.getloadavg()[0]:.1f}")
+    machine = f"{os.cpu_count()} cores of {processor()}"
+    print(f"{options.env}, coachable {code_version()}, {machine}, load {os.getloadavg()[0]:.1f}")
     print("| workers | collector | " + " | ".join(COLUMNS.values()) + " |\n|" + "-|" * (len(COLUMNS) + 2), flush=True)
     connection = Connection(None, 1, 0.1, patience=300.0)  # one Ray for all
     try:
@@ -94,13 +96,6 @@ def main() -> None:
         print(f"load {os.getloadavg()[0]:.1f}")
     finally:
         connection.close()
-
-
-def processor() -> str:
-    """Returns the name of the processor and its number of cores."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines()
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return f"{os.cpu_count()} cores of {names[0] if names else 'an unknown processor'}"
 
 
 class Bench:

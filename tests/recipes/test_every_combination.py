@@ -12,7 +12,6 @@ from recipe_config import compose_config, config_groups, run_recipe
 from tensordict import TensorDict
 
 from coachable.domains.racing.families import racing_family
-from coachable.envs.racing.race.features import style_features_size
 from coachable.envs.racing.race.observation import COURSE_POINTS
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
 from coachable.training.trainer import REPLAY_KEYS
@@ -178,7 +177,7 @@ def test_a_driver_of_races_learns_alone_on_the_observation_of_races(stage):
     settings = typed_settings(config)
     env = settings.env.build(num_envs=3, seed=0, track="ring")
     assert env.cars == (5 if among_others else 1) and env.observation_size == 190
-    assert env.reset()["style_features"].shape[-1] == style_features_size(env.cars)
+    assert env.reset()["style_features"].shape[-1] == 10 + 3 * (env.cars - 1)
 
 
 @pytest.mark.parametrize("stage", ["laps", "corners"])
