@@ -7,6 +7,7 @@ import html
 import math
 from collections.abc import Hashable
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -159,25 +160,13 @@ class SceneView:
                 self._still.append(node.handle)
 
     def _look(self, view: Viewpoint) -> None:
-        """Set the initial camera, also in narrow windows, where the agent is shown above the panel."""
-        position, target = camera_of(view)
-        self._server.initial_camera.position = tuple(position)
-        self._server.initial_camera.look_at = tuple(target)
-        self._server.initial_camera.fov = math.radians(45.0)
-        self._server.initial_camera.far = 4 * view.far
-
-        def raise_agent(camera: viser.CameraHandle) -> None:
-            untouched = any(np.allclose(camera.position, start, atol=1e-3) for start in (position, _START))
-            if camera.image_width <= PHONE and untouched:
-                with contextlib.suppress(ValueError):  # the browser reported an invalid camera
-                    camera.up_direction = (0.0, 0.0, 1.0)
-                    camera.position, camera.look_at = (tuple(point) for point in camera_of(view, narrow=True))
-
-        def on_connect(client: viser.ClientHandle) -> None:
-            raise_agent(client.camera)
-            client.camera.on_update(raise_agent)
-
-        self._server.on_client_connect(on_connect)
+        """Set the initial camera, and keep it fitted to each browser's window."""
+        camera = self._server.initial_camera
+        camera.position, camera.look_at = camera_of(view)
+        camera.fov = math.radians(45.0)
+        camera.far = 4 * view.far
+        self._server.on_client_connect(lambda client: client.camera.on_update(partial(fit_camera, view=view)))
+        self._server.on_client_connect(lambda client: fit_camera(client.camera, view))
 
 
 # viser takes the colours of batches and of fog as linear ones, unlike those of meshes.
@@ -234,6 +223,22 @@ class _Node:
             np.concatenate([batch.sizes, np.full((free, 3), 1e-3)]).astype(np.float32),
             np.concatenate([_LINEAR[batch.colours], np.zeros((free, 3), np.uint8)]),
         )
+
+
+def fit_camera(camera: viser.CameraHandle, view: Viewpoint) -> None:
+    """Move a browser's camera if its window has become narrow or wide, unless somebody has moved it by hand.
+
+    Args:
+        camera: Camera of one browser.
+        view: The stage's viewpoint.
+    """
+    wide, narrow = camera_of(view), camera_of(view, narrow=True)
+    phone = camera.image_width <= PHONE
+    expected = (wide[0], _START) if phone else (narrow[0],)
+    if any(np.allclose(camera.position, position, atol=1e-3) for position in expected):
+        with contextlib.suppress(ValueError):  # the browser reported an invalid camera
+            camera.up_direction = (0.0, 0.0, 1.0)
+            camera.position, camera.look_at = narrow if phone else wide
 
 
 def camera_of(view: Viewpoint, narrow: bool = False) -> tuple[np.ndarray, np.ndarray]:

@@ -183,3 +183,17 @@ def test_in_a_narrow_window_the_camera_shows_the_agent_above_the_panel(make):
         assert 0.2 < share < 1.0, "above the panel's 60 %"
     position, target = scene_view.camera_of(viewpoint)
     assert np.linalg.norm(target - position) == pytest.approx(viewpoint.distance) and target[2] == viewpoint.height
+
+
+def test_a_window_that_becomes_wide_again_gets_the_wide_camera_unless_somebody_moved_it():
+    view = RacingStage.viewpoint
+    wide, narrow = scene_view.camera_of(view), scene_view.camera_of(view, narrow=True)
+    camera = SimpleNamespace(position=wide[0], look_at=wide[1], up_direction=None, image_width=360)
+    scene_view.fit_camera(camera, view)
+    assert np.array_equal(camera.position, narrow[0]) and np.array_equal(camera.look_at, narrow[1])
+    camera.image_width = 1280
+    scene_view.fit_camera(camera, view)
+    assert np.array_equal(camera.position, wide[0]) and np.array_equal(camera.look_at, wide[1])
+    camera.position, camera.image_width = wide[0] + 1.0, 360
+    scene_view.fit_camera(camera, view)
+    assert np.array_equal(camera.position, wide[0] + 1.0)
