@@ -206,17 +206,19 @@ class _Sections:
         self.page.section("Requested and measured", *parts)
 
     def add_switches(self, episodes: int) -> None:
-        """Add how fast the agent complies after switches of the style, in `episodes` episodes per run."""
+        """Add how fast the agent complies after switches, in `episodes` episodes per run, if there are any."""
+        tests = [run.switching for run in self.runs]
+        switches = sum(test.switches for test in tests)
+        if not switches:  # the episodes are shorter than the time between two switches
+            return
         period = SWITCH_PERIOD * self.domain.control_step
         draw_switches(self.runs, period, self.out / "switches.png")
-        tests = [run.switching for run in self.runs]
         waits = [test.comply_seconds for test in tests]
         row: dict[str, Any] = {
             "complied": estimate([test.complied for test in tests]),
             "median_seconds": estimate([wait.median().item() if len(wait) else np.nan for wait in waits]),
             **{name: estimate([test.metrics[name] for test in tests]) for name in tests[0].metrics},
         }
-        switches = sum(test.switches for test in tests)
         write_csv([flat_row(row | {"switches": switches})], self.out / "switches.csv")
         self.page.section(
             "Styles that change while the agent acts",
@@ -291,6 +293,7 @@ def _text(styles: StyleTable, runs: Sequence[Run], formats: Mapping[str, str], o
     for row, form in zip(styles.summary(list(formats)), formats.values(), strict=True):
         extremes = "; ".join(f"{t} {shown(row[t], form)} at {row[f'{t} at']}" for t in ("lowest", "highest"))
         lines.append(f"{readable(row['metric'])}: {shown(row['all styles'], form)}; {extremes}")
-    complied = estimate([run.switching.complied for run in runs])
-    lines.append(f"switches complied with: {shown(complied, '.0%')}")
+    if any(run.switching.switches for run in runs):
+        complied = estimate([run.switching.complied for run in runs])
+        lines.append(f"switches complied with: {shown(complied, '.0%')}")
     return "\n".join([*lines, f"wrote {out / 'report.html'}"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from coachable.styles import Choice, StyleSpace
 __all__ = ["draw_metrics", "draw_requests", "draw_switches", "draw_tradeoffs"]
 
 _COLUMNS = 3
+_LABEL = 36  # characters of a line of a style's name
 _GROWTH_POINTS = 200
 
 
@@ -135,10 +137,13 @@ def draw_tradeoffs(runs: Sequence[Run], success: str, form: str, path: Path, tit
 def _draw_points(
     table: StyleTable, metrics: Sequence[str], formats: Mapping[str, str], path: Path, titles: Mapping[str, str]
 ) -> None:
-    height = 0.9 + 0.22 * len(table.cells)
-    with drawing(path, 1, len(metrics), size=(2.2 + 2.6 * len(metrics), height), sharey=True) as panels:
-        rows = list(range(len(table.cells)))
-        for panel, metric in zip(panels[0], metrics, strict=True):
+    labels = [textwrap.fill(label, _LABEL) for label in table.labels]
+    lines = sum(label.count("\n") + 1 for label in labels)
+    columns = min(len(metrics), _COLUMNS)
+    height = (0.9 + 0.16 * lines + 0.06 * len(labels)) * -(-len(metrics) // columns)
+    with _panels(path, len(metrics), (2.2 + 2.6 * columns, height), columns, sharey=True) as panels:
+        rows = list(range(len(labels)))
+        for panel, metric in zip(panels, metrics, strict=True):
             estimates = [table.of(metric, [i]) for i in rows]
             panel.errorbar([e.value for e in estimates], rows, xerr=_reach(estimates), fmt="o", ms=4, capsize=2)
             panel.set_xlabel(titles.get(metric, readable(metric)))
@@ -146,8 +151,9 @@ def _draw_points(
                 rare = panel.get_xlim()[1] < RARE
                 panel.set_xlim(*((None, None) if rare else (-0.03, 1.03)))
                 panel.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=None if rare else 0))
-        panels[0, 0].set_yticks(rows, table.labels, fontsize=8)
-        panels[0, 0].invert_yaxis()
+            panel.tick_params(axis="y", labelsize=8)
+        panels[0].set_yticks(rows, labels)
+        panels[0].invert_yaxis()
 
 
 def _line(panel: Axes, x: Sequence[float], estimates: Sequence[Estimate], index: int, label: str, lines: int) -> None:
@@ -164,12 +170,14 @@ def _reach(estimates: Sequence[Estimate]) -> np.ndarray:
 
 
 @contextlib.contextmanager
-def _panels(path: Path, count: int) -> Iterator[list[Axes]]:
+def _panels(
+    path: Path, count: int, size: tuple[float, float] | None = None, columns: int | None = None, sharey: bool = False
+) -> Iterator[list[Axes]]:
     """Provide `count` panels of a figure, see `drawing`."""
-    columns = 2 if count == 4 else min(count, _COLUMNS)
+    columns = columns or (2 if count == 4 else min(count, _COLUMNS))
     rows = -(-count // columns)
-    size = (4.0 * columns if count > 1 else 5.4, 3.2 * rows)
-    with drawing(path, rows, columns, size=size) as grid:
+    size = size or (4.0 * columns if count > 1 else 5.4, 3.2 * rows)
+    with drawing(path, rows, columns, size=size, sharey=sharey) as grid:
         for panel in grid.flat[count:]:
             panel.set_visible(False)
         yield list(grid.flat[:count])

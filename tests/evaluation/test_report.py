@@ -61,6 +61,15 @@ AGENT = LoadedPolicy(
 SMALL = {"seeds": 3, "episodes": 2, "switch_episodes": 4, "progress": False}
 
 
+@pytest.fixture(scope="module", autouse=True)
+def quick_switches():
+    """Switches within episodes of 10 steps."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in ("runs", "report"):
+            patch.setattr(f"coachable.evaluation.{module}.SWITCH_PERIOD", 4)
+        yield
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     out = tmp_path_factory.mktemp("report")
@@ -184,10 +193,10 @@ def test_several_agents_are_a_run_each(tmp_path):
 def test_another_kind_of_grid(tmp_path):
     """No numeric axis, metrics that the domain does not name, an agent that never lives to see a switch."""
     domain = Domain(**{**vars(DOMAIN), "grid": {"hat": ("red", "blue")}, "columns": {}})
-    write_report(domain, {"toy.pt": AGENT}, tmp_path, **SMALL, steps=3)
+    text = write_report(domain, {"toy.pt": AGENT}, tmp_path, **SMALL, steps=3)
     page = (tmp_path / "report.html").read_text()
     assert "task return" in page and "Requested and measured" not in page
-    assert "n/a" in page
+    assert "Styles that change" not in page and "switches" not in text and not (tmp_path / "switches.csv").exists()
 
 
 def test_of_many_parameters_only_what_is_asked_for_is_named():

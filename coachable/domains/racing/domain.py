@@ -17,7 +17,7 @@ from coachable.envs.racing.circuit.track import Track
 from coachable.envs.racing.env import EPISODE_STEPS
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
 from coachable.envs.racing.race.observation import ACTION_GROUPS, COURSE_POINTS, observation_groups
-from coachable.envs.racing.race.scenarios import rolling_start
+from coachable.envs.racing.race.scenarios import SOLO, rolling_start
 from coachable.scene.renderer import SceneRenderer
 
 # Options of a training's environment that do not apply when an agent is shown or measured.
@@ -47,6 +47,8 @@ def racing_domain(
         **options: Options of the environment that differ from training when an agent is shown and measured.
     """
     make_env, make_space, make_reward = racing_family(family)
+    if cars == 1:
+        options = {"scenarios": SOLO} | options  # training also launches cars in any direction, or starts off course
 
     def as_trained(settings: Mapping[str, Any]) -> Domain:
         """Return the domain with the track, car, observation and episode length of a training.

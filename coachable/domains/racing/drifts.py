@@ -13,7 +13,6 @@ from coachable.domains.racing.families import home_track
 from coachable.domains.racing.laps import circuits_report, circuits_summary, drive_circuits
 from coachable.domains.racing.metrics import DRIFT_DEG, DRIFT_SPEED, GRIP_DEG
 from coachable.envs.racing.race.features import CORNER_RADIUS, DRIFT_NAMES
-from coachable.envs.racing.race.scenarios import Scenario
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import drawing
 from coachable.evaluation.statistics import bootstrap_interval, comparison_interval, rank_correlation
@@ -38,7 +37,6 @@ SWEEPS = {  # weights that rise together
     "all four": DRIFT_NAMES,
 }
 WEIGHTS = (-0.4, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
-_STARTS = (Scenario("solo", 1.0, "solo"),)
 _METRICS = (
     *("sideslip", "sideslip_corners", "sideslip_straights", "drift_corners", "drift_straights", "slip_angle_rear"),
     *("pace", "off", "turned_per_km", "backwards", "turns", "survived"),
@@ -72,7 +70,6 @@ def evaluate_drift(domain: Domain, agent: LoadedPolicy, out: Path, settings: Eva
         agent.space,
         episodes=settings.episodes,
         cells=cells,
-        env_options={"scenarios": _STARTS},
         **settings.rollout,
     )
     values = {name: value.reshape(len(SWEEPS), len(WEIGHTS), -1) for name, value in grid.episodes.items()}

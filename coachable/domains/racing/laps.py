@@ -13,7 +13,7 @@ from coachable.domains.racing.metrics import TelemetryMeasures
 from coachable.envs.racing.circuit.circuits import HELD_OUT, SHIPPED, load_tracks
 from coachable.envs.racing.physics.cars import Resources, load_car
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
-from coachable.envs.racing.race.scenarios import Conditions, Scenario
+from coachable.envs.racing.race.scenarios import SOLO, Conditions
 from coachable.evaluation.episode_records import record_styles
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.statistics import bootstrap_interval
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 TRIAL_STEPS = 6000  # ten minutes: two laps of the longest circuit
 DRIVEN = (*SHIPPED, *HELD_OUT)
-SOLO = (Scenario("solo", 1.0, "solo"),)
 _SHOWN = {"circuit": "", "trained": "", "kilometres": ".1f", "laps": "", "clean_laps": ".0%", "mean_lap": ".2f"}
 _SHOWN |= {"quasi_steady_state": ".2f", "over": "+.1%", "off": ".2%", "retired": ".0%"}
 

@@ -19,12 +19,12 @@ from coachable.domains.racing.bounds import (
 )
 from coachable.domains.racing.families import home_track, typical_car
 from coachable.domains.racing.frontier import TANK, WORN, sweep
-from coachable.domains.racing.laps import SOLO, TRIAL_STEPS, circuits_report, circuits_summary, cut_laps, drive_circuits
+from coachable.domains.racing.laps import TRIAL_STEPS, circuits_report, circuits_summary, cut_laps, drive_circuits
 from coachable.domains.racing.metrics import TelemetryMeasures
 from coachable.domains.racing.traffic import draw_traffic, race_in_traffic, traffic_report, traffic_response
 from coachable.envs.racing.circuit.circuits import HELD_OUT, load_track
 from coachable.envs.racing.physics.cars import Resources
-from coachable.envs.racing.race.scenarios import Conditions
+from coachable.envs.racing.race.scenarios import SOLO, Conditions
 from coachable.evaluation.episode_records import record_styles
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import drawing, shade

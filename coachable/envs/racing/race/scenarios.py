@@ -55,6 +55,9 @@ class Scenario:
             raise ValueError(f"scenario {self.name!r} starts {self.start!r}: expected one of {', '.join(STARTS)}")
 
 
+SOLO = (Scenario("solo", 1.0, "solo"),)  # anywhere on the course, alone
+
+
 def drift_scenarios() -> tuple[Scenario, ...]:
     """Return launches at random positions, speeds and orientations (paper).
 
