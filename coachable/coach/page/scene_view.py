@@ -17,7 +17,7 @@ from coachable.coach.session.session import CoachSession
 from coachable.scene.between import between, continues
 from coachable.scene.frame import Frame, Map, Stage, Viewpoint
 from coachable.scene.palette import AIR, HAZE, NIGHT_AIR, NIGHT_HAZE, css
-from coachable.scene.parts import SHAPES, Batch, Parts, about_z, rotated, unit_mesh
+from coachable.scene.parts import SHAPES, Batch, Parts, about_z, multiplied, rotated, unit_mesh
 from coachable.scene.renderer import GLOW
 
 if TYPE_CHECKING:
@@ -59,7 +59,8 @@ class SceneView:
         self._seen: Hashable = None
         self._place: Hashable = None
         self._still: list[Any] = []
-        # What moves is placed relative to the focus, so that it stays in the picture in browsers that draw slowly.
+        # What moves is placed relative to the agent, whose pose is a frame of its own: browsers that draw slowly show
+        # the pose of a frame sooner than the many places in it.
         self._nodes = {
             (group, shape): _Node(server, f"{parent}/{group}_{shape}", shape, glows=group == "glows")
             for group, parent in (("parts", _MOVING), ("marks", _ROOT), ("glows", _MOVING))
@@ -114,10 +115,10 @@ class SceneView:
             _light(event.client.scene, self._stage.viewpoint, event.target.value)
 
     def _show(self, frame: Frame) -> None:
-        focus = np.array([*frame.focus[:2], 0.0])
+        focus, turn = np.array([*frame.focus[:2], 0.0]), np.array(about_z(frame.heading))
         for (group, _), node in self._nodes.items():
-            node.show(getattr(frame, group), np.zeros(3) if group == "marks" else focus)
-        self._moving.position = focus
+            node.show(getattr(frame, group), *(() if group == "marks" else (focus, turn)))
+        self._moving.position, self._moving.wxyz = focus, turn
         self._move(frame)
         for index, handle in enumerate(self._labels):
             label = frame.labels[index] if index < len(frame.labels) else None
@@ -186,11 +187,19 @@ class _Node:
         self.handle: Any = None
         self._room = 0
 
-    def show(self, parts: Parts, origin: np.ndarray | None = None) -> None:
-        """Show the primitives of this node's shape, with places relative to an origin (3,) [m]."""
+    def show(self, parts: Parts, origin: np.ndarray | None = None, turn: np.ndarray | None = None) -> None:
+        """Show the primitives of this node's shape.
+
+        Args:
+            parts: The primitives.
+            origin: Position (3,) of the frame in which the node lies [m]; None for the world's.
+            turn: Its orientation, a quaternion (4,).
+        """
         batch = parts.of(self._shape)
-        if origin is not None:
-            batch = replace(batch, positions=batch.positions - origin)
+        if origin is not None and turn is not None:
+            back = turn * (1, -1, -1, -1)
+            places = rotated(back, batch.positions - origin)
+            batch = replace(batch, positions=places, wxyzs=multiplied(back, batch.wxyzs))
         if len(batch) > self._room:
             self._make(batch)
         elif self._room:

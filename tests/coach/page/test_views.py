@@ -15,7 +15,7 @@ from coachable.domains.combat.stage import CombatStage  # noqa: E402
 from coachable.domains.humanoid.stage import HumanoidStage  # noqa: E402
 from coachable.domains.racing.stage import RacingStage  # noqa: E402
 from coachable.scene import palette  # noqa: E402
-from coachable.scene.parts import Parts  # noqa: E402
+from coachable.scene.parts import Parts, rotated  # noqa: E402
 from tests.coach.echo_domain import echo_session  # noqa: E402
 
 
@@ -148,9 +148,13 @@ def test_slow_control_steps_are_drawn_in_between(server, monkeypatch):
     assert -view._root.position[:2] == pytest.approx(between, abs=1e-5)
     assert view._moving.position[:2] == pytest.approx(between, abs=1e-5)
     view.update()
-    placed = view._nodes["parts", "ball"].handle.batched_positions + view._moving.position
-    balls = view.frame.parts.of("ball").positions
-    assert placed[: len(balls)] == pytest.approx(balls, abs=1e-4), "relative to what the camera follows"
+    pose, boxes = view._moving, view.frame.parts.of("box")
+    shown = view._nodes["parts", "box"].handle
+    placed = rotated(pose.wxyz, shown.batched_positions) + pose.position
+    assert placed[: len(boxes)] == pytest.approx(boxes.positions, abs=1e-4), "relative to what the camera follows"
+    axes = [rotated(wxyzs, np.array([1.0, 0.0, 0.0])) for wxyzs in shown.batched_wxyzs[: len(boxes)]]
+    expected = [rotated(wxyzs, np.array([1.0, 0.0, 0.0])) for wxyzs in boxes.wxyzs]
+    assert rotated(pose.wxyz, np.array(axes)) == pytest.approx(np.array(expected), abs=1e-4)
     session.close()
 
 
