@@ -25,10 +25,9 @@ if TYPE_CHECKING:
 
 TRIAL_STEPS = 6000  # ten minutes: two laps of the longest circuit
 DRIVEN = (*SHIPPED, *HELD_OUT)
-_SHOWN = {"circuit": "", "trained": "", "kilometres": ".1f", "laps": "", "clean_laps": ".0%", "mean_lap": ".2f"}
-_SHOWN |= {"quasi_steady_state": ".2f", "over": "+.1%", "off": ".2%", "retired": ".0%"}
-
-_UNITS = {"mean_lap": "s", "quasi_steady_state": "s"}
+_SHOWN = {"circuit": "", "trained": "", "kilometres": ".1f", "fuel": ".0f", "laps": "", "clean_laps": ".0%"}
+_SHOWN |= {"mean_lap": ".2f", "quasi_steady_state": ".2f", "over": "+.1%", "off": ".2%", "retired": ".0%"}
+_UNITS = {"fuel": "l", "mean_lap": "s", "quasi_steady_state": "s"}
 
 
 def cut_laps(distance: np.ndarray, off: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -64,10 +63,14 @@ def drive_circuits(domain: Domain, agent: LoadedPolicy, settings: EvaluationSett
 
     Returns:
         A row per circuit: whether the agent was trained on it, completed laps, share of them that never left the track,
-        mean lap after the first one and quasi-steady-state lap on half a tank [s], share of time off the track, share
-        of cars that retired. "over" and its 95 % interval are of the lap times above the quasi-steady state, as a share
-        of it.
+        mean lap after the first one and quasi-steady-state lap [s], share of time off the track, share of cars that
+        retired. "over" and its 95 % interval are of the lap times above the quasi-steady state, as a share of it. The
+        family "resources" starts with three quarters of a tank [l], the others with the fuel of their trainings.
     """
+    family, trained_in = domain.name.removeprefix("racing_"), agent.config.get("env", {})
+    uses_fuel = family == "resources"  # the other families drive with the fuel that they start with
+    conditions = Conditions(fuel=0.75 * TANK) if uses_fuel else Conditions()  # enough for the whole trial
+    load = TANK / 2 if uses_fuel else conditions.fuel
     tracks = load_tracks(DRIVEN)
     if "track" in settings.env_options:
         tracks += (settings.env_options["track"],)
@@ -85,20 +88,19 @@ def drive_circuits(domain: Domain, agent: LoadedPolicy, settings: EvaluationSett
         controlled=1,
         driver=None,
         scenarios=SOLO,
-        conditions=Conditions(fuel=0.75 * TANK),  # enough for the whole trial
+        conditions=conditions,
         episode_steps=steps + 1,
         **{**settings.rollout, "steps": steps},
     )
     distance, off = (record.measures[name].double().numpy() for name in ("distance", "off"))
     alive = record.alive.numpy()
-    family, trained_in = domain.name.removeprefix("racing_"), agent.config.get("env", {})
     trained, car = training_tracks(family, trained_in), load_car(typical_car(family, trained_in))
     rows = []
     for index, track in enumerate(tracks):
         own = range(index, count, len(tracks))
         driven = [(distance[:, i][alive[:, i]], off[:, i][alive[:, i]]) for i in own]
         times, clean, _ = zip(*(cut_laps(*drive, track.length) for drive in driven), strict=True)
-        [bound] = LapProgramme(track, car, Resources(), fuel=TANK / 2).laps("fuel", [0.0])
+        [bound] = LapProgramme(track, car, Resources(), fuel=load).laps("fuel", [0.0])
         flying = np.array([*np.concatenate([lap[1:] for lap in times]), np.nan])
         mean, (low, high) = mean_of(flying), bootstrap_interval(flying / bound.time - 1.0)
         rows.append(
@@ -106,6 +108,7 @@ def drive_circuits(domain: Domain, agent: LoadedPolicy, settings: EvaluationSett
                 "circuit": track.name,
                 "trained": "yes" if track.name in trained else "no",
                 "kilometres": track.length / 1000.0,
+                "fuel": conditions.fuel,
                 "laps": sum(map(len, times)),
                 "clean_laps": float(np.concatenate(clean).mean()) if sum(map(len, clean)) else 0.0,
                 "mean_lap": mean,
@@ -126,10 +129,9 @@ def circuits_report(rows: Sequence[Mapping[str, Any]]) -> str:
     Args:
         rows: Result of `drive_circuits`.
     """
-    text = "\n## Circuits\n\nAlone, in the default style, from three quarters of a tank on.\n\n" + markdown_table(
-        rows, _SHOWN, _UNITS
-    )
-    text += "\nTrained: whether the agent was trained on the circuit. Laps: completed ones; clean if never three "
+    text = "\n## Circuits\n\nAlone, in the default style.\n\n" + markdown_table(rows, _SHOWN, _UNITS)
+    text += "\nTrained: whether the agent was trained on the circuit. Fuel: at the start; only the family `resources` "
+    text += "uses fuel up, and its bound is on half a tank. Laps: completed ones; clean if never three "
     text += "wheels were off the track. Mean lap: after the first one; over: above the quasi-steady state of a "
     text += "point mass. "
     return text + "Off: share of the time off the track. Retired: share of the cars that stood, drove back or left.\n"

@@ -21,6 +21,7 @@ from coachable.domains.racing.traffic import draw_traffic, race_in_traffic, traf
 from coachable.envs.racing.circuit.circuits import load_track, load_tracks
 from coachable.envs.racing.circuit.track import Track
 from coachable.envs.racing.physics.cars import load_car
+from coachable.envs.racing.physics.state import ROW
 from coachable.envs.racing.race.driver import LineFollower
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.statistics import wilson_interval
@@ -196,6 +197,16 @@ def test_laps_on_shipped_held_out_and_own_circuits(tmp_path, monkeypatch):
     summary = circuits_summary(rows)
     assert summary["unseen"]["over"] == pytest.approx((rows[1]["over"] + rows[2]["over"]) / 2)
     assert "| own | no |" in circuits_report(rows)
+
+
+@pytest.mark.parametrize(("family", "car", "fuel"), [("resources", "x2019", 75.0), ("drift", "street", 30.0)])
+def test_circuits_are_driven_with_the_fuel_of_the_family(one_circuit, family, car, fuel):
+    domain, agent = scripted(family, car)
+    made = []
+    seen = replace(domain, make_env=lambda **options: made.append(domain.make_env(**options)) or made[-1])
+    [row] = drive_circuits(seen, agent, EvaluationSettings(episodes=1, steps=3, progress=False))
+    assert row["fuel"] == fuel
+    assert made[-1].state[ROW["fuel"]].flatten().tolist() == pytest.approx([fuel], abs=0.5)
 
 
 def test_races_of_the_scripted_driver(tmp_path, one_circuit):
