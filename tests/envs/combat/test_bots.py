@@ -2,10 +2,10 @@
 
 import pytest
 import torch
+from combat_bots import BOTS, Bot
 from tensordict import TensorDict
 
 from coachable.envs.combat import CombatEnv
-from coachable.envs.combat.bots import BOTS, Bot
 from coachable.envs.combat.constants import CONTROL_STEP
 from coachable.envs.combat.gamepad import GAMEPAD
 from coachable.envs.combat.player import from_stick, to_stick
