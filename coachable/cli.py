@@ -199,7 +199,7 @@ def _train_seeds(file: Path, arguments: list[str], seeds: str) -> int:
     chosen = parse_seeds(seeds.partition("=")[2])
     print(f"Writing to {folder}; run_dir={folder} continues what Ctrl-C interrupts", flush=True)
     failed = train_seeds(file, arguments, chosen, folder)
-    print(seed_table(folder, chosen, failed))
+    print(seed_table(folder, chosen, failed), end="")
     return 1 if failed else 0
 
 

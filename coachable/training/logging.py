@@ -42,21 +42,17 @@ class CsvLog:
         if self.path.exists() and self.path.read_bytes()[-1:] not in (b"", b"\n"):
             self._rewrite(rows)
 
-    def rewind(self, limit: float, key: str = "frames") -> None:
-        """Drop the rows beyond a limit, which a resumed training writes again.
-
-        Args:
-            limit: Largest value to keep.
-            key: Column that is compared.
+    def rewind(self, frames: int) -> None:
+        """Drop the rows after `frames` env-steps, which a resumed training writes again.
 
         Raises:
             ValueError: If the column has an entry that is not a number, or the file is not a table.
         """
         rows = self._read()
         try:
-            kept = [row for row in rows if float(row.get(key) or 0) <= limit]
+            kept = [row for row in rows if float(row.get("frames") or 0) <= frames]
         except ValueError as error:
-            raise ValueError(f"{self.path} is damaged: {error} in {key!r}. {_MOVE}") from error
+            raise ValueError(f"{self.path} is damaged: {error} in 'frames'. {_MOVE}") from error
         if len(kept) < len(rows):
             self._rewrite(kept)
 

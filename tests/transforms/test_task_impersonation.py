@@ -147,7 +147,7 @@ def test_labels_are_independent_over_transitions_and_copies(space, sampler):
     td = TensorDict(
         {"style": space.sample((size,)), "next": {"reward": one, "task_reward": one, "style_features": one}}, [size]
     )
-    draws = sampler.sample_independent((20_000,), torch.Generator().manual_seed(1))
+    draws = sampler.sample((20_000, 1), torch.Generator().manual_seed(1)).squeeze(-2)
     alike = (draws[::2] == draws[1::2]).all(-1).double().mean().item()
     for n in range(1, 7):
         labels = TaskImpersonation(reward, n=n, sampler=sampler, seed=n)(td)["style"][:, 1:]
@@ -180,13 +180,13 @@ def test_the_cars_of_a_race_share_a_style_and_their_labels_do_not():
     copies = space.sampler.copies
     drawn = space.sample((copies * 7,), torch.Generator().manual_seed(0)).reshape(copies, 7, space.dim)
     assert (drawn == drawn[0]).all() and len(drawn[0].unique(dim=0)) == 7
-    assert len(space.sampler.sample_independent((copies, 7)).reshape(-1, space.dim).unique(dim=0)) == 7 * copies
+    assert len(space.sampler.sample((copies, 7, 1)).reshape(-1, space.dim).unique(dim=0)) == 7 * copies
 
 
 def test_samplers_that_share_nothing_draw_as_before():
     """The same numbers in the same order, so that a seed goes on to mean what it meant."""
     sampler = style_mixture(StyleSpace([Weight("a", -1.0, 1.0), Weight("b", 0.0, 2.0)]))
-    independent = sampler.sample_independent((5, 3), torch.Generator().manual_seed(0))
+    independent = sampler.sample((5, 3, 1), torch.Generator().manual_seed(0)).squeeze(-2)
     assert torch.equal(independent, sampler.sample((5, 3), torch.Generator().manual_seed(0)))
 
 

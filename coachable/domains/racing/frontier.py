@@ -67,13 +67,12 @@ class Lap:
 
 
 class LapProgramme:
-    """Dynamic programme for the laps of least cost of one car on one track.
+    """Dynamic programme for the laps of least cost of one car with half a tank on one track.
 
     Args:
         track: Circuit.
         car: Parameters of one car, as numbers.
         resources: Wear and fuel rates; `fuel_exponent` determines how much part throttle saves.
-        fuel: Fuel on board, half a tank by default [l].
         line: Offset from the centre line (n,); by default the line of least curvature [m].
 
     Example:
@@ -83,16 +82,14 @@ class LapProgramme:
         True
     """
 
-    def __init__(
-        self, track: Track, car: Car, resources: Resources, *, fuel: float = TANK / 2, line: np.ndarray | None = None
-    ) -> None:
+    def __init__(self, track: Track, car: Car, resources: Resources, *, line: np.ndarray | None = None) -> None:
         curvature, spacing = line_geometry(track, minimum_curvature_line(track) if line is None else line)
         ends = np.concatenate([[0.0], np.cumsum(spacing)])
         count = max(3, round(ends[-1] / STAGE))
         self.step = float(ends[-1] / count)
         middle = (np.arange(count) + 0.5) * self.step
         self.curvature = np.abs(np.interp(middle, ends, np.append(curvature, curvature[0])))
-        self.car, self.resources, self.envelope = car, resources, Envelope(car, fuel=fuel)
+        self.car, self.resources, self.envelope = car, resources, Envelope(car, fuel=TANK / 2)
         self._tables()
 
     def laps(self, resource: str, prices: Sequence[float]) -> list[Lap]:

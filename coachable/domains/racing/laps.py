@@ -99,7 +99,7 @@ def drive_circuits(domain: Domain, agent: LoadedPolicy, settings: EvaluationSett
         own = range(index, count, len(tracks))
         driven = [(distance[:, i][alive[:, i]], off[:, i][alive[:, i]]) for i in own]
         times, clean, _ = zip(*(cut_laps(*drive, track.length) for drive in driven), strict=True)
-        [bound] = LapProgramme(track, car, Resources(), fuel=TANK / 2).laps("fuel", [0.0])
+        [bound] = LapProgramme(track, car, Resources()).laps("fuel", [0.0])
         flying = np.array([*np.concatenate([lap[1:] for lap in times]), np.nan])
         mean, (low, high) = mean_of(flying), bootstrap_interval(flying / bound.time - 1.0)
         rows.append(

@@ -119,7 +119,6 @@ class HumanoidEnv(EnvBase):
         self._push_left = np.zeros(num_envs, dtype=np.int64)
         self.styled_speed = styled_speed
         self._features_size = STYLED_SPEED_SIZE if styled_speed else STYLE_FEATURES_SIZE
-        self.divergences = 0
         self._observation = np.zeros((num_envs, OBSERVATION_SIZE), dtype=np.float32)
         self._postures = self._find_postures()
         self._random = np.random.default_rng(seed)
@@ -190,7 +189,6 @@ class HumanoidEnv(EnvBase):
         require_finite_action(action)
         controls = np.clip(action.numpy().astype(np.float64), -1.0, 1.0)
         diverged = self.simulation.step(controls, self._pushes())
-        self.divergences += int(diverged.sum())
         self.steps += 1
         kinematics = self.simulation.kinematics()
         forces, power = self.simulation.forces(), self.simulation.power()

@@ -72,7 +72,7 @@ def test_a_ring_is_driven_at_the_speed_that_friction_allows():
 @pytest.mark.parametrize("car", ["gt3", "x2019"])
 def test_a_stint_lasts_about_ten_laps(car, long_stages):
     """An uncoached lap: the fastest of the programme on its own line."""
-    programme = LapProgramme(load_track("lakeside"), load_car(car), Resources.calibrated(car), fuel=TANK / 2)
+    programme = LapProgramme(load_track("lakeside"), load_car(car), Resources.calibrated(car))
     [lap] = programme.laps("fuel", [0.0])
     assert TANK / lap.fuel == pytest.approx(10.0, abs=1.0)
     assert WORN / lap.wear == pytest.approx(10.0, abs=1.0)

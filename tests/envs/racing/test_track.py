@@ -53,15 +53,6 @@ def test_projection_finds_the_nearest_point(name):
     assert (arc.nx + direction.sin()).abs().max() < 2e-3
 
 
-def test_a_point_is_found_from_anywhere():
-    course = Course(load_track("lakeside"), dtype=torch.float64)
-    s = torch.linspace(10.0, 5700.0, 50, dtype=torch.float64)
-    x, y, _ = course.place(s, torch.full_like(s, 3.0))
-    found, arc, _ = course.find(x, y)
-    torch.testing.assert_close(found, s, atol=2e-2, rtol=0)
-    torch.testing.assert_close(arc.offset, torch.full_like(s, 3.0), atol=2e-3, rtol=0)
-
-
 def circle_file(path, lines):
     path.write_text("\n".join(lines) + "\n")
     return path
