@@ -29,6 +29,7 @@ BASE = {
     "ranges",
     "shipped",
     "signals",
+    "specs",
 }
 
 # Of each room, the rooms below it that it may import; what these may import it may, too.
