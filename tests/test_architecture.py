@@ -26,6 +26,7 @@ BASE = {
     "keys",
     "object_state",
     "offscreen",
+    "outputs",
     "ranges",
     "shipped",
     "signals",

@@ -14,11 +14,11 @@ from torchrl.envs import EnvBase
 
 from coachable.domain import Domain
 from coachable.evaluation.episode_records import record_episodes
-from coachable.evaluation.outputs import complete_folder
 from coachable.evaluation.style_grid import published
 from coachable.evaluation.wording import measures_by_parameter, readable, unit_of
 from coachable.export.web.pinned_files import provide
 from coachable.export.web.simulated_page import about, copy_page, finish_page
+from coachable.outputs import complete_folder
 from coachable.scene.frame import Frame, Stage
 from coachable.scene.palette import css
 from coachable.scene.recorded import encode_backdrop, encode_frames

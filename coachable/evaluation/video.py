@@ -17,9 +17,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from coachable.domain import Domain
-from coachable.evaluation.outputs import complete_file
 from coachable.evaluation.wording import measured_text, measures_by_parameter, readable, readable_number
 from coachable.extras import how_to_install
+from coachable.outputs import complete_file
 from coachable.scene.look import DARK
 from coachable.scene.renderer import SceneRenderer
 from coachable.styles import Choice, StyleRangeWarning, StyleSpace, Weight
