@@ -18,11 +18,11 @@ from tensordict import TensorDict
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "recipes"))
 
+from combat_bots import BOTS
 from recipe_config import compose_config
 from recipe_target import Target
 
 from coachable.domains.combat import combat_style_reward, combat_style_space
-from coachable.envs.combat.bots import BOTS
 from coachable.envs.combat.env import CombatEnv
 from coachable.envs.combat.tables import MACHINES
 from coachable.evaluation.style_grid import markdown_table

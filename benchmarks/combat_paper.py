@@ -17,16 +17,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import apex_fight
 import numpy as np
+import paper_figures
+import paper_tables
 import torch
+from fight_queue import fight_grid
+from reference_tables import reference_tables
+from request_odds import odds_rows
 
 from coachable.domain import Domain
-from coachable.domains.combat import apex_fight, paper_figures, paper_tables
 from coachable.domains.combat.coached_fight import SOURCES, STATES, draw_timeline
-from coachable.domains.combat.fight_queue import fight_grid
 from coachable.domains.combat.fights import PAIRS, PARTS, composed_styles, style_label
-from coachable.domains.combat.reference_tables import reference_tables
-from coachable.domains.combat.request_odds import odds_rows
 from coachable.domains.combat.styles import single_styles
 from coachable.envs.combat.tables import MACHINES, UNSEEN_MACHINES
 from coachable.evaluation.statistics import bootstrap_interval, wilson_interval

@@ -2,7 +2,6 @@
 
 import argparse
 import glob
-import math
 import runpy
 import sys
 import time
@@ -95,11 +94,11 @@ def _parser() -> argparse.ArgumentParser:
     text = "one request, NAME=VALUE,NAME=VALUE; repeat it to switch (default: a tour of the styles)"
     render.add_argument("--style", action="append", type=_style, dest="styles", metavar="NAME=VALUE,...", help=text)
     text = "per style (%(default)s)"
-    render.add_argument("--seconds", type=_seconds, default=4.0, dest="seconds_per_style", help=text)
+    render.add_argument("--seconds", type=float, default=4.0, dest="seconds_per_style", help=text)
     text = "of the picture of one style (default: 640x480)"
     render.add_argument("--size", type=_size, default=(640, 480), metavar="WIDTHxHEIGHT", help=text)
     text = "pictures per second (%(default)s)"
-    render.add_argument("--fps", type=_fps, default=20.0, help=text)
+    render.add_argument("--fps", type=float, default=20.0, help=text)
     render.add_argument("--together", action="store_true", help="show all styles at once, side by side")
     render.add_argument("--seed", type=_at_least(0), default=0)
 
@@ -199,7 +198,7 @@ def _train_seeds(file: Path, arguments: list[str], seeds: str) -> int:
     chosen = parse_seeds(seeds.partition("=")[2])
     print(f"Writing to {folder}; run_dir={folder} continues what Ctrl-C interrupts", flush=True)
     failed = train_seeds(file, arguments, chosen, folder)
-    print(seed_table(folder, chosen, failed))
+    print(seed_table(folder, chosen, failed), end="")
     return 1 if failed else 0
 
 
@@ -217,7 +216,7 @@ def _explain(options: argparse.Namespace) -> int:
 
 def _measure(measure: Callable[..., str], options: argparse.Namespace) -> int:
     """Write the results of a measurement into a folder that appears when they are complete, and print its text."""
-    from coachable.evaluation.outputs import complete_folder
+    from coachable.outputs import complete_folder
 
     with complete_folder(options.out) as options.out:
         text = measure(**_arguments(options))
@@ -328,23 +327,6 @@ def _at_least(lowest: int) -> Callable[[str], int]:
         return value
 
     return number
-
-
-def _number(accepted: Callable[[float], bool], expected: str) -> Callable[[str], float]:
-    def number(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not accepted(value):
-            raise argparse.ArgumentTypeError(f"{text!r}: expected a number of {expected}")
-        return value
-
-    return number
-
-
-_seconds = _number(lambda value: 0.0 < value <= 3600.0, "seconds above 0 and up to 3600")
-_fps = _number(lambda value: 1.0 <= value <= 60.0, "pictures per second from 1 to 60")
 
 
 def _format(text: str) -> str:

@@ -26,9 +26,11 @@ BASE = {
     "keys",
     "object_state",
     "offscreen",
+    "outputs",
     "ranges",
     "shipped",
     "signals",
+    "specs",
 }
 
 # Of each room, the rooms below it that it may import; what these may import it may, too.

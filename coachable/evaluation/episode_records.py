@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, TypedDict
 
@@ -62,6 +64,7 @@ def record_episodes(
     steps: int,
     seed: int,
     progress: str | None = None,
+    watch: Callable[[Tensor], None] = lambda alive: None,
 ) -> EpisodeRecord:
     """Run one episode in each env, with the policy's `default_interaction_type`.
 
@@ -73,23 +76,27 @@ def record_episodes(
         steps: Length of the episodes. Steps after the end of an episode are not counted as alive.
         seed: Seed of the initial states and of sampled actions.
         progress: Label of the progress bar, or None for no bar.
+        watch: Function that is called at the start and after each step, with the rows (N,) whose episodes ran until
+            then.
     """
     schedule: StyleSchedule = style if callable(style) else lambda _: style
-    rollout = Rollout(env, seed)
-    rollout.begin(schedule(0))
-    survived = torch.ones(env.batch_size, dtype=torch.bool)
-    task_return = torch.zeros(env.batch_size)
-    rows: list[dict[str, Tensor]] = []
-    styles, lives = [], []
-    run = rollout.episode(policy, steps, schedule)
-    for transition, alive in tqdm(run, progress, steps, disable=True if progress is None else None, leave=False):
-        after = transition.get("next")
-        rows.append(measures.step(transition))
-        styles.append(transition.get(STYLE))
-        lives.append(alive)
-        task_return += torch.where(alive, after.get(TASK_REWARD).squeeze(-1), 0.0)
-        survived &= ~(alive & after.get("terminated").squeeze(-1))
-    env.close()
+    with closing(env):
+        rollout = Rollout(env, seed)
+        rollout.begin(schedule(0))
+        survived = torch.ones(env.batch_size, dtype=torch.bool)
+        task_return = torch.zeros(env.batch_size)
+        rows: list[dict[str, Tensor]] = []
+        styles, lives = [], []
+        watch(survived)
+        run = rollout.episode(policy, steps, schedule)
+        for transition, alive in tqdm(run, progress, steps, disable=True if progress is None else None, leave=False):
+            after = transition.get("next")
+            rows.append(measures.step(transition))
+            styles.append(transition.get(STYLE))
+            lives.append(alive)
+            task_return += torch.where(alive, after.get(TASK_REWARD).squeeze(-1), 0.0)
+            survived &= ~(alive & after.get("terminated").squeeze(-1))
+            watch(alive)
     return EpisodeRecord(
         measures={name: torch.stack([row[name] for row in rows]) for name in rows[0]},
         style=torch.stack(styles),

@@ -21,11 +21,10 @@ from coachable.evaluation.style_grid import (
     mean_of,
     policy_sentence,
     published,
-    with_unit,
     write_results,
 )
 from coachable.evaluation.switching import SwitchReport, evaluate_switching
-from coachable.evaluation.wording import counted, units_of
+from coachable.evaluation.wording import counted, units_of, with_unit
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
 
@@ -182,7 +181,7 @@ def _report(
         text += "\n## Response to the request\n\n"
         numbers = ("slope", "rank_correlation", "mean_error")
         units = units_of(domain, agent.space, dict.fromkeys(agent.space.names, ""))
-        shown = [row | {"parameter": with_unit(row["parameter"], units)} for row in response]
+        shown = [row | {"parameter": with_unit(row["parameter"], units.get(row["parameter"], ""))} for row in response]
         formats = {name: ".3f" if name in numbers else "" for name in response[0]}
         text += markdown_table(shown, formats, units_of(domain, agent.space, formats))
         text += "\nThe mean error is in the unit of the parameter.\n"

@@ -17,7 +17,7 @@ from matplotlib import pyplot as plt
 from coachable.domain import Domain
 from coachable.evaluation.runs import describe
 from coachable.evaluation.style_grid import StyleGrid, mean_of, measured_column, published
-from coachable.evaluation.wording import readable
+from coachable.evaluation.wording import readable, with_unit
 from coachable.scene.look import LIGHT, LINES
 from coachable.scene.palette import css
 from coachable.styles import Choice, StyleSpace
@@ -106,12 +106,14 @@ def draw_style_grid(grid: StyleGrid, domain: Domain, space: StyleSpace, path: Pa
             if name == axis:
                 bounds = [space[name].low, space[name].high]
                 panel.plot(bounds, bounds, color="0.6", ls="--", lw=1, label="as requested")
-                panel.set_ylabel(f"measured {with_unit(name, space[name].unit)}")
+                panel.set_ylabel(f"measured {with_unit(readable(name), space[name].unit)}")
             else:
-                panel.set_ylabel(with_unit(name, domain.units.get(name, "")))
+                panel.set_ylabel(with_unit(readable(name), domain.units.get(name, "")))
                 if formats.get(column, "").endswith("%") and panel.get_ylim()[1] > RARE:
                     panel.set_ylim(-0.03, 1.05)
-            panel.set_xlabel(f"requested {with_unit(axis, space[axis].unit)}" if axis else "style, by row of the table")
+            panel.set_xlabel(
+                f"requested {with_unit(readable(axis), space[axis].unit)}" if axis else "style, by row of the table"
+            )
         if axes[0, 0].get_legend_handles_labels()[1]:
             axes[0, 0].legend(fontsize=8)
         axes[0, 0].figure.suptitle(title, fontsize=10)
@@ -138,13 +140,3 @@ def grid_lines(cells: Sequence[dict[str, Any]], space: StyleSpace) -> tuple[str 
         lines.setdefault(describe(others) if others else "", []).append(i)
     drawable = len(lines) <= len(MARKERS) and all(len(line) > 1 for line in lines.values())
     return (axis, lines) if drawable else (None, {})
-
-
-def with_unit(name: str, unit: str) -> str:
-    """Return a readable name with its unit in brackets.
-
-    Args:
-        name: Name, with underscores.
-        unit: Unit, or "".
-    """
-    return f"{readable(name)} [{unit}]" if unit else readable(name)

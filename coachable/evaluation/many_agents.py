@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import json
 import math
+import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from coachable.evaluation.evaluate import evaluate
 from coachable.evaluation.style_grid import markdown_table, write_csv
 from coachable.training.weights import load_policy
 
-__all__ = ["evaluate_agents", "side_by_side"]
+__all__ = ["evaluate_agents", "side_by_side", "table_of"]
 
 
 def evaluate_agents(sources: Sequence[str | Path], out: Path, **settings: Any) -> str:
@@ -48,14 +47,15 @@ def evaluate_agents(sources: Sequence[str | Path], out: Path, **settings: Any) -
         summaries[folder.name] = _numbers(summary.get("bounds", summary))
     rows = side_by_side(summaries)
     write_csv(rows, out / "agents.csv")
-    return markdown_table(rows, {name: "" if name == "quantity" else ".4g" for name in rows[0]})
+    return table_of(rows, ".4g")
 
 
 def side_by_side(summaries: Mapping[str, Mapping[str, float]]) -> list[dict[str, Any]]:
-    """Return a row per number that all agents have, with its mean and standard deviation over the agents.
+    """Return a row per number that all agents name, with its mean and standard deviation over the agents.
 
     Args:
-        summaries: Numbers by name, by agent; at least two agents.
+        summaries: Numbers by name, by agent. The mean and the deviation leave out NaN; a number that is NaN everywhere
+            has no row.
 
     Example:
         >>> side_by_side({"0": {"laps": 3.0, "off": 0.1}, "1": {"laps": 5.0}})
@@ -66,10 +66,21 @@ def side_by_side(summaries: Mapping[str, Mapping[str, float]]) -> list[dict[str,
     for name in first:
         if all(name in other for other in others):
             values = {agent: summary[name] for agent, summary in summaries.items()}
-            every = np.array(list(values.values()))
-            spread = {"mean": float(every.mean()), "std": float(every.std(ddof=1))}
-            rows.append({"quantity": name, **values, **spread})
+            known = [value for value in values.values() if not math.isnan(value)]
+            if known:
+                spread = statistics.stdev(known) if len(known) > 1 else math.nan
+                rows.append({"quantity": name, **values, "mean": statistics.fmean(known), "std": spread})
     return rows
+
+
+def table_of(rows: Sequence[Mapping[str, Any]], form: str) -> str:
+    """Return the rows of `side_by_side` as Markdown, or an empty text if there are none.
+
+    Args:
+        rows: The rows.
+        form: Format of the numbers.
+    """
+    return markdown_table(rows, {name: "" if name == "quantity" else form for name in rows[0]}) if rows else ""
 
 
 def _numbers(summary: Any, name: str = "") -> dict[str, float]:

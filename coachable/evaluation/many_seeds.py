@@ -1,9 +1,9 @@
 """Training of one recipe with several seeds, side by side in processes of their own, and a table of the results."""
 
 import ctypes
+import math
 import os
 import signal
-import statistics
 import subprocess
 import sys
 import time
@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from coachable.evaluation.curves import metrics_files, read_metric
+from coachable.evaluation.many_agents import side_by_side, table_of
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
 from coachable.training.hardware import detect
 
@@ -84,19 +85,8 @@ def seed_table(folder: Path, seeds: Sequence[int], failed: Mapping[int, str]) ->
         seeds: The seeds.
         failed: From `train_seeds`.
     """
-    columns = {name: [_last(folder / f"seed_{seed}", name) for seed in seeds] for name in _SHOWN}
-    columns = {name: values for name, values in columns.items() if any(value is not None for value in values)}
-    lines = [["seed", *columns, ""]]
-    for row, seed in enumerate(seeds):
-        lines.append([str(seed), *(_short(values[row]) for values in columns.values()), failed.get(seed, "")])
-    known = [[value for value in values if value is not None] for values in columns.values()]
-    lines.append(["mean", *(_short(statistics.mean(values)) for values in known), ""])
-    lines.append(["std", *(_short(statistics.stdev(values) if len(values) > 1 else None) for values in known), ""])
-    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
-    return "\n".join(
-        "  ".join(cell.rjust(width) for cell, width in zip(line[:-1], widths, strict=False)) + f"  {line[-1]}".rstrip()
-        for line in lines
-    )
+    last = {f"seed {seed}": {name: _last(folder / f"seed_{seed}", name) for name in _SHOWN} for seed in seeds}
+    return table_of(side_by_side(last), ".6g") + "".join(f"seed {seed}: {why}\n" for seed, why in failed.items())
 
 
 def _start(script: Path, arguments: Sequence[str], seed: int, folder: Path) -> "subprocess.Popen[bytes]":
@@ -132,19 +122,15 @@ def _has_ended(run: Path) -> bool:
     return is_last and state["loop"]["frames"] >= config["train"]["total_frames"]
 
 
-def _last(run: Path, name: str) -> float | None:
+def _last(run: Path, name: str) -> float:
     if not metrics_files(run):
-        return None
+        return math.nan
     try:
         return float(read_metric(run, "frames", name)[1][-1])
     except ValueError:  # there is no such column, or no row has it
-        return None
+        return math.nan
 
 
 def _last_line(log: Path) -> str:
     lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     return lines[-1] if lines else "ended without a word"
-
-
-def _short(value: float | None) -> str:
-    return "" if value is None else f"{value:.6g}"

@@ -8,24 +8,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
-from tqdm import tqdm
 
 from coachable.domain import Domain
-from coachable.evaluation.outputs import complete_folder
+from coachable.evaluation.episode_records import record_episodes
 from coachable.evaluation.style_grid import published
 from coachable.evaluation.wording import measures_by_parameter, readable, unit_of
 from coachable.export.web.pinned_files import provide
 from coachable.export.web.simulated_page import about, copy_page, finish_page
-from coachable.keys import TASK_REWARD
+from coachable.outputs import complete_folder
 from coachable.scene.frame import Frame, Stage
 from coachable.scene.palette import css
 from coachable.scene.recorded import encode_backdrop, encode_frames
 from coachable.styles import Choice, StyleSpace, Weight
-from coachable.training.rollout import Rollout
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
 __all__ = ["Recording", "export_recordings", "record"]
@@ -160,32 +157,18 @@ def record(
     options = {**domain.coached, **(alike(len(requests)) if alike else {})}
     env = domain.styled_env(space, len(requests), seed=seed, **options)
     cameras = [_Camera(env, row, make_stage(), request) for row, request in enumerate(requests)]
-    survived = torch.ones(len(requests), dtype=torch.bool)
-    task_return = torch.zeros(len(requests))
-    rows: list[dict[str, Tensor]] = []
-    lives: list[Tensor] = []
-    try:
-        rollout = Rollout(env, seed)
-        rollout.begin(theta)
-        for camera in cameras:
-            camera.see()
-        run = rollout.episode(policy, steps, lambda _: theta)
-        for transition, alive in tqdm(run, "recording", steps, disable=None if progress else True, leave=False):
-            after = transition.get("next")
-            rows.append(domain.measures.step(transition))
-            lives.append(alive)
-            task_return += torch.where(alive, after.get(TASK_REWARD).squeeze(-1), 0.0)
-            survived = survived & ~(alive & after.get("terminated").squeeze(-1))
-            for row in alive.nonzero()[:, 0].tolist():
-                cameras[row].see()
-    finally:
-        env.close()
-    taken = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
-    summary = domain.measures.summarise(taken, torch.stack(lives))
-    summary = {"survived": survived.float(), "task_return": task_return, **summary}
+
+    def see(alive: Tensor) -> None:
+        for row in alive.nonzero()[:, 0].tolist():
+            cameras[row].see()
+
+    label = "recording" if progress else None
+    taken = record_episodes(env, policy, theta, domain.measures, steps=steps, seed=seed, progress=label, watch=see)
+    summary = domain.measures.summarise(taken.measures, taken.alive)
+    summary = {"survived": taken.survived.float(), "task_return": taken.task_return, **summary}
     return [
         Recording(camera.frames, camera.backdrops, {name: float(v[row]) for name, v in summary.items()}, bool(~stays))
-        for row, (camera, stays) in enumerate(zip(cameras, survived, strict=True))
+        for row, (camera, stays) in enumerate(zip(cameras, taken.survived, strict=True))
     ]
 
 
@@ -220,7 +203,7 @@ def _manifest(agent: LoadedPolicy, domain: Domain, requests: list[dict[str, Any]
                 "text": domain.words.name(parameter.name),
                 "kind": "choice" if isinstance(parameter, Choice) else "number",
                 "weight": isinstance(parameter, Weight),
-                "unit": getattr(parameter, "unit", ""),
+                "unit": parameter.unit,
                 "help": parameter.help,
                 "values": values[parameter.name] if isinstance(parameter, Choice) else sorted(values[parameter.name]),
             }
@@ -246,7 +229,7 @@ def _measure(domain: Domain, space: StyleSpace, column: str, form: str) -> dict[
         "parameter": beside,
         "text": "mean over the recording" if name == beside else domain.words.name(name),
         "unit": unit,
-        "asked": bool(beside and unit) and unit == getattr(space[beside], "unit", ""),
+        "asked": bool(beside and unit) and unit == space[beside].unit,
         "share": form.endswith("%"),
         "digits": digits,
         "significant": form.endswith("g"),

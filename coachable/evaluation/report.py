@@ -15,7 +15,6 @@ from coachable import __version__
 from coachable.domain import Domain
 from coachable.evaluation.episode_records import RolloutOptions
 from coachable.evaluation.evaluation_settings import EvaluationSettings
-from coachable.evaluation.outputs import complete_folder
 from coachable.evaluation.report_figures import draw_metrics, draw_requests, draw_switches, draw_tradeoffs
 from coachable.evaluation.report_page import Page, paragraph, picture, shown, table
 from coachable.evaluation.runs import (
@@ -30,6 +29,7 @@ from coachable.evaluation.runs import (
 )
 from coachable.evaluation.style_grid import acting, training_counts, write_csv
 from coachable.evaluation.wording import counted, heading_of, readable
+from coachable.outputs import complete_folder
 from coachable.styles import Setpoint, StyleSpace
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy, widths_of
 

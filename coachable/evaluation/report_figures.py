@@ -12,10 +12,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import PercentFormatter
 
-from coachable.evaluation.figures import MARKERS, RARE, drawing, grid_lines, with_unit
+from coachable.evaluation.figures import MARKERS, RARE, drawing, grid_lines
 from coachable.evaluation.runs import Estimate, Run, StyleTable, estimate, sweep_estimate
 from coachable.evaluation.sweep import UNIT_REWARD
-from coachable.evaluation.wording import readable
+from coachable.evaluation.wording import readable, with_unit
 from coachable.styles import Choice, StyleSpace
 
 __all__ = ["draw_metrics", "draw_requests", "draw_switches", "draw_tradeoffs"]
@@ -52,7 +52,7 @@ def draw_metrics(
             for index, (label, cells) in enumerate(lines.items()):
                 estimates = [table.of(metric, [i]) for i in cells]
                 _line(panel, [table.cells[i][axis] for i in cells], estimates, index, label, len(lines))
-            panel.set_xlabel(f"requested {with_unit(axis, space[axis].unit)}")
+            panel.set_xlabel(f"requested {with_unit(readable(axis), space[axis].unit)}")
             panel.set_ylabel(titles.get(metric, readable(metric)))
             _as_share(panel, formats.get(table.column(metric), ""))
         _legend(panels[0], len(lines))
@@ -79,8 +79,8 @@ def draw_requests(table: StyleTable, space: StyleSpace, parameters: Sequence[str
                 shown = [(value, table.of(name, cells)) for value, cells in zip(values, members, strict=True) if cells]
                 label = readable(option) if choice else "measured"
                 _line(panel, [x for x, _ in shown], [y for _, y in shown], index, label, len(options))
-            panel.set_xlabel(f"requested {with_unit(name, space[name].unit)}")
-            panel.set_ylabel(f"measured {with_unit(name, space[name].unit)}")
+            panel.set_xlabel(f"requested {with_unit(readable(name), space[name].unit)}")
+            panel.set_ylabel(f"measured {with_unit(readable(name), space[name].unit)}")
         _legend(panels[0], len(options) + 1)
 
 

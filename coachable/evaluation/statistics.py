@@ -8,18 +8,19 @@ from typing import cast
 import numpy as np
 from scipy import stats
 
+_RESAMPLES = 2000  # bootstrap samples
 
-def interquartile_mean(values: np.ndarray, axis: int = -1) -> np.ndarray:
+
+def interquartile_mean(values: np.ndarray) -> np.ndarray:
     """Compute the mean of the middle half of the values (Agarwal et al. 2021, arXiv 2108.13264).
 
     Args:
-        values: Numbers; NaN are left out. A quarter of the others, rounded down, is cut at each end of `axis`.
-        axis: Axis to aggregate.
+        values: Numbers (..., n); NaN are left out. A quarter of the others, rounded down, is cut at each end.
 
     Returns:
-        The means, without `axis`; NaN where there are no values.
+        The means (...); NaN where there are no values.
     """
-    ordered = np.moveaxis(np.sort(values, axis=axis), axis, -1)  # NaN come last
+    ordered = np.sort(values)  # NaN come last
     count = (~np.isnan(ordered)).sum(-1, keepdims=True)
     cut = count // 4
     position = np.arange(ordered.shape[-1])
@@ -29,7 +30,7 @@ def interquartile_mean(values: np.ndarray, axis: int = -1) -> np.ndarray:
     return np.divide(total, kept, out=np.full(total.shape, np.nan), where=kept > 0)
 
 
-def stratified_interval(scores: np.ndarray, *, resamples: int = 2000, seed: int = 0) -> tuple[float, float]:
+def stratified_interval(scores: np.ndarray) -> tuple[float, float]:
     """Compute the 95 % percentile bootstrap interval of the interquartile mean of several runs on several tasks.
 
     Runs are drawn with replacement for each task separately, so every resample has every task (Agarwal et al. 2021,
@@ -37,8 +38,6 @@ def stratified_interval(scores: np.ndarray, *, resamples: int = 2000, seed: int 
 
     Args:
         scores: Scores (runs, tasks); NaN are left out.
-        resamples: Number of bootstrap samples.
-        seed: Seed of the resampling.
 
     Returns:
         Lower and upper bound; NaN if there are no values.
@@ -46,18 +45,14 @@ def stratified_interval(scores: np.ndarray, *, resamples: int = 2000, seed: int 
     if np.isnan(scores).all():
         return float("nan"), float("nan")
     runs, tasks = scores.shape
-    draws = np.random.default_rng(seed).integers(0, runs, (resamples, runs, tasks))
-    spread = interquartile_mean(scores[draws, np.arange(tasks)].reshape(resamples, -1))
+    draws = np.random.default_rng(0).integers(0, runs, (_RESAMPLES, runs, tasks))
+    spread = interquartile_mean(scores[draws, np.arange(tasks)].reshape(_RESAMPLES, -1))
     low, high = np.nanpercentile(spread, [2.5, 97.5])
     return float(low), float(high)
 
 
 def bootstrap_interval(
-    values: np.ndarray,
-    statistic: Callable[..., np.ndarray] = np.mean,
-    *,
-    resamples: int = 2000,
-    seed: int = 0,
+    values: np.ndarray, statistic: Callable[..., np.ndarray] = np.mean, *, resamples: int = _RESAMPLES
 ) -> tuple[float, float]:
     """Compute the 95 % percentile bootstrap interval of a statistic of independent values.
 
@@ -65,7 +60,6 @@ def bootstrap_interval(
         values: Numbers (n,); NaN are left out.
         statistic: Function that is called as `statistic(samples, axis=-1)`.
         resamples: Number of bootstrap samples.
-        seed: Seed of the resampling.
 
     Returns:
         Lower and upper bound; NaN if there are no values.
@@ -75,7 +69,7 @@ def bootstrap_interval(
         only = float(statistic(values, axis=-1)) if len(values) else float("nan")
         return only, only
     options = {"n_resamples": resamples, "confidence_level": 0.95, "method": "percentile", "vectorized": True}
-    low, high = stats.bootstrap((values,), statistic, rng=np.random.default_rng(seed), **options).confidence_interval
+    low, high = stats.bootstrap((values,), statistic, rng=np.random.default_rng(0), **options).confidence_interval
     return float(low), float(high)
 
 
@@ -96,7 +90,7 @@ def comparison_interval(
     if not all(map(len, kept)):
         return float("nan"), float("nan")
     generator = np.random.default_rng(0)
-    means = (numbers[generator.integers(0, len(numbers), (2000, len(numbers)))].mean(1) for numbers in kept)
+    means = (numbers[generator.integers(0, len(numbers), (_RESAMPLES, len(numbers)))].mean(1) for numbers in kept)
     low, high = np.percentile(compare(*means), [2.5, 97.5])
     return float(low), float(high)
 

@@ -15,6 +15,7 @@ from tensordict.nn import InteractionType, TensorDictModuleBase
 from coachable.domain import Domain
 from coachable.evaluation.episode_records import RolloutOptions, record_styles
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
+from coachable.evaluation.wording import with_unit
 from coachable.styles import Setpoint, StyleSpace
 from coachable.training.weights import LoadedPolicy
 
@@ -185,20 +186,10 @@ def markdown_table(
         | t_pose | 1.23 |
         <BLANKLINE>
     """
-    headings = [with_unit(name, units or {}) for name in columns]
+    headings = [with_unit(name, (units or {}).get(name, "")) for name in columns]
     lines = ["| " + " | ".join(headings) + " |", "|" + "--|" * len(columns)]
     lines += ["| " + " | ".join(format(row[c], spec) for c, spec in columns.items()) + " |" for row in rows]
     return "\n".join(lines) + "\n"
-
-
-def with_unit(name: str, units: Mapping[str, str]) -> str:
-    """Return a name with its unit, such as "speed [m/s]", or without if it has none.
-
-    Args:
-        name: The name.
-        units: Units by name.
-    """
-    return f"{name} [{units[name]}]" if units.get(name) else name
 
 
 def training_counts(agent: LoadedPolicy) -> str:

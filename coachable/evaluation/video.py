@@ -17,9 +17,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from coachable.domain import Domain
-from coachable.evaluation.outputs import complete_file
 from coachable.evaluation.wording import measured_text, measures_by_parameter, readable, readable_number
 from coachable.extras import how_to_install
+from coachable.outputs import complete_file
 from coachable.scene.look import DARK
 from coachable.scene.renderer import SceneRenderer
 from coachable.styles import Choice, StyleRangeWarning, StyleSpace, Weight
@@ -234,7 +234,7 @@ def asked_line(space: StyleSpace, request: Mapping[str, Any], theta: Tensor) -> 
         clamped = abs(wanted - value) > 1e-6 * max(abs(wanted), abs(value))
         if value or clamped or not isinstance(space[name], Weight):
             note = f" (clamped from {readable_number(wanted)})" if clamped else ""
-            parts.append(f"{name} {readable_number(value, getattr(space[name], 'unit', ''))}{note}")
+            parts.append(f"{name} {readable_number(value, space[name].unit)}{note}")
     return readable(f"requested: {', '.join(parts) or 'every weight 0'}")
 
 

@@ -23,6 +23,11 @@ def readable_number(value: float, unit: str = "") -> str:
     return f"{number} {unit}".rstrip()
 
 
+def with_unit(name: str, unit: str) -> str:
+    """Return a name with its unit, such as "speed [m/s]", or without if the unit is empty."""
+    return f"{name} [{unit}]" if unit else name
+
+
 def counted(count: int, noun: str) -> str:
     """Return a number of things, such as "1 episode" or "20 episodes".
 
@@ -68,7 +73,7 @@ def unit_of(domain: Domain, space: StyleSpace, name: str) -> str:
         name: Name of the measure.
     """
     parameter = name.removesuffix("_error")
-    return domain.units.get(name) or (getattr(space[parameter], "unit", "") if parameter in space else "")
+    return domain.units.get(name) or (space[parameter].unit if parameter in space else "")
 
 
 def units_of(domain: Domain, space: StyleSpace, columns: Mapping[str, str]) -> dict[str, str]:
@@ -95,8 +100,7 @@ def heading_of(domain: Domain, space: StyleSpace, column: str, form: str = "") -
     """
     name = column.removeprefix("measured_")
     text = f"measured {domain.words.name(name)}" if name != column else domain.words.name(name)
-    unit = units_of(domain, space, {column: form}).get(column)
-    return f"{text} [{unit}]" if unit else text
+    return with_unit(text, units_of(domain, space, {column: form}).get(column, ""))
 
 
 def measured_text(domain: Domain, space: StyleSpace, name: str, value: float) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -21,6 +20,7 @@ from coachable.export.graph import import_onnx, quietly
 from coachable.export.recorder import Rig, record
 from coachable.files import CheckpointError, space_named
 from coachable.networks.plain import DeterministicAction
+from coachable.outputs import complete_file
 from coachable.signals import Signal
 from coachable.styles import StyleSpace
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy, widths_of
@@ -86,21 +86,16 @@ def write_onnx(agent: LoadedPolicy, domain: Domain | None, out: Path) -> float:
             contract = replace(contract, recorded=record(rig, contract, policy))
     onnx.helper.set_model_props(model, {"coachable_version": __version__} | contract.to_metadata())
     onnx.checker.check_model(model)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    partial = out.with_name(out.name + ".partial")
     content = model.SerializeToString()
-    try:
+    with complete_file(out) as unfinished:
         with space_named(out, len(content)):
-            partial.write_bytes(content)
-        difference = largest_difference(partial, plain, agent.space)
+            unfinished.write_bytes(content)
+        difference = largest_difference(unfinished, plain, agent.space)
         if not difference <= TOLERANCE:
             source = agent.metadata["source"]
             raise CheckpointError(
                 f"the exported policy of {source} differs from torch by {difference:.2g}: expected at most {TOLERANCE}"
             )
-        os.replace(partial, out)
-    finally:
-        partial.unlink(missing_ok=True)
     return difference
 
 

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from coachable.distributions.action_heads import ActionHeads
@@ -19,6 +18,7 @@ from coachable.gym.actions import action_components, native_action
 from coachable.gym.checked_features import Features, checked_features, flat_observation
 from coachable.keys import STYLE_FEATURES, TASK_REWARD
 from coachable.object_state import load_object, save_object
+from coachable.specs import set_specs
 
 __all__ = ["GymnasiumEnv"]
 
@@ -66,18 +66,10 @@ class GymnasiumEnv(EnvBase):
         trial = first.action_space.sample()
         observation, _, _, _, info = first.step(trial)
         self._num_features = len(checked_features(features(observation, trial, info)))
-        self._make_specs()
+        width = self._observation.shape[1]
+        action = self.heads.spec(self.batch_size)
+        set_specs(self, action=action, observation=width, style_features=self._num_features)
         self._set_seed(seed)
-
-    def _make_specs(self) -> None:
-        shape, column = self.batch_size, torch.Size((*self.batch_size, 1))
-        widths = {"observation": self._observation.shape[1], TASK_REWARD: 1, STYLE_FEATURES: self._num_features}
-        floats = {name: Unbounded(torch.Size((*shape, width)), dtype=torch.float32) for name, width in widths.items()}
-        flags = {name: Binary(1, column, dtype=torch.bool) for name in ("done", "terminated", "truncated")}
-        self.action_spec = self.heads.spec(shape)
-        self.observation_spec = Composite(floats, shape=shape)
-        self.reward_spec = Unbounded(column, dtype=torch.float32)
-        self.done_spec = Composite(flags, shape=shape)
 
     def _set_seed(self, seed: int | None) -> None:
         """Derive the seeds that the environments get at their next reset."""

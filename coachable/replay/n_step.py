@@ -50,10 +50,6 @@ class NStep:
         self._data: TensorDictBase | None = None
         self._steps: Steps | None = None
 
-    def __len__(self) -> int:
-        """Return the number of steps held back."""
-        return 0 if self._steps is None else len(self._steps)
-
     def push(self, data: TensorDictBase, steps: Steps) -> tuple[TensorDictBase, Steps]:
         """Add steps and return the transitions that they complete, in the order of completion.
 

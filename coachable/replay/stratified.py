@@ -16,6 +16,8 @@ from coachable.replay.sum_tree import SumTree
 
 __all__ = ["StratifiedSampler", "allot"]
 
+_EPSILON = 1e-8  # added to priorities, so that none is 0
+
 
 def allot(batch_size: int, proportions: np.ndarray, available: np.ndarray) -> np.ndarray:
     """Divide a batch among the available tables by largest remainders of the renormalised proportions.
@@ -91,7 +93,6 @@ class StratifiedSampler(Sampler):
         prioritized: Whether to draw within a table in proportion to priorities instead of uniformly.
         alpha: Exponent of the priorities.
         beta: Exponent of the importance weights; may be changed while training.
-        eps: Number added to priorities, so that none is 0.
     """
 
     regions: Regions
@@ -99,21 +100,12 @@ class StratifiedSampler(Sampler):
     prioritized: bool = False
     alpha: float = 0.6
     beta: float = 0.4
-    eps: float = 1e-8
 
     def __post_init__(self) -> None:
         self._plans: dict[tuple[int, torch.device], tuple[int, _Plan]] = {}
         self._tree: SumTree | None = None
         self._largest: Tensor | None = None
         self._pending_leaves: Tensor | None = None
-
-    def counts(self, batch_size: int) -> dict[str, int]:
-        """Return the present number of records of each table in a batch.
-
-        Raises:
-            ValueError: If no table has records, or more tables have some than a batch holds.
-        """
-        return dict(zip(self.regions.names, self._allot(batch_size).tolist(), strict=True))
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
         """Draw slots, grouped by table.
@@ -161,12 +153,8 @@ class StratifiedSampler(Sampler):
             tree = self._tree_on(index.device)
             tree.update(index, self._largest_priority(index.device).expand(len(index)))
 
-    def add(self, index: int | Tensor) -> None:
-        """Give a new record, with the slot `index` `()`, the largest priority so far."""
-        self.extend(torch.as_tensor(index).reshape(-1))
-
     def update_priority(self, index: Any, priority: Any, *, storage: Storage | None = None) -> None:
-        """Set priorities to `(|priority| + eps)^alpha`; if a slot is given more than once, the largest counts.
+        """Set priorities to `(|priority| + 1e-8)^alpha`; if a slot is given more than once, the largest counts.
 
         Args:
             index: Slots of any shape.
@@ -179,7 +167,7 @@ class StratifiedSampler(Sampler):
         if not self.prioritized:
             raise RuntimeError("this buffer draws uniformly within its tables: priorities need prioritized=True")
         index = torch.as_tensor(index)
-        priority = torch.as_tensor(priority, device=index.device).detach().abs().double().add(self.eps)
+        priority = torch.as_tensor(priority, device=index.device).detach().abs().double().add(_EPSILON)
         priority = priority.expand(index.shape) if not priority.ndim else priority.reshape(*index.shape, -1).amax(-1)
         priority = priority.pow(self.alpha)
         tree = self._tree_on(index.device)

@@ -117,11 +117,6 @@ class SumTree:
                 row = self._first_row[level - 1][region] + entry
         return self._offsets[region] + entry
 
-    def clear(self) -> None:
-        """Set every priority to 0."""
-        for level in self.levels:
-            level.zero_()
-
     def leaves(self) -> Tensor:
         """Return all priorities by slot, float64 `(slots,)`."""
         return self.get(torch.arange(int(self.capacities.sum()), device=self.device))

@@ -53,10 +53,6 @@ class WindowHistory:
         self.key[rows[rows >= 0]] = -1
         self._sorted = None
 
-    def __len__(self) -> int:
-        """Return the number of open episodes."""
-        return int((self.key >= 0).sum())
-
     def update(self, steps: Steps, slot: np.ndarray, serial: np.ndarray) -> Copies:
         """Add a batch.
 

@@ -13,16 +13,16 @@ from coachable.scene.parts import SHAPES, Batch, Parts
 _JUMP = 20.0  # [m], farther apart, the agent was put somewhere else
 
 
-def continues(before: Frame, after: Frame) -> bool:
-    """Return whether one frame shows the primitives of another one, moved.
-
-    Args:
-        before: Earlier frame.
-        after: Later frame.
-    """
-    near = float(np.linalg.norm(np.subtract(after.focus, before.focus))) < _JUMP
+def alike(before: Frame, after: Frame) -> bool:
+    """Return whether two frames show the same primitives in one episode and place."""
     same = all(len(before.parts.of(shape)) == len(after.parts.of(shape)) for shape in SHAPES)
-    return near and same and (before.episode, before.place) == (after.episode, after.place)
+    return same and (before.episode, before.place) == (after.episode, after.place)
+
+
+def continues(before: Frame, after: Frame) -> bool:
+    """Return whether a frame shows the primitives of the one before, moved."""
+    near = float(np.linalg.norm(np.subtract(after.focus, before.focus))) < _JUMP
+    return near and alike(before, after)
 
 
 def between(before: Frame, after: Frame, share: float) -> Frame:

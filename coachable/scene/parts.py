@@ -217,34 +217,16 @@ def towards(direction: np.ndarray) -> np.ndarray:
 
 
 def rotated(wxyz: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return points (N, 3) rotated by a quaternion (4,).
-
-    Args:
-        wxyz: Unit quaternion (4,).
-        points: (N, 3).
-
-    Returns:
-        (N, 3).
-    """
-    w, axis = wxyz[0], wxyz[1:]
-    twice = 2.0 * np.cross(axis, points)
-    return points + w * twice + np.cross(axis, twice)
+    """Return points (..., 3) rotated by unit quaternions (..., 4)."""
+    twice = 2.0 * np.cross(wxyz[..., 1:], points)
+    return points + wxyz[..., :1] * twice + np.cross(wxyz[..., 1:], twice)
 
 
-def multiplied(one: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the rotations that apply `others` (N, 4) first and then `one` (4,).
-
-    Args:
-        one: Unit quaternion (4,).
-        others: Unit quaternions (N, 4).
-
-    Returns:
-        Unit quaternions (N, 4).
-    """
-    w, axis = one[0], one[1:]
-    real = w * others[:, :1] - others[:, 1:] @ axis[:, None]
-    rest = w * others[:, 1:] + others[:, :1] * axis + np.cross(axis, others[:, 1:])
-    return np.concatenate([real, rest], axis=1)
+def multiplied(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the rotations that apply `other` first and then `one`, unit quaternions (..., 4) each."""
+    scalar = one[..., :1] * other[..., :1] - (one[..., 1:] * other[..., 1:]).sum(-1, keepdims=True)
+    vector = one[..., :1] * other[..., 1:] + other[..., :1] * one[..., 1:] + np.cross(one[..., 1:], other[..., 1:])
+    return np.concatenate([scalar, vector], axis=-1)
 
 
 def unit_mesh(shape: str) -> tuple[np.ndarray, np.ndarray]:

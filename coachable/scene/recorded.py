@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from coachable.scene.between import alike
 from coachable.scene.frame import Backdrop, Frame
 from coachable.scene.palette import css
-from coachable.scene.parts import SHAPES, Batch, Parts
+from coachable.scene.parts import SHAPES, Batch, Parts, multiplied, rotated
 
 __all__ = ["encode_backdrop", "encode_figures", "encode_frames"]
 
@@ -39,7 +40,7 @@ def encode_frames(frames: Sequence[Frame], places: Mapping[Hashable, int]) -> by
         "focus": np.array([frame.focus for frame in frames], np.float32),
         "heading": np.array([frame.heading for frame in frames], np.float32),
     }
-    cuts = [0, *(i + 1 for i, pair in enumerate(pairwise(frames)) if not _alike(*pair)), len(frames)]
+    cuts = [0, *(i + 1 for i, pair in enumerate(pairwise(frames)) if not alike(*pair)), len(frames)]
     segments = []
     for number, (first, end) in enumerate(pairwise(cuts)):
         counts = {shape: len(frames[first].parts.of(shape)) for shape in SHAPES}
@@ -104,11 +105,6 @@ def encode_figures(figures: Sequence[Parts]) -> bytes:
     return _packed({"figures": len(figures), "counts": counts}, arrays)
 
 
-def _alike(one: Frame, other: Frame) -> bool:
-    same = all(len(one.parts.of(shape)) == len(other.parts.of(shape)) for shape in SHAPES)
-    return same and (one.episode, one.place) == (other.episode, other.place)
-
-
 def _segment(frames: Sequence[Frame]) -> dict[str, np.ndarray]:
     """Return the moving primitives of frames that have equally many: rigid figures, and changes of size and colour."""
     batches = [_joined(frame.parts) for frame in frames]
@@ -151,8 +147,8 @@ def _figures(positions: np.ndarray, turns: np.ndarray) -> tuple[np.ndarray, np.n
         mover = int(free[0])
         movers.append(mover)
         back = turns[:, mover] * (1.0, -1.0, -1.0, -1.0)
-        relative = _rotated(back[:, None], positions[:, free] - positions[:, mover, None])
-        turned = _same_sign(_multiplied(back[:, None], turns[:, free]))
+        relative = rotated(back[:, None], positions[:, free] - positions[:, mover, None])
+        turned = _same_sign(multiplied(back[:, None], turns[:, free]))
         joins = _constant(relative) & _constant(turned)
         joins[0] = True
         members = free[joins]
@@ -205,19 +201,6 @@ def _constant(values: np.ndarray) -> np.ndarray:
 def _same_sign(turns: np.ndarray) -> np.ndarray:
     """Return quaternions (F, K, 4), each with the sign that is nearer to the first row's."""
     return np.where((turns * turns[:1]).sum(-1, keepdims=True) < 0, -turns, turns)
-
-
-def _multiplied(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return products of quaternions (..., 4)."""
-    scalar = one[..., :1] * other[..., :1] - (one[..., 1:] * other[..., 1:]).sum(-1, keepdims=True)
-    vector = one[..., :1] * other[..., 1:] + other[..., :1] * one[..., 1:] + np.cross(one[..., 1:], other[..., 1:])
-    return np.concatenate([scalar, vector], axis=-1)
-
-
-def _rotated(turns: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return points (..., 3) rotated by quaternions (..., 4)."""
-    twice = 2.0 * np.cross(turns[..., 1:], points)
-    return points + turns[..., :1] * twice + np.cross(turns[..., 1:], twice)
 
 
 def _short(turns: np.ndarray) -> np.ndarray:

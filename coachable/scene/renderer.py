@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from coachable.offscreen import OffscreenMujoco
 from coachable.scene.between import between, continues
 from coachable.scene.frame import Backdrop, Frame, Gauge, Map, Stage
-from coachable.scene.palette import AIR, HAZE, INK, WHITE, mixed
+from coachable.scene.palette import AIR, HAZE, INK, WHITE, Colour, mixed
 from coachable.scene.parts import BALL, BOX, CYLINDER, SECTOR, SHAPES, rotated, unit_mesh
 
 _GEOMS = {
@@ -303,8 +303,8 @@ def _fan(scene: mujoco.MjvScene, at: np.ndarray, wxyz: np.ndarray, size: np.ndar
 _STILL = {"contype": 0, "conaffinity": 0}
 
 
-def _rgba(colour, opacity: float = 1.0) -> np.ndarray:
-    return np.array([*np.divide(colour, 255.0), opacity])
+def _rgba(colour: Colour) -> np.ndarray:
+    return np.array([*np.divide(colour, 255.0), 1.0])
 
 
 def _half(shape: str, size: np.ndarray) -> np.ndarray:

@@ -38,6 +38,7 @@ class _Numeric:
     high: float
     evaluation: tuple[float, float] | None
     width: ClassVar[int] = 1
+    options: ClassVar[tuple[str, ...]] = ()
 
     def _check(self, kind: str) -> None:
         _check_name(kind, self.name)

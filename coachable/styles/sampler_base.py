@@ -74,12 +74,6 @@ class Sampler:
         drawn = self._draw(tuple(shape), generator, source)
         return drawn if source == target else drawn.to(target)
 
-    def sample_independent(
-        self, shape: Sequence[int] = (), generator: Generator | None = None, device: torch.device | str | None = None
-    ) -> Tensor:
-        """Draw styles that are all independent, unlike the rows of a batch of `Shared`; see `sample`."""
-        return self.sample((*shape, 1), generator, device).squeeze(-2)
-
     def _draw(self, shape: tuple[int, ...], generator: Generator | None, device: torch.device) -> Tensor:
         raise NotImplementedError(f"{type(self).__name__} must define _draw")
 

@@ -269,8 +269,8 @@ class OneHot(PointMass):
 class Shared(Sampler):
     """Distribution in which several rows of a batch, such as the cars of a race, share a style.
 
-    In a batch `(copies * n,)` rows i, i + n, i + 2 n and so on share a style. `sample_independent` draws styles that
-    are not shared, as relabelling needs.
+    In a batch `(copies * n,)` rows i, i + n, i + 2 n and so on share a style. A last axis of 1 in the shape, as
+    `(n, 1)`, gives styles that are not shared, as relabelling needs.
 
     Args:
         sampler: Distribution of the shared style.

@@ -308,7 +308,7 @@ class StyleSpace:
     def encodes_like(self, other: "StyleSpace") -> bool:
         """Return whether the entries of both spaces and their encoding are equal, so that networks can be reused."""
         ours, theirs = (
-            [(p.name, p.kind, getattr(p, "options", None), p.encoding, p.low, p.high) for p in space.parameters]
+            [(p.name, p.kind, p.options, p.encoding, p.low, p.high) for p in space.parameters]
             for space in (self, other)
         )
         return ours == theirs

@@ -3,7 +3,7 @@
 import multiprocessing
 import signal
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -14,6 +14,7 @@ from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 
+from coachable.keys import TASK_REWARD
 from coachable.training.async_collector import AsyncCollector
 from coachable.training.rng import preserved_rng
 from coachable.training.rollout import Rollout
@@ -190,7 +191,6 @@ def evaluate_policy(
     policy: Callable[[TensorDictBase], TensorDictBase],
     *,
     max_steps: int,
-    keys: Iterable[str] = (),
     measures: Any = None,
     device: torch.device | str = "cpu",
 ) -> dict[str, float]:
@@ -200,21 +200,19 @@ def evaluate_policy(
         env: Batched environment `[N]`. It is reset first, with styles drawn by its sampler.
         policy: Writes `action`.
         max_steps: Number of steps after which an episode is cut.
-        keys: Entries of `next`, (N, 1) each, whose averages per step are returned as well.
         measures: Measured style, see `coachable.domain.StyleMeasures`.
         device: Device of the policy.
 
     Returns:
-        `return`, `task_return`, `length`, `survived` (share of episodes that did not terminate), one `NAME_per_step`
-        for each key, and the measures by their names, all averaged over the episodes that have a value.
+        `return`, `task_return`, `length`, `survived` (share of episodes that did not terminate), and the measures by
+        their names, all averaged over the episodes that have a value.
     """
-    wanted = dict.fromkeys(["reward", "task_reward", *keys])
     with preserved_rng(), torch.no_grad():
         rollout = Rollout(env)
         rollout.begin()
         fell = torch.zeros(env.batch_size, dtype=torch.bool, device=env.device)
         length = torch.zeros_like(fell, dtype=torch.float32)
-        sums = {key: torch.zeros_like(length) for key in wanted}
+        sums = {key: torch.zeros_like(length) for key in ("reward", TASK_REWARD)}
         measured, alive = [], []
         for stepped, running in rollout.episode(lambda td: policy(td.to(device)).to(env.device), max_steps):
             rollout.begin_ended()
@@ -230,12 +228,10 @@ def evaluate_policy(
             fell |= running & after["terminated"].reshape(running.shape)
     result = {
         "return": sums["reward"].mean().item(),
-        "task_return": sums["task_reward"].mean().item(),
+        "task_return": sums[TASK_REWARD].mean().item(),
         "length": length.mean().item(),
         "survived": 1.0 - fell.float().mean().item(),
     }
-    for key in keys:
-        result[f"{key}_per_step"] = (sums[key] / length).mean().item()
     if measures is not None:
         record = {name: torch.stack([row[name] for row in measured]) for name in measured[0]}
         summary = measures.summarise(record, torch.stack(alive))

@@ -12,63 +12,72 @@ from typing import Any, TextIO
 
 from tqdm import tqdm
 
-__all__ = ["CsvLog", "MetricsLog", "Progress", "wandb_logger"]
+__all__ = ["MetricsLog", "Progress", "wandb_logger"]
 
 
 _MOVE = "Move it away to go on with a new one"
 
 
-class CsvLog:
-    """CSV file of metrics to which rows and columns can be added.
+class MetricsLog:
+    """Log that writes rows of metrics to a CSV file, to which columns can be added, and to an optional TorchRL logger.
 
-    An incomplete last line, which a process leaves behind if it is killed while writing, is dropped.
+    Rows are appended to an existing file. An incomplete last line, which a process leaves behind if it is killed while
+    writing, is dropped.
 
     Args:
-        path: The file; if it exists, rows are appended.
+        run_dir: Folder of `metrics.csv`, created if missing.
+        logger: TorchRL logger with `log_metrics`, or None.
 
     Example:
         >>> import tempfile
-        >>> log = CsvLog(Path(tempfile.mkdtemp()) / "metrics.csv")
+        >>> log = MetricsLog(Path(tempfile.mkdtemp()))
         >>> log.write({"frames": 1, "loss": 0.5})
         >>> log.write({"frames": 2, "reward": 1.0})
         >>> log.path.read_text().splitlines()
         ['frames,loss,reward', '1,0.5,', '2,,1.0']
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = Path(path)
+    def __init__(self, run_dir: Path | str, logger: Any | None = None) -> None:
+        Path(run_dir).mkdir(parents=True, exist_ok=True)
+        self.path = Path(run_dir) / "metrics.csv"
+        self.logger = logger
         self.columns: list[str] = []
         rows = self._read()
         if self.path.exists() and self.path.read_bytes()[-1:] not in (b"", b"\n"):
             self._rewrite(rows)
 
-    def rewind(self, limit: float, key: str = "frames") -> None:
-        """Drop the rows beyond a limit, which a resumed training writes again.
-
-        Args:
-            limit: Largest value to keep.
-            key: Column that is compared.
+    def rewind(self, frames: int) -> None:
+        """Drop the rows after `frames` env-steps, which a resumed training writes again.
 
         Raises:
             ValueError: If the column has an entry that is not a number, or the file is not a table.
         """
         rows = self._read()
         try:
-            kept = [row for row in rows if float(row.get(key) or 0) <= limit]
+            kept = [row for row in rows if float(row.get("frames") or 0) <= frames]
         except ValueError as error:
-            raise ValueError(f"{self.path} is damaged: {error} in {key!r}. {_MOVE}") from error
+            raise ValueError(f"{self.path} is damaged: {error} in 'frames'. {_MOVE}") from error
         if len(kept) < len(rows):
             self._rewrite(kept)
 
-    def write(self, row: Mapping[str, Any]) -> None:
-        """Append one row; new names become new columns."""
+    def write(self, row: Mapping[str, float]) -> None:
+        """Append one row.
+
+        Args:
+            row: Numbers by name, with the number of env-steps so far as "frames"; new names become new columns.
+        """
         new = [name for name in row if name not in self.columns]
         if new:
             rows = self._read()
             self.columns += new
             self._rewrite(rows)
         with self.path.open("a", newline="", encoding="utf-8") as file:
-            csv.DictWriter(file, self.columns, restval="", lineterminator="\n").writerow(row)
+            csv.DictWriter(file, self.columns, restval="", lineterminator="\n").writerow(
+                {k: _short(v) for k, v in row.items()}
+            )
+        if self.logger is not None:
+            finite = {k: float(v) for k, v in row.items() if math.isfinite(v)}
+            self.logger.log_metrics(finite, step=int(row["frames"]))
 
     def _read(self) -> list[dict[str, Any]]:
         if not self.path.exists():
@@ -111,36 +120,6 @@ def wandb_logger(name: str, run_dir: Path, *, project: str = "coachable", mode: 
     from torchrl.record.loggers.wandb import WandbLogger
 
     return WandbLogger(exp_name=name, offline=mode == "offline" or not has_key, save_dir=str(run_dir), project=project)
-
-
-class MetricsLog:
-    """Log that writes every row of metrics to a CSV file and to an optional TorchRL logger.
-
-    Args:
-        run_dir: Folder of `metrics.csv`, created if missing.
-        logger: TorchRL logger with `log_metrics`, or None.
-    """
-
-    def __init__(self, run_dir: Path, logger: Any | None = None) -> None:
-        Path(run_dir).mkdir(parents=True, exist_ok=True)
-        self.csv = CsvLog(Path(run_dir) / "metrics.csv")
-        self.logger = logger
-
-    def rewind(self, frames: int) -> None:
-        """Drop the rows after `frames` env-steps, before a training is resumed there."""
-        self.csv.rewind(frames)
-
-    def write(self, row: Mapping[str, float], step: int) -> None:
-        """Log one row.
-
-        Args:
-            row: Numbers by name.
-            step: Number of env-steps so far.
-        """
-        self.csv.write({k: _short(v) for k, v in row.items()})
-        if self.logger is not None:
-            finite = {k: float(v) for k, v in row.items() if math.isfinite(v)}
-            self.logger.log_metrics(finite, step=step)
 
 
 class Progress:

@@ -256,7 +256,7 @@ class Trainer:
 
     def _write(self, row: Mapping[str, float]) -> None:
         try:
-            self.log.write(row, step=self.frames)
+            self.log.write(row)
         except OSError as error:  # a full disk must not end a training
             warnings.warn(f"metrics at {self.frames} frames were not written: {error}", stacklevel=2)
 

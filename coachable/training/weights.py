@@ -1,6 +1,5 @@
 """Agents in files: their description, loading their policy, exporting and reusing their weights."""
 
-import os
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import wraps
@@ -19,6 +18,7 @@ from coachable.networks import make_gaussian_actor, make_mixed_actor
 from coachable.networks.mixed import MixedPolicy
 from coachable.networks.plain import policy_network
 from coachable.networks.residual import with_new_inputs
+from coachable.outputs import complete_file
 from coachable.shipped import located, shipped_agents
 from coachable.styles import Choice, StyleSpace
 from coachable.training.checkpoint import SCHEMA_VERSION, CheckpointError, check_fits, find_checkpoint, read_state
@@ -208,14 +208,8 @@ def export_weights(checkpoint: Path | str, out: Path | str) -> Path:
     check_finite({"actor": agent["actor"], "critics": agent["critics"]}, source)
     agent["config"] = {**agent["config"], **dict.fromkeys(_PATHS)}
     out = Path(out)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    partial = out.with_name(out.name + ".partial")
-    try:
-        with space_named(out, tensor_bytes(agent)):
-            save_state({"schema": SCHEMA_VERSION, **agent, "counters": counters}, partial)
-            os.replace(partial, out)
-    finally:
-        partial.unlink(missing_ok=True)
+    with complete_file(out) as unfinished, space_named(out, tensor_bytes(agent)):
+        save_state({"schema": SCHEMA_VERSION, **agent, "counters": counters}, unfinished)
     return out
 
 

@@ -1,6 +1,6 @@
 """TorchRL transforms: styles and style rewards for environments, relabelling and mirror images for replay."""
 
-from coachable.transforms.mirror import MirrorMap, MirrorSymmetry
+from coachable.transforms.mirror import MirrorMap, MirrorSymmetry, mirror_map
 from coachable.transforms.style_features import StyleFeatures
 from coachable.transforms.style_reward import StyleRewardTransform
 from coachable.transforms.style_sampler import CoachableEnv, StyleSampler, coachable_env
@@ -15,4 +15,5 @@ __all__ = [
     "StyleSampler",
     "TaskImpersonation",
     "coachable_env",
+    "mirror_map",
 ]

@@ -1,7 +1,9 @@
-"""`MirrorSymmetry`, which replaces sampled transitions by their mirror images."""
+"""`MirrorSymmetry`, which replaces sampled transitions by their mirror images, and the maps that it needs."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from typing import Any
 
 import torch
@@ -10,6 +12,9 @@ from torch import Tensor
 from torchrl.envs import Transform
 
 from coachable.ranges import SHARE
+from coachable.signals import Signal
+
+_SIDE = re.compile("left|right")
 
 
 @dataclass(frozen=True)
@@ -37,10 +42,41 @@ class MirrorMap:
                     f"entries {i} and {j} are not each other's mirror image: expected a map that is its own inverse"
                 )
 
-    @property
-    def width(self) -> int:
-        """Number of entries of a vector."""
-        return len(self.source)
+
+def mirror_map(groups: Sequence[Signal], turned: Mapping[str, Sequence[str]]) -> MirrorMap:
+    """Return the mirror map of adjacent blocks of an observation or an action, from the names of their entries.
+
+    An entry whose name has "left" or "right" swaps with the entry of the same block whose name has the other, if there
+    is one.
+
+    Args:
+        groups: The blocks, in order.
+        turned: Patterns of the entries whose sign changes, by block. Every block needs an entry here, so that none is
+            forgotten.
+
+    Raises:
+        ValueError: If it is not known how a block looks in the mirror.
+
+    Example:
+        >>> wheels = Signal("slip_angle", 2, "", ("front_left", "front_right"))
+        >>> mirror_map([Signal("fuel", 1), wheels], {"fuel": (), "slip_angle": ("*",)})
+        MirrorMap(source=(0, 2, 1), sign=(1.0, -1.0, -1.0))
+    """
+    source: list[int] = []
+    sign: list[float] = []
+    for group in groups:
+        if group.name not in turned:
+            raise ValueError(
+                f"block {group.name!r} has no mirror image: expected one of {', '.join(turned)}. Add it to the "
+                "domain's patterns, or set mirror=0"
+            )
+        first = len(source)
+        entries = group.entries or tuple(f"{group.name} {index}" for index in range(group.width))
+        for index, entry in enumerate(entries):
+            other = _SIDE.sub(lambda side: "right" if side[0] == "left" else "left", entry, count=1)
+            source.append(first + (entries.index(other) if other in entries else index))
+            sign.append(-1.0 if any(fnmatchcase(entry, pattern) for pattern in turned[group.name]) else 1.0)
+    return MirrorMap(tuple(source), tuple(sign))
 
 
 class MirrorSymmetry(Transform):

@@ -95,7 +95,8 @@ class TaskImpersonation(Transform):
         self._refuse_sums(tensordict)
         stored, features, task_reward, reward = self._entries(tensordict)
         shape = tensordict.batch_size
-        drawn = self.sampler.sample_independent((*shape, self.n), self.generator, stored.device)
+        # Batches of one, because `Shared` gives several rows of a batch the same style.
+        drawn = self.sampler.sample((*shape, self.n, 1), self.generator, stored.device).squeeze(-2)
         dim = len(shape)
         features = features.unsqueeze(dim)
         features = features.expand(*shape, self.n, *features.shape[dim + 1 :])

@@ -24,12 +24,13 @@ def within(expected: Range) -> Any:
     return field(metadata={"range": expected})
 
 
-def arguments(**ranges: Range | list[Range]) -> Any:
+def arguments(**ranges: Range | list[Range] | type[bool]) -> Any:
     """Return a dataclass field for a target.
 
     Args:
-        **ranges: Range by the name of an argument, also a nested one; in a list the range of each of several numbers. A
-            number with the name of one of `Settings` has its range. Others must be finite; the target checks them.
+        **ranges: Range by the name of an argument, also a nested one; in a list the range of each of several numbers;
+            `bool` for a switch, which older files write as 0 or 1. A number with the name of one of `Settings` has its
+            range. Others must be finite; the target checks them.
     """
     return field(metadata={"ranges": ranges})
 
@@ -135,7 +136,7 @@ class Settings:
     env: Target = arguments(
         num_envs=COUNT, episode_steps=COUNT, cars=COUNT, seconds=POSITIVE, shares=[SHARE], weights=[NOT_NEGATIVE]
     )
-    style_reward: dict[str, Any] = arguments(**{"margin": POSITIVE, "*": NOT_NEGATIVE})
+    style_reward: dict[str, Any] = arguments(**{"margin": POSITIVE, "in_corners": bool, "*": NOT_NEGATIVE})
     sampler: Target = arguments(share=SHARE, neutral=SHARE, independent=SHARE, positive=SHARE, full=SHARE)
     gamma: float = within(SHARE)
     alpha: float = within(POSITIVE)

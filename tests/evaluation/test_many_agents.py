@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 
 import pytest
 
@@ -39,7 +40,7 @@ def test_the_numbers_of_all_agents_are_in_one_table(evaluated, tmp_path):
         rows = list(csv.DictReader(file))
     assert [row["quantity"] for row in rows] == ["seed", "trial, best", "trial, laps, 0", "trial, laps, 1"]
     assert list(rows[0]) == ["quantity", "1_car_a", "2_car_b", "mean", "std"]
-    assert rows[3]["1_car_a"] == rows[3]["mean"] == "nan"
+    assert rows[3]["1_car_a"] == rows[3]["std"] == "nan" and rows[3]["mean"] == "1"
 
 
 def test_bounds_are_shown_alone(evaluated, tmp_path):
@@ -58,3 +59,4 @@ def test_a_single_agent_has_its_own_report(evaluated, tmp_path):
 def test_numbers_that_an_agent_lacks_are_left_out():
     rows = side_by_side({"a": {"x": 1.0, "y": 2.0}, "b": {"x": 3.0}})
     assert [row["quantity"] for row in rows] == ["x"] and rows[0]["mean"] == 2.0
+    assert side_by_side({"a": {"x": math.nan}, "b": {"x": math.nan}}) == []

@@ -41,9 +41,11 @@ def test_finished_trainings_are_shown_and_not_repeated(tmp_path, capsys):
     capsys.readouterr()
     assert main(["train", "rare_targets", *TINY, "seeds=0,1", f"run_dir={tmp_path}"]) == 0
     table = capsys.readouterr().out
-    rows = {line.split()[0]: [float(cell) for cell in line.split()[1:]] for line in table.splitlines()[-4:]}
-    assert rows.keys() == {"0", "1", "mean", "std"} and rows["0"][0] == rows["mean"][0] == 200
-    for zero, one, mean in zip(rows["0"], rows["1"], rows["mean"], strict=True):
+    heading, _, *lines = [line.strip("| ").split(" | ") for line in table.splitlines()[1:]]
+    assert heading == ["quantity", "seed 0", "seed 1", "mean", "std"]
+    rows = {name: [float(cell) for cell in cells] for name, *cells in lines}
+    assert rows["frames"] == [200, 200, 200, 0] and "episode/return" in rows
+    for zero, one, mean, _ in rows.values():
         assert mean == pytest.approx((zero + one) / 2, rel=1e-3)
     assert not list(tmp_path.glob("*.log"))
     assert [(tmp_path / f"seed_{seed}" / "metrics.csv").read_text() for seed in (0, 1)] == before
@@ -76,6 +78,6 @@ def test_the_same_command_continues_what_was_interrupted(tmp_path, number):
     process = start()
     said, _ = process.communicate()
     assert process.returncode == 0
-    assert re.search(rf"^\s*mean\s+{total} ", said, re.MULTILINE)
+    assert re.search(rf"^\| frames \| {total} \| {total} \| {total} \|", said, re.MULTILINE)
     assert "resumed" in (tmp_path / "seed_3.log").read_text()
     assert {read_state(find_checkpoint(tmp_path / f"seed_{s}"))["config"]["seed"] for s in (3, 5)} == {3, 5}

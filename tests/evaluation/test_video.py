@@ -132,6 +132,7 @@ def test_another_suffix_is_refused_before_anything_is_drawn(tmp_path):
         ({"seconds_per_style": float("nan")}, "seconds per style are nan: expected more than 0"),
         ({"fps": 0.5}, "0.5 pictures per second: expected 1 to 60"),
         ({"seconds_per_style": 0.0}, "seconds per style are 0.0: expected more than 0"),
+        ({"seconds_per_style": float("inf")}, "seconds per style are inf: expected more than 0, at most 3600"),
     ],
 )
 def test_odd_settings_are_refused_before_anything_is_drawn(tmp_path, settings, message):

@@ -183,7 +183,7 @@ def test_a_driver_of_races_learns_alone_on_the_observation_of_races(stage):
 @pytest.mark.parametrize("stage", ["laps", "corners"])
 def test_the_stages_of_drifting_pay_for_corners_on_many_circuits(stage):
     config = compose_config("racing_qr_sac", ["preset=drift", f"stage={stage}"])
-    assert config["domain"] == "racing_drift" and config["style_reward"] == {"in_corners": 1.0, "angle_scale": 2.5}
+    assert config["domain"] == "racing_drift" and config["style_reward"] == {"in_corners": True, "angle_scale": 2.5}
     assert config["env"]["track"] == "training" and config["env"]["curvature"] is True
     shares = {name: config["sampler"][name] for name in ("positive", "full", "neutral")}
     assert sum(shares.values()) < 1.0 and config["sampler"]["_target_"].endswith("with_requests")

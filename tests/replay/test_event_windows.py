@@ -76,7 +76,7 @@ def test_open_episodes_that_nobody_continues_are_forgotten():
     for trajectory in range(400):
         ids = TensorDict({"traj_ids": torch.full((1,), trajectory)}, [1])
         buffer.extend(steps([trajectory], [False], collector=ids))
-    assert len(buffer.writer.history) <= 52
+    assert (buffer.writer.history.key >= 0).sum() <= 52
     assert len(buffer.writer.history.key) < 256
 
 
@@ -86,8 +86,7 @@ def test_held_back_steps_that_nobody_continues_are_written():
         td = steps([trajectory], [False], collector=TensorDict({"traj_ids": torch.full((1,), trajectory)}, [1]))
         td["next", "reward"] = torch.ones(1, 1)
         buffer.extend(td)
-    assert len(buffer.writer.n_step) <= 52
-    assert buffer.write_count >= 345
+    assert buffer.write_count >= 348
 
 
 def test_padding_of_split_trajectories_is_dropped():

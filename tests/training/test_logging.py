@@ -6,31 +6,31 @@ import time
 
 import pytest
 
-from coachable.training.logging import CsvLog, Progress, wandb_logger
+from coachable.training.logging import MetricsLog, Progress, wandb_logger
 from coachable.training.throttle import Throttle
 
 
 def test_csv_gains_columns_and_forgets_an_abandoned_future(tmp_path):
-    log = CsvLog(tmp_path / "m.csv")
+    log = MetricsLog(tmp_path)
     log.write({"frames": 1, "a": 1.0})
     log.write({"frames": 2, "b": 2.0})
     log.write({"frames": 3, "a": 3.0})
-    again = CsvLog(tmp_path / "m.csv")
+    again = MetricsLog(tmp_path)
     again.rewind(2)
     again.write({"frames": 3, "b": 5.0})
-    assert (tmp_path / "m.csv").read_text().splitlines() == ["frames,a,b", "1,1.0,", "2,,2.0", "3,,5.0"]
+    assert (tmp_path / "metrics.csv").read_text().splitlines() == ["frames,a,b", "1,1.0,", "2,,2.0", "3,,5.0"]
 
 
 @pytest.mark.parametrize("torn", ["4,1", "40,1.0,", "40,1.0,2.0", '4"'])
 def test_a_line_that_was_not_finished_is_dropped(tmp_path, torn):
-    log = CsvLog(tmp_path / "m.csv")
+    log = MetricsLog(tmp_path)
     log.write({"frames": 1, "a": 1.0, "b": 2.0})
-    with (tmp_path / "m.csv").open("a") as file:
+    with (tmp_path / "metrics.csv").open("a") as file:
         file.write(torn)
-    again = CsvLog(tmp_path / "m.csv")
+    again = MetricsLog(tmp_path)
     again.rewind(10)
     again.write({"frames": 5, "a": 3.0})
-    assert (tmp_path / "m.csv").read_text().splitlines() == ["frames,a,b", "1,1.0,2.0", "5,3.0,"]
+    assert (tmp_path / "metrics.csv").read_text().splitlines() == ["frames,a,b", "1,1.0,2.0", "5,3.0,"]
 
 
 def test_progress_tells_rates_and_the_time_to_go(monkeypatch):

@@ -253,9 +253,8 @@ def hold(td):
 def test_evaluation_counts_each_episode_once(make_echo_env):
     env = make_echo_env(3)
     env.hold_style(torch.tensor([0.5]))
-    result = evaluate_policy(env, hold, max_steps=100, keys=["style_reward"])
+    result = evaluate_policy(env, hold, max_steps=100)
     assert result["return"] == pytest.approx(-0.5 * result["length"], rel=1e-5)
-    assert result["style_reward_per_step"] == pytest.approx(-0.5, rel=1e-5)
     assert 0 < result["length"] <= 20
 
 

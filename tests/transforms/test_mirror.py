@@ -49,7 +49,6 @@ def test_mirroring_twice_must_be_nothing(source, sign):
 def test_what_does_not_fit_is_refused():
     with pytest.raises(ValueError, match="as many signs as sources, got 1, 2"):
         MirrorMap((0, 1), (1,))
-    assert SWAP.width == 3
     with pytest.raises(ValueError, match="'action' has 3 entries, its mirror map 2"):
         MirrorSymmetry({"action": MirrorMap((0, 1), (1, 1))})(batch(5))
 

@@ -7,7 +7,7 @@ import io
 import threading
 import webbrowser
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, redirect_stdout
+from contextlib import ExitStack, redirect_stdout, suppress
 from typing import Any
 
 ENV_OPTIONS = "Further options, after the source, are those of its domain; of an unknown one the error lists them."
@@ -51,30 +51,9 @@ def read_env_options(parser: argparse.ArgumentParser, arguments: Sequence[str]) 
     return options
 
 
-def serve(source: str, *, say: Callable[[str], None], **settings: Any) -> None:
-    """Serve the page of an agent until you interrupt it.
-
-    Args:
-        source: The agent, see `CoachSession.open`.
-        say: Called with the address of the page.
-        **settings: `port`, the first port to try; `host`, the address to listen on; `seed`, the seed of the session;
-            `env_options`, the options of the domain's environment as texts; `open_browser`, whether to open the page in
-            your browser.
-
-    Raises:
-        CheckpointError: If there is no such agent.
-        ValueError: If the agent's domain has no such option, or not with such a value.
-        ImportError: If the extra `ui` is not installed.
-        OSError: If the server cannot listen at that address.
-    """
-    try:
-        _serve(source, say, **settings)
-    except KeyboardInterrupt:
-        say("ended")
-
-
-def _serve(
+def serve(
     source: str,
+    *,
     say: Callable[[str], None],
     port: int = 8080,
     host: str = "127.0.0.1",
@@ -82,9 +61,26 @@ def _serve(
     open_browser: bool = False,
     env_options: Mapping[str, str] | None = None,
 ) -> None:
+    """Serve the page of an agent until you interrupt it.
+
+    Args:
+        source: The agent, see `CoachSession.open`.
+        say: Called with the address of the page.
+        port: First port to try.
+        host: Address to listen on.
+        seed: Seed of the session.
+        open_browser: Whether to open the page in your browser.
+        env_options: Options of the domain's environment as texts.
+
+    Raises:
+        CheckpointError: If there is no such agent.
+        ValueError: If the agent's domain has no such option, or not with such a value.
+        ImportError: If the extra `ui` is not installed.
+        OSError: If the server cannot listen at that address.
+    """
     from coachable.coach.page.server import make_server, page_address
 
-    with ExitStack() as closing:
+    with suppress(KeyboardInterrupt), ExitStack() as closing:
         # The server starts first, so that you can open the page while the agent is being loaded.
         server = make_server(host, port)
         closing.callback(_quietly, server.stop)
@@ -106,6 +102,7 @@ def _serve(
         loading.remove()
         page.start()
         wait()
+    say("ended")
 
 
 def wait() -> None:

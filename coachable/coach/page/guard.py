@@ -242,15 +242,13 @@ def _is_address(name: str) -> bool:
 
 
 def _refused(status: http.HTTPStatus, reason: str) -> Response:
-    body = f"Refused: {reason}.\n".encode()
-    headers = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))})
-    return Response(status.value, status.phrase, headers, body)
+    return _answered(f"Refused: {reason}.\n", "text/plain; charset=utf-8", status)
 
 
-def _answered(text: str, kind: str) -> Response:
+def _answered(text: str, kind: str, status: http.HTTPStatus = http.HTTPStatus.OK) -> Response:
     body = text.encode()
     headers = Headers({"Content-Type": kind, "Cache-Control": "no-store", "Content-Length": str(len(body))})
-    return Response(http.HTTPStatus.OK.value, http.HTTPStatus.OK.phrase, headers, body)
+    return Response(status.value, status.phrase, headers, body)
 
 
 def _protection(host: str) -> dict[str, str]:

@@ -35,8 +35,28 @@ _HIDDEN = -1000.0  # [m], height of spare primitives
 _START = (3.0, 3.0, 3.0)  # [m], viser's position of the camera until the browser receives ours
 
 
-class SceneView:
-    """3-D view of a stage; see `coachable.coach.page.views.View`.
+class View:
+    """View of a session, used only in the thread that steps it; this one shows nothing.
+
+    Attributes:
+        overlay: HTML that is laid over the view.
+    """
+
+    overlay = ""
+
+    def update(self, share: float = 1.0) -> None:
+        """Show the present state.
+
+        Args:
+            share: Share of the control step that has passed; views that can show states between two steps use it.
+        """
+
+    def close(self) -> None:
+        """Release the view's resources."""
+
+
+class SceneView(View):
+    """3-D view of a stage.
 
     The world moves instead of the camera, because each viewer controls their own camera.
 
@@ -47,7 +67,6 @@ class SceneView:
 
     Attributes:
         frame: The frame of the last update.
-        overlay: HTML that is laid over the scene.
         mode: Dropdown of what the camera does.
         brightness: Buttons that make the scene light or dark in the browser that presses them.
     """
@@ -66,7 +85,6 @@ class SceneView:
             for group, parent in (("parts", _MOVING), ("marks", _ROOT), ("glows", _MOVING))
             for shape in SHAPES
         }
-        self.overlay = ""
         server.scene.set_up_direction("+z")
         server.scene.configure_default_lights(enabled=False, cast_shadow=False)
         server.scene.configure_environment_map(None)
@@ -106,9 +124,6 @@ class SceneView:
                 self._build()
                 self._place = frame.place
             self._show(frame)
-
-    def close(self) -> None:
-        """See `View.close`."""
 
     def _change_brightness(self, event: viser.GuiEvent) -> None:
         if event.client is not None and event.target.value in _LIGHTS:

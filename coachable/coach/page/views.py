@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import time
 import warnings
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from coachable.coach.page.scene_view import PHONE, SceneView
+from coachable.coach.page.scene_view import PHONE, SceneView, View
 from coachable.coach.session.session import CoachSession
 
 if TYPE_CHECKING:
@@ -21,32 +21,8 @@ _BORDER = 235  # grey
 _ASPECTS = (0.25, 4.0)  # of windows that pictures are fitted to
 
 
-class View(Protocol):
-    """View of a session, used only in the thread that steps it.
-
-    Attributes:
-        overlay: HTML that is laid over the view.
-    """
-
-    overlay: str
-
-    def update(self, share: float = 1.0) -> None:
-        """Show the present state.
-
-        Args:
-            share: Share of the control step that has passed; views that can show states between two steps use it.
-        """
-        ...
-
-    def close(self) -> None:
-        """Release the view's resources."""
-        ...
-
-
-class PictureView:
+class PictureView(View):
     """Pictures of the domain's renderer as the background of the page, drawn while a browser is connected."""
-
-    overlay = ""
 
     def __init__(self, server: viser.ViserServer, session: CoachSession) -> None:
         self._server, self._session = server, session
@@ -93,21 +69,6 @@ def padded(picture: np.ndarray, aspect: float, upper_left: bool = False) -> np.n
     return np.pad(picture, sides, constant_values=_BORDER)
 
 
-class NoView:
-    """Note that says why the agent cannot be shown; coaching works without a view."""
-
-    overlay = ""
-
-    def __init__(self, server: viser.ViserServer, reason: str) -> None:
-        server.gui.add_markdown(f"**No view:** {reason}")
-
-    def update(self, share: float = 1.0) -> None:
-        """See `View.update`."""
-
-    def close(self) -> None:
-        """See `View.close`."""
-
-
 def make_view(server: viser.ViserServer, session: CoachSession) -> View:
     """Make the domain's 3-D view if it has one, else a view of its renderer's pictures, else a note with the reason.
 
@@ -120,4 +81,5 @@ def make_view(server: viser.ViserServer, session: CoachSession) -> View:
             return SceneView(server, session, session.domain.make_stage())
         return PictureView(server, session)
     except (ImportError, RuntimeError) as error:  # an extra or an OpenGL library is missing
-        return NoView(server, str(error))
+        server.gui.add_markdown(f"**No view:** {error}")
+        return View()  # coaching works without one

@@ -11,7 +11,13 @@ import numpy as np
 
 from coachable.coach.session.readout import StyleReport
 from coachable.domain import Domain, Words
-from coachable.evaluation.wording import measured_text, measures_by_parameter, readable, readable_number
+from coachable.evaluation.wording import (
+    measured_text,
+    measures_by_parameter,
+    readable,
+    readable_number,
+    with_unit,
+)
 from coachable.scene import palette
 from coachable.scene.palette import css
 from coachable.styles import Choice, Parameter, StyleSpace, Weight
@@ -264,7 +270,7 @@ def label(parameter: Parameter, words: Words) -> str:
         parameter: The parameter.
         words: Words of its domain.
     """
-    return words.name(parameter.name) + (f" [{parameter.unit}]" if parameter.unit else "")
+    return with_unit(words.name(parameter.name), parameter.unit)
 
 
 def trained(parameter: Parameter) -> str:

@@ -43,7 +43,7 @@ def amount(p: Weight | Setpoint, segment: Segment, now: float, last: Last | None
     if segment.level is not None:
         return _level(p, 1.0 - segment.level if sense < 0 else segment.level, segment.degree)
     if segment.default:
-        return default_of(p)
+        return cast(float, p.default)  # declared, or derived when the parameter was made: never None
     if isinstance(p, Weight):
         return _weight(p, segment, spent)
     if sense:
@@ -54,11 +54,6 @@ def amount(p: Weight | Setpoint, segment: Segment, now: float, last: Last | None
 def dimension_of(parameter: Weight | Setpoint | Choice) -> str:
     """Return the dimension of a parameter's unit, such as "length"; "" if it has no known unit."""
     return UNITS.get(stem(parameter.unit), (ANY, 1.0))[0] if parameter.unit else ANY
-
-
-def default_of(parameter: Weight | Setpoint) -> float:
-    """Return the default of a numeric parameter."""
-    return cast(float, parameter.default)  # declared, or derived when the parameter was made: never None
 
 
 def wrapped(p: Weight | Setpoint | Choice, value: float) -> float:

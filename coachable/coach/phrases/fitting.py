@@ -8,7 +8,7 @@ from typing import Any
 
 from coachable.coach.phrases.grammar import read_meaning
 from coachable.domain import Words
-from coachable.styles import Choice, Parameter
+from coachable.styles import Parameter
 
 
 def fitting(words: Words, parameters: Sequence[Parameter]) -> Words:
@@ -21,10 +21,10 @@ def fitting(words: Words, parameters: Sequence[Parameter]) -> Words:
     Returns:
         The words of the domain that name only these parameters and their options.
     """
-    options = {p.name: p.options if isinstance(p, Choice) else None for p in parameters}
+    options = {p.name: p.options for p in parameters}
 
     def known(name: str, value: Any) -> bool:
-        return name in options and (options[name] is None or value in ("", *(options[name] or ())))
+        return name in options and (not options[name] or value in ("", *options[name]))
 
     def means(meaning: str) -> bool:
         named, _, value = read_meaning(meaning)

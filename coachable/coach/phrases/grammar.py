@@ -148,7 +148,7 @@ class StyleGrammar:
     def _add_names(self) -> None:
         named = []
         for p in self.parameters.values():
-            named += [(p.name, Mention((p.name,))), *((option, Mention((p.name,), option)) for option in _options(p))]
+            named += [(p.name, Mention((p.name,))), *((option, Mention((p.name,), option)) for option in p.options)]
         counts = Counter(word for name, _ in named for word in set(tokenise(name)))
         for name, mention in named:
             for word in tokenise(name):
@@ -177,7 +177,7 @@ class StyleGrammar:
             raise ValueError(f"the vocabulary has words for {given!r}: expected one of {list(self.parameters)}")
         if not value:
             return Mention(signed, sign=sign)
-        for options in filter(None, (_options(self.parameters[name]) for name in signed)):
+        for options in filter(None, (self.parameters[name].options for name in signed)):
             if value not in options:
                 raise ValueError(f"the vocabulary has words for {meaning!r}: options are {list(options)}")
         p = self.parameters[signed[0]]
@@ -244,7 +244,7 @@ class StyleGrammar:
     def _deny(self, name: str, value: Value, segment: Segment, reading: _Reading) -> None:
         """Request any other value than this one, or ask which."""
         parameter = self.parameters[name]
-        others = [option for option in _options(parameter) if option != value]
+        others = [option for option in parameter.options if option != value]
         if isinstance(parameter, Choice) and reading.values[name] != value:
             reading.said.append(f"{readable(name)} stays {_shown(parameter, reading.values[name])}")
         elif isinstance(parameter, Weight) and value == 0.0:
@@ -320,10 +320,6 @@ def read_meaning(meaning: str) -> tuple[tuple[str, ...], int, str]:
     names, _, value = meaning.partition("=")
     signs = {_SIGNS.get(name[0], 0) for name in names.split()}
     return tuple(name.lstrip("+-") for name in names.split()), signs.pop() if signs else 0, value
-
-
-def _options(parameter: Parameter) -> tuple[str, ...]:
-    return tuple(parameter.options) if isinstance(parameter, Choice) else ()
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from coachable.coach.session.session import CoachSession
 from coachable.domain import Control
-from coachable.styles import Choice, Parameter, StyleSpace
+from coachable.styles import Choice, StyleSpace
 
 __all__ = ["Binding", "make_bindings"]
 
@@ -120,7 +120,7 @@ def make_bindings(space: StyleSpace, controls: Sequence[Control] = ()) -> list[B
                 is_control=parameter.name in circular,
                 low=None if isinstance(parameter, Choice) else parameter.low,
                 high=None if isinstance(parameter, Choice) else parameter.high,
-                options=_options(parameter),
+                options=parameter.options,
                 circular=circular.get(parameter.name, False),
                 keys=tuple(next(keys, "")),
                 axis=axis,
@@ -128,7 +128,3 @@ def make_bindings(space: StyleSpace, controls: Sequence[Control] = ()) -> list[B
             )
         )
     return bindings
-
-
-def _options(parameter: Parameter) -> tuple[str, ...]:
-    return parameter.options if isinstance(parameter, Choice) else ()

@@ -8,60 +8,31 @@ otherwise (shoulders, ankle_x).
 from __future__ import annotations
 
 from coachable.envs.humanoid.features import NUM_ARM_JOINTS, STYLE_FEATURES_SIZE, STYLED_SPEED_SIZE
-from coachable.envs.humanoid.observation import OBSERVATION_GROUPS
-from coachable.transforms.mirror import MirrorMap
+from coachable.envs.humanoid.model import ARM_JOINTS
+from coachable.envs.humanoid.observation import ACTION_GROUPS, OBSERVATION_GROUPS
+from coachable.signals import Signal
+from coachable.transforms.mirror import MirrorMap, mirror_map
 
-_POLAR, _AXIAL = (1, -1, 1), (-1, 1, -1)  # x, y, z of vectors, and of rotations
-# Signs of abdomen z, y, x; of a leg's hip x, z, y, knee, ankle y, x; of an arm's shoulder 1, 2, elbow.
-_ABDOMEN, _LEG, _ARM = (-1, 1, -1), (1, 1, 1, 1, 1, -1), (-1, -1, 1)
-
-
-def _keep(signs: tuple[int, ...]) -> tuple[list[int], list[int]]:
-    return list(range(len(signs))), list(signs)
-
-
-def _swap(signs: tuple[int, ...]) -> tuple[list[int], list[int]]:
-    """Return the map of two halves, one per side, that swap."""
-    n = len(signs)
-    return [*range(n, 2 * n), *range(n)], [*signs, *signs]
-
-
-def _join(*parts: tuple[list[int], list[int]]) -> tuple[list[int], list[int]]:
-    sources: list[int] = []
-    signs: list[int] = []
-    for source, sign in parts:
-        sources += [len(signs) + i for i in source]
-        signs += sign
-    return sources, signs
-
-
-_JOINTS = _join(_keep(_ABDOMEN), _swap(_LEG), _swap(_ARM))
-_GROUPS = {
+# Patterns of the entries whose sign changes, by block.
+_JOINTS = ("abdomen_z", "abdomen_x", "*_ankle_x", "*_shoulder?")
+_TURNED = {
     "joint_angles": _JOINTS,
-    "head_height": _keep((1,)),
-    "extremities": _swap((*_POLAR, *_POLAR)),
-    "torso_vertical": _keep(_POLAR),
-    "com_velocity": _keep(_POLAR),
-    "velocity": _join(_keep(_POLAR), _keep(_AXIAL), _JOINTS),
-    "pelvis_orientation": _keep((1, *_AXIAL)),
-    "expected_foot": _swap((1,)),
-    "knee_range": _join(_swap((1,)), _swap((1,))),
-    "step_start": _keep((1, -1)),
-    "stride_start": _keep((1, -1)),
-    "step_timer": _keep((1,)),
+    "head_height": (),
+    "extremities": ("*_left",),
+    "torso_vertical": ("of_left_axis",),
+    "com_velocity": ("left",),
+    "velocity": ("root_left", "root_turn_x", "root_turn_z", *_JOINTS),
+    "pelvis_orientation": ("x", "z"),
+    "expected_foot": (),
+    "knee_range": (),
+    "step_start": ("left",),
+    "stride_start": ("left",),
+    "step_timer": (),
+    "motors": _JOINTS,
+    "arms": _JOINTS,
+    "gait": (),
 }
-
-
-def _map(parts: tuple[list[int], list[int]]) -> MirrorMap:
-    return MirrorMap(tuple(parts[0]), tuple(float(sign) for sign in parts[1]))
-
-
-OBSERVATION = _map(_join(*(_GROUPS[group.name] for group in OBSERVATION_GROUPS)))
-# The motors' order: abdomen y, z, x; per leg hip x, z, y, knee, ankle x, y; per arm shoulder 1, 2, elbow.
-ACTION = _map(_join(_keep((1, -1, -1)), _swap((1, 1, 1, 1, -1, 1)), _swap(_ARM)))
-STYLE_FEATURES, STYLED_SPEED_FEATURES = (
-    _map(_join(_swap(_ARM), _keep((1,) * (size - NUM_ARM_JOINTS)))) for size in (STYLE_FEATURES_SIZE, STYLED_SPEED_SIZE)
-)
+OBSERVATION, ACTION = mirror_map(OBSERVATION_GROUPS, _TURNED), mirror_map(ACTION_GROUPS, _TURNED)
 
 
 def humanoid_mirror_maps(styled_speed: bool = False) -> dict[str | tuple[str, ...], MirrorMap]:
@@ -70,9 +41,11 @@ def humanoid_mirror_maps(styled_speed: bool = False) -> dict[str | tuple[str, ..
     Args:
         styled_speed: Option of the `HumanoidEnv`.
     """
+    size = STYLED_SPEED_SIZE if styled_speed else STYLE_FEATURES_SIZE
+    features = (Signal("arms", NUM_ARM_JOINTS, "", ARM_JOINTS), Signal("gait", size - NUM_ARM_JOINTS))
     return {
         "observation": OBSERVATION,
         "action": ACTION,
         ("next", "observation"): OBSERVATION,
-        ("next", "style_features"): STYLED_SPEED_FEATURES if styled_speed else STYLE_FEATURES,
+        ("next", "style_features"): mirror_map(features, _TURNED),
     }

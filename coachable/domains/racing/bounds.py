@@ -25,6 +25,7 @@ PACE_KEPT = 0.5  # smallest share of the pace at a middle request
 CORNERS_OVER_STRAIGHTS = 3.0  # smallest ratio of the shares of time that the car drifts there
 TURNED_PER_KM = 1.0  # most turns at a middle request
 LEVELS = 4  # fewest weights whose sideslips differ by more than their intervals
+_RESAMPLES = 500  # of the rank correlations
 _ROUNDING = 1e-9  # of rank correlations
 
 
@@ -183,22 +184,18 @@ def levels_apart(rows: Sequence[Row], measure: str) -> int:
     return max(longest, default=0)
 
 
-def rank_interval(
-    margins: np.ndarray, values: np.ndarray, *, resamples: int = 500, seed: int = 0
-) -> tuple[float, float]:
+def rank_interval(margins: np.ndarray, values: np.ndarray) -> tuple[float, float]:
     """Return the 95 % bootstrap interval of the rank correlation of a request with the means of what it asks for.
 
     Args:
         margins: Requested values (n,).
         values: Measured values (n, episodes), of which each row is resampled by itself.
-        resamples: Number of bootstrap samples.
-        seed: Seed of the resampling.
     """
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     count = values.shape[1]
     ranks = [
         rank_correlation(margins, np.take_along_axis(values, generator.integers(0, count, values.shape), 1).mean(1))
-        for _ in range(resamples)
+        for _ in range(_RESAMPLES)
     ]
     low, high = np.nanpercentile(ranks, [2.5, 97.5]) if not np.isnan(ranks).all() else (math.nan, math.nan)
     return float(low), float(high)

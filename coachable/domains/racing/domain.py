@@ -74,7 +74,7 @@ def racing_domain(
 
     def page(shown: Callable[..., Any]) -> Callable[..., Any] | None:
         """Return the function that makes the page on which a car drives alone, or None for races of several cars."""
-        return partial(racing_web, family=family, make_env=shown) if cars == 1 else None
+        return partial(racing_web, family=family, told=recorded, make_env=shown) if cars == 1 else None
 
     angles = ("sideslip", "sideslip_corners", "sideslip_straights") if family == "drift" else ()
     units = {"pace": "m/s", "speed": "m/s", "fuel_per_km": "l"}

@@ -107,7 +107,6 @@ _FAMILIES = {
         rival_env, partial(styles.aggressiveness_style_space, AGENTS), styles.aggressiveness_style_reward
     ),
 }
-FAMILIES = tuple(_FAMILIES)
 
 
 def racing_family(family: str) -> Family:

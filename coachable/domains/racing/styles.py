@@ -72,23 +72,22 @@ def aggressiveness_style_space(cars: int = 1) -> StyleSpace:
     return StyleSpace(parameters, law if cars == 1 else Shared(law, cars), name="racing_aggressiveness")
 
 
-def drift_style_reward(space: StyleSpace, *, in_corners: float = 0.0, angle_scale: float = 1.0) -> StyleReward:
+def drift_style_reward(space: StyleSpace, *, in_corners: bool = False, angle_scale: float = 1.0) -> StyleReward:
     """Return the reward Σ w_i g_i of mean slip angles [rad] and slip ratios of the axles.
 
     Args:
         space: Result of `drift_style_space`.
-        in_corners: Share of the positive weights that pays in corners only (our choice). There g_i counts in
-            proportion to `cornering`, and the slip angle of the rear tyres is replaced by the `inward_angle` of the
-            car. The rest pays everywhere, as do negative weights. 0 is the paper's literal reward, of which spinning
-            anywhere earns most.
+        in_corners: Whether positive weights pay in corners only (our choice). There g_i counts in proportion to
+            `cornering`, and the slip angle of the rear tyres is replaced by the `inward_angle` of the car. Negative
+            weights pay everywhere. False is the paper's literal reward, of which spinning anywhere earns most.
         angle_scale: Factor of a positive weight of the rear slip angle; 1 in the paper.
 
     Raises:
-        ValueError: If `in_corners` is not in [0, 1].
+        ValueError: If `in_corners` is neither true nor false, which older files write as 1 and 0.
     """
-    if not 0.0 <= in_corners <= 1.0:
-        raise ValueError(f"in_corners is {in_corners}: expected a share between 0 and 1")
-    if in_corners == 0.0 and angle_scale == 1.0:
+    if in_corners not in (False, True):
+        raise ValueError(f"in_corners is {in_corners}: expected true or false")
+    if not in_corners and angle_scale == 1.0:
         return StyleReward(space, {"drift": WeightedSum(DRIFT_NAMES, DRIFT)})
 
     def requested(name: str) -> Term:
@@ -96,9 +95,10 @@ def drift_style_reward(space: StyleSpace, *, in_corners: float = 0.0, angle_scal
 
         def reward(features: Tensor, style: Mapping[str, Tensor]) -> Tensor:
             weight, slip = style[name], features[..., column]
-            inside = features[..., CORNER_DRIFT] if rear_angle else slip * features[..., CORNERING]
-            asked = slip.lerp(inside, in_corners) * (angle_scale if rear_angle else 1.0)
-            return weight * torch.where(weight > 0.0, asked, slip)
+            asked = slip
+            if in_corners:
+                asked = features[..., CORNER_DRIFT] if rear_angle else slip * features[..., CORNERING]
+            return weight * torch.where(weight > 0.0, asked * angle_scale if rear_angle else asked, slip)
 
         return Term(reward, parameters=(name,))
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from coachable.domain import Recorded
 from coachable.domains.racing.car_scene import body, wheel
 from coachable.domains.racing.car_view import (
     GAUGES,
@@ -37,11 +38,6 @@ from coachable.scene.frame import Map
 from coachable.styles import StyleSpace
 
 KILOMETRES = "kilometres"  # along the track, in a control step
-TITLES = {"drift": "A car that drifts when you ask", "resources": "A driver who saves what you ask for"}
-SUMMARIES = {
-    "drift": "Ask for sliding rear tyres, and see how far the car goes sideways.",
-    "resources": "Ask for saved tyres and saved fuel, and see what the car uses of both.",
-}
 OPENS = {
     "drift": {"slip_angle_rear": 3.0, "slip_ratio_rear": 3.0},
     "resources": {"overtake": 1.0, "defend": 1.0, "tire": 0.0, "fuel": 0.0},
@@ -165,12 +161,15 @@ def memory_of(env: RacingEnv) -> Tensor:
     return torch.cat([rows, torch.stack(seen)], dim=1)
 
 
-def racing_web(space: StyleSpace, family: str, make_env: Callable[..., RacingEnv], **options: Any) -> StepPart:
+def racing_web(
+    space: StyleSpace, family: str, told: Recorded, make_env: Callable[..., RacingEnv], **options: Any
+) -> StepPart:
     """Return the part of the page of a car that is alone.
 
     Args:
         space: The agent's style space.
         family: Name of the family, "drift" or "resources".
+        told: Title and summary of the page.
         make_env: Function that makes the environment in which the agent is shown.
         **options: Its options that differ, such as `track`.
     """
@@ -179,8 +178,8 @@ def racing_web(space: StyleSpace, family: str, make_env: Callable[..., RacingEnv
     env.reset()
     size, track = CarSize.of(env.garage.car), env.tracks[0]
     return StepPart(
-        title=TITLES[family],
-        summary=SUMMARIES[family],
+        title=told.title,
+        summary=told.summary,
         measures=MEASURES[family],
         starts=_starts(make_env(num_envs=_STARTS, seed=0)),
         physics={

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Composite, Unbounded
+from torchrl.data import Binary, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from coachable.envs.combat import constants as c
@@ -41,6 +41,7 @@ from coachable.envs.combat.traps import TrapNumbers
 from coachable.finite import require_finite_action
 from coachable.keys import EVENTS, SCENARIO, STYLE_FEATURES, TASK_REWARD
 from coachable.ranges import AMOUNT, COUNT, Range
+from coachable.specs import set_specs
 
 COMPONENTS_KEY = "components"
 """Key of the raw components of a step, `(N, 44)`, for evaluation; see `rewards.COMPONENTS`."""
@@ -169,24 +170,18 @@ class CombatEnv(EnvBase):
         return torch.device("cpu") if self.device is None else self.device
 
     def _make_specs(self) -> None:
-        def rows(width: int) -> dict[str, Any]:
-            return {"shape": torch.Size((self.num_envs, width)), "device": self._on}
-
-        events = len(self.styles) + self.kill_event
-        entries: dict[str, Any] = {
-            "observation": Unbounded(dtype=torch.float32, **rows(observation_size(self.observation))),
-            TASK_REWARD: Unbounded(dtype=torch.float32, **rows(1)),
-            STYLE_FEATURES: Unbounded(dtype=torch.float32, **rows(len(self.styles))),
-            EVENTS: Binary(n=events, dtype=torch.bool, **rows(events)),
-            SCENARIO: Unbounded(dtype=torch.int64, **rows(1)),
+        column, events = torch.Size((self.num_envs, 1)), len(self.styles) + self.kill_event
+        further: dict[str, int | TensorSpec] = {
+            EVENTS: Binary(events, torch.Size((self.num_envs, events)), dtype=torch.bool, device=self._on),
+            SCENARIO: Unbounded(column, dtype=torch.int64, device=self._on),
         }
-        if self.emit_components:
-            entries[COMPONENTS_KEY] = Unbounded(dtype=torch.float32, **rows(NUM_COMPONENTS))
-        self.action_spec = GAMEPAD.spec(self.batch_size, device=self._on)
-        self.observation_spec = Composite(entries, shape=self.batch_size, device=self._on)
-        self.reward_spec = Unbounded(dtype=torch.float32, **rows(1))
-        flags = {name: Binary(n=1, dtype=torch.bool, **rows(1)) for name in ("done", "terminated", "truncated")}
-        self.done_spec = Composite(flags, shape=self.batch_size, device=self._on)
+        set_specs(
+            self,
+            action=GAMEPAD.spec(self.batch_size, device=self._on),
+            observation=observation_size(self.observation),
+            style_features=len(self.styles),
+            further=further | ({COMPONENTS_KEY: NUM_COMPONENTS} if self.emit_components else {}),
+        )
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is None:

@@ -109,21 +109,6 @@ def from_stick(stick: Tensor, forward: Tensor) -> Tensor:
     return torch.stack((fx * y + fy * x, fy * y - fx * x))
 
 
-def to_stick(direction: Tensor, yaw: Tensor) -> Tensor:
-    """Convert directions of the world to a stick; the inverse of `from_stick`.
-
-    Args:
-        direction: (2, N).
-        yaw: Direction of the camera, counter-clockwise from +x (N,) [rad].
-
-    Returns:
-        Stick (2, N), x to the right and y forward.
-    """
-    x, y = direction
-    fx, fy = facing(yaw)
-    return torch.stack((fy * x - fx * y, fx * x + fy * y))
-
-
 def element_of(section: Tensor, ammo_table: Tensor) -> Tensor:
     """Return one-hots (7, N) of the elements of wheel sections (N,).
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Bounded
 from torchrl.envs import EnvBase
 
 from coachable.envs.humanoid.features import (
@@ -33,6 +33,7 @@ from coachable.envs.humanoid.simulation import HumanoidSimulation, Kinematics
 from coachable.finite import require_finite_action
 from coachable.keys import STYLE_FEATURES, TASK_REWARD
 from coachable.ranges import COUNT, NOT_NEGATIVE, POSITIVE
+from coachable.specs import set_specs
 
 EPISODE_STEPS = 1000
 FALL_HEIGHT = 1.1  # [m], an episode ends when the head is lower
@@ -119,11 +120,16 @@ class HumanoidEnv(EnvBase):
         self._push_left = np.zeros(num_envs, dtype=np.int64)
         self.styled_speed = styled_speed
         self._features_size = STYLED_SPEED_SIZE if styled_speed else STYLE_FEATURES_SIZE
-        self.divergences = 0
         self._observation = np.zeros((num_envs, OBSERVATION_SIZE), dtype=np.float32)
         self._postures = self._find_postures()
         self._random = np.random.default_rng(seed)
-        self._make_specs()
+        set_specs(
+            self,
+            action=Bounded(-1.0, 1.0, torch.Size((num_envs, NUM_ACTIONS)), dtype=torch.float32),
+            observation=OBSERVATION_SIZE,
+            style_features=self._features_size,
+            further={WALK: WALK_SIZE},
+        )
 
     def steer(self, course: float | np.ndarray) -> None:
         """Set the direction that counts as forward, counter-clockwise from +x [rad], for all envs or each (N,)."""
@@ -140,26 +146,6 @@ class HumanoidEnv(EnvBase):
         return np.where(self._push_left[:, None] > 0, self.push, 0.0)
 
     # -- TorchRL ---------------------------------------------------------------------------------------------------
-
-    def _make_specs(self) -> None:
-        def rows(width: int) -> torch.Size:
-            return torch.Size((self.num_envs, width))
-
-        self.action_spec = Bounded(-1.0, 1.0, shape=rows(NUM_ACTIONS), dtype=torch.float32)
-        self.observation_spec = Composite(
-            {
-                "observation": Unbounded(shape=rows(OBSERVATION_SIZE), dtype=torch.float32),
-                TASK_REWARD: Unbounded(shape=rows(1), dtype=torch.float32),
-                STYLE_FEATURES: Unbounded(shape=rows(self._features_size), dtype=torch.float32),
-                WALK: Unbounded(shape=rows(WALK_SIZE), dtype=torch.float32),
-            },
-            shape=self.batch_size,
-        )
-        self.reward_spec = Unbounded(shape=rows(1), dtype=torch.float32)
-        self.done_spec = Composite(
-            {name: Binary(n=1, shape=rows(1), dtype=torch.bool) for name in ("done", "terminated", "truncated")},
-            shape=self.batch_size,
-        )
 
     def _set_seed(self, seed: int | None) -> None:
         self._random = np.random.default_rng(seed)
@@ -190,7 +176,6 @@ class HumanoidEnv(EnvBase):
         require_finite_action(action)
         controls = np.clip(action.numpy().astype(np.float64), -1.0, 1.0)
         diverged = self.simulation.step(controls, self._pushes())
-        self.divergences += int(diverged.sum())
         self.steps += 1
         kinematics = self.simulation.kinematics()
         forces, power = self.simulation.forces(), self.simulation.power()

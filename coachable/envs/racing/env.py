@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Bounded, Unbounded
 from torchrl.envs import EnvBase
 
 from coachable.envs.racing.circuit.circuits import load_tracks
@@ -28,11 +28,11 @@ from coachable.envs.racing.race.run import RUN_ROWS, Field, Run
 from coachable.envs.racing.race.scenarios import Conditions, Scenario, Starter, race_scenarios
 from coachable.envs.racing.race.task import TaskWeights
 from coachable.finite import require_finite_action
-from coachable.keys import STYLE_FEATURES, TASK_REWARD
+from coachable.keys import SCENARIO, STYLE_FEATURES, TASK_REWARD
 from coachable.ranges import COUNT
+from coachable.specs import set_specs
 
 EPISODE_STEPS = 1500  # 150 s
-SCENARIO = "scenario"
 TELEMETRY_KEY = "telemetry"
 
 Driver = Callable[[Field, Tensor], Tensor]
@@ -179,40 +179,18 @@ class RacingEnv(EnvBase):
         self.observation_size = sum(group.width for group in self.observation_groups)
         self._observation = torch.zeros(rows, self.observation_size, device=place)
         self._set_seed(seed)
-        self._make_specs()
+        set_specs(
+            self,
+            action=Bounded(-1.0, 1.0, torch.Size((num_envs, 2)), dtype=torch.float32, device=place),
+            observation=self.observation_size,
+            style_features=style_features_size(cars),
+            further={
+                TELEMETRY_KEY: len(TELEMETRY),
+                SCENARIO: Unbounded(torch.Size((num_envs, 1)), dtype=torch.int64, device=place),
+            },
+        )
 
     # -- TorchRL ---------------------------------------------------------------------------------------------------
-
-    def _make_specs(self) -> None:
-        device = self.device
-
-        def rows(width: int) -> torch.Size:
-            return torch.Size((self.num_envs, width))
-
-        def unbounded(width: int) -> Unbounded:
-            return Unbounded(shape=rows(width), dtype=torch.float32, device=device)
-
-        self.action_spec = Bounded(-1.0, 1.0, shape=rows(2), dtype=torch.float32, device=device)
-        self.observation_spec = Composite(
-            {
-                "observation": unbounded(self.observation_size),
-                TASK_REWARD: unbounded(1),
-                STYLE_FEATURES: unbounded(style_features_size(self.cars)),
-                TELEMETRY_KEY: unbounded(len(TELEMETRY)),
-                SCENARIO: Unbounded(shape=rows(1), dtype=torch.int64, device=device),
-            },
-            shape=self.batch_size,
-            device=device,
-        )
-        self.reward_spec = unbounded(1)
-        self.done_spec = Composite(
-            {
-                name: Binary(n=1, shape=rows(1), dtype=torch.bool, device=device)
-                for name in ("done", "terminated", "truncated")
-            },
-            shape=self.batch_size,
-            device=device,
-        )
 
     def _set_seed(self, seed: int | None) -> None:
         start = int(torch.randint(2**31, ()).item()) if seed is None else seed

@@ -16,6 +16,7 @@ from coachable.export.graph import import_onnx
 from coachable.export.onnx import TOLERANCE, export
 from coachable.export.web.part import PagePart
 from coachable.export.web.pinned_files import Package, packages, provide
+from coachable.outputs import complete_folder
 from coachable.scene.look import ICON, stylesheet
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
@@ -61,17 +62,15 @@ def export_page(
     import_onnx()
     agent = load_policy(source)
     part = _part_of(agent, env_options or {})
-    if out.exists() and not out.is_dir():
-        raise NotADirectoryError(f"{out} is a file: expected a folder, or a name that is free")
-    vendored = provide(assets, *part.packages)
-    files = part.files()
-    out.mkdir(parents=True, exist_ok=True)
-    copy_page(out, vendored, part.licence)
-    export(source, out / _POLICY)
-    for name, content in files.items():
-        (out / name).write_bytes(content)
-    manifest = manifest_of(agent, part) | ({} if home is None else {"home": home})
-    return finish_page(out, manifest, [*files, _POLICY], vendored)
+    with complete_folder(out) as folder:
+        vendored = provide(assets, *part.packages)
+        files = part.files()
+        copy_page(folder, vendored, part.licence)
+        export(source, folder / _POLICY)
+        for name, content in files.items():
+            (folder / name).write_bytes(content)
+        manifest = manifest_of(agent, part) | ({} if home is None else {"home": home})
+        return finish_page(folder, manifest, [*files, _POLICY], vendored)
 
 
 def copy_page(out: Path, vendored: Mapping[str, Path], licence: str = "") -> None:

@@ -7,6 +7,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 import torch
+from combat_bots import Bot
 
 from coachable.domain import load_domain
 from coachable.domains.combat.coached_fight import (
@@ -17,7 +18,6 @@ from coachable.domains.combat.coached_fight import (
     requests_of,
 )
 from coachable.domains.combat.fights import evaluate_fights
-from coachable.envs.combat.bots import Bot
 from coachable.envs.combat.tables import MACHINES
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.sweep import WeightSweep

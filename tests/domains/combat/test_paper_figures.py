@@ -2,20 +2,22 @@
 
 from dataclasses import replace
 
+import apex_fight
 import matplotlib.image
 import numpy as np
+import paper_figures
+import paper_tables
 import pytest
 import torch
+from combat_bots import Bot
+from fight_queue import fight_grid, run_fights
+from paper_tables import KINDS
+from reference_tables import head_rows, reference_tables
+from request_odds import odds_rows, probability_of_pair
 
 from coachable.domain import load_domain
-from coachable.domains.combat import apex_fight, paper_figures, paper_tables
 from coachable.domains.combat.coached_fight import SOURCES, STATES
-from coachable.domains.combat.fight_queue import fight_grid, run_fights
 from coachable.domains.combat.fights import PARTS
-from coachable.domains.combat.paper_tables import KINDS
-from coachable.domains.combat.reference_tables import head_rows, reference_tables
-from coachable.domains.combat.request_odds import odds_rows, probability_of_pair
-from coachable.envs.combat.bots import Bot
 from coachable.envs.combat.tables import MACHINES
 from coachable.training.weights import LoadedPolicy
 

@@ -10,7 +10,7 @@ import torch
 from coachable.domains.racing import frontier
 from coachable.domains.racing.frontier import SPEEDS, TANK, THROTTLE, WORN, LapProgramme
 from coachable.envs.racing.circuit.circuits import load_track
-from coachable.envs.racing.circuit.profile import Envelope, lap_time, speed_profile
+from coachable.envs.racing.circuit.profile import Envelope, speed_profiles
 from coachable.envs.racing.physics.cars import Resources, load_car
 from coachable.envs.racing.physics.powertrain import drive_wheels
 from coachable.envs.racing.race.driver import line_geometry
@@ -42,9 +42,8 @@ def test_centre_line_laps_are_those_of_the_specification(name, expected):
     _, free = lakeside(name)
     track = load_track("lakeside")
     curvature, spacing = line_geometry(track, None)
-    assert lap_time(speed_profile(Envelope(load_car(name)), curvature, spacing), spacing) == pytest.approx(
-        expected, rel=0.01
-    )
+    [speed] = speed_profiles(Envelope(load_car(name)), [curvature], [spacing])
+    assert np.sum(2 * spacing / (speed + np.roll(speed, -1))) == pytest.approx(expected, rel=0.01)
     assert free.time == pytest.approx(expected, rel=0.01)
 
 
@@ -64,7 +63,7 @@ def test_a_ring_is_driven_at_the_speed_that_friction_allows():
     """Radius 200 m: the lap of a steady speed, to the width of the speed grid."""
     track, car = load_track("ring"), load_car("gt3")
     envelope = Envelope(car)
-    speed = speed_profile(envelope, np.full(len(track.table), 1 / 200.0), track.spacing).mean()
+    speed = speed_profiles(envelope, [np.full(len(track.table), 1 / 200.0)], [track.spacing])[0].mean()
     programme = LapProgramme(track, car, Resources(1.0, 1.0), line=np.zeros(len(track.table)))
     [lap] = programme.laps("tyre", [0.0])
     assert lap.time == pytest.approx(track.length / speed, rel=0.01)
@@ -73,7 +72,7 @@ def test_a_ring_is_driven_at_the_speed_that_friction_allows():
 @pytest.mark.parametrize("car", ["gt3", "x2019"])
 def test_a_stint_lasts_about_ten_laps(car, long_stages):
     """An uncoached lap: the fastest of the programme on its own line."""
-    programme = LapProgramme(load_track("lakeside"), load_car(car), Resources.calibrated(car), fuel=TANK / 2)
+    programme = LapProgramme(load_track("lakeside"), load_car(car), Resources.calibrated(car))
     [lap] = programme.laps("fuel", [0.0])
     assert TANK / lap.fuel == pytest.approx(10.0, abs=1.0)
     assert WORN / lap.wear == pytest.approx(10.0, abs=1.0)

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 
 from coachable.domains.racing.events import SLIDE, racing_events
 from coachable.domains.racing.families import family_env, family_style
-from coachable.domains.racing.mirror_maps import mirror_map, racing_mirror_maps
+from coachable.domains.racing.mirror_maps import racing_mirror_maps
 from coachable.envs.racing import RacingEnv
 from coachable.envs.racing.circuit.circuits import load_track
 from coachable.envs.racing.physics.cars import Resources
@@ -20,6 +20,7 @@ from coachable.envs.racing.race.referee import TELEMETRY
 from coachable.envs.racing.race.run import Run
 from coachable.envs.racing.race.scenarios import Conditions, race_scenarios
 from coachable.signals import Signal, entry_names
+from coachable.transforms.mirror import mirror_map
 
 STEPS = 200
 WORN = Conditions.resources()
@@ -132,5 +133,5 @@ def test_the_place_on_the_lap_has_no_mirror_image():
 
 
 def test_unknown_blocks_are_refused():
-    with pytest.raises(ValueError, match="block 'wind' of the observation has no mirror image: expected one of motion"):
-        mirror_map([Signal("fuel", 1), Signal("wind", 2)])
+    with pytest.raises(ValueError, match="block 'wind' has no mirror image: expected one of motion, fuel"):
+        mirror_map([Signal("fuel", 1), Signal("wind", 2)], {"motion": (), "fuel": ()})

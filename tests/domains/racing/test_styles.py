@@ -75,14 +75,18 @@ def test_positive_weights_of_drift_pay_in_corners():
     space = styles.drift_style_space()
     features = torch.tensor([[0.1, 0.5, 0.2, 0.3, 9.0, 9.0, 9.0, 9.0, 0.7, 0.6]] * 2)
     theta = torch.tensor([[1.0, 2.0, -0.4, 5.0], [-0.1, -0.2, 4.0, 5.0]])
-    reward = styles.drift_style_reward(space, in_corners=1.0)(features, theta)
+    reward = styles.drift_style_reward(space, in_corners=True)(features, theta)
     expected = [0.06 + 2 * 0.7 - 0.08 + 5 * 0.18, -0.01 - 0.2 * 0.5 + 4 * 0.12 + 5 * 0.18]
     assert reward[:, 0].tolist() == pytest.approx(expected)
-    half = styles.drift_style_reward(space, in_corners=0.5, angle_scale=3.0)(features, theta)
-    expected = [0.08 + 3 * 2 * 0.6 - 0.08 + 5 * 0.24, -0.01 - 0.2 * 0.5 + 4 * 0.16 + 5 * 0.24]
-    assert half[:, 0].tolist() == pytest.approx(expected)
-    with pytest.raises(ValueError, match="in_corners is 2: expected a share"):
-        styles.drift_style_reward(space, in_corners=2)
+    scaled = styles.drift_style_reward(space, in_corners=1.0, angle_scale=3.0)(features, theta)  # as in older files
+    expected = [0.06 + 3 * 2 * 0.7 - 0.08 + 5 * 0.18, -0.01 - 0.2 * 0.5 + 4 * 0.12 + 5 * 0.18]
+    assert scaled[:, 0].tolist() == pytest.approx(expected)
+    everywhere = styles.drift_style_reward(space, in_corners=0, angle_scale=3.0)(features, theta)
+    expected = [0.1 + 3 * 2 * 0.5 - 0.08 + 5 * 0.3, -0.01 - 0.2 * 0.5 + 4 * 0.2 + 5 * 0.3]
+    assert everywhere[:, 0].tolist() == pytest.approx(expected)
+    for unclear in (0.5, 2, "yes"):
+        with pytest.raises(ValueError, match=f"in_corners is {unclear}: expected true or false"):
+            styles.drift_style_reward(space, in_corners=unclear)
 
 
 @pytest.mark.parametrize(

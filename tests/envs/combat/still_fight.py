@@ -7,10 +7,10 @@ from tensordict import TensorDict
 
 from coachable.envs.combat import CombatEnv
 from coachable.envs.combat import constants as c
-from coachable.envs.combat.gamepad import press
 from coachable.envs.combat.rewards import COMPONENT_SLICES
 from coachable.envs.combat.tables import WEAPONS
 from coachable.envs.combat.traits import SPREAD
+from tests.envs.combat.pressing import press
 
 NOTHING = press()
 NEVER = 1e6  # frames

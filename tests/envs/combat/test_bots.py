@@ -2,13 +2,13 @@
 
 import pytest
 import torch
+from combat_bots import BOTS, Bot, to_stick
 from tensordict import TensorDict
 
 from coachable.envs.combat import CombatEnv
-from coachable.envs.combat.bots import BOTS, Bot
 from coachable.envs.combat.constants import CONTROL_STEP
 from coachable.envs.combat.gamepad import GAMEPAD
-from coachable.envs.combat.player import from_stick, to_stick
+from coachable.envs.combat.player import from_stick
 from coachable.envs.combat.state import ACTIVE, IDLE, TELEGRAPH, State
 from coachable.envs.combat.tables import AMMO, MACHINES, SITES, WEAPONS
 

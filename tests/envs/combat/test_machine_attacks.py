@@ -5,10 +5,10 @@ import torch
 
 from coachable.envs.combat import CombatEnv
 from coachable.envs.combat import constants as c
-from coachable.envs.combat.gamepad import press
 from coachable.envs.combat.state import ACTIVE, IDLE, RECOVER, SAFE, STAGGER, STAGGERED, TELEGRAPH
 from coachable.envs.combat.tables import ALL_MACHINES, MACHINES
 from coachable.envs.combat.traits import DAMAGE, KIND, MACHINE_NAMES
+from tests.envs.combat.pressing import press
 from tests.envs.combat.still_fight import NOTHING, act, act_plain, still_fight
 
 

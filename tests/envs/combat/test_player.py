@@ -7,8 +7,8 @@ import torch
 
 from coachable.envs.combat import constants as c
 from coachable.envs.combat.damage import BURNING, FROST
-from coachable.envs.combat.gamepad import press
 from coachable.envs.combat.tables import ELEMENTS, MACHINES, resistance
+from tests.envs.combat.pressing import press
 from tests.envs.combat.still_fight import NOTHING, SHOOT, act, aim_at_body, hold, part, still_fight
 
 

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from coachable.envs.combat import constants as c
-from coachable.envs.combat.gamepad import press
 from coachable.envs.combat.state import AIR, DODGE, SLIDE
 from coachable.envs.combat.tables import ALL_MACHINES, AMMO, ELEMENTS, WEAPONS, load_table, resistance
+from tests.envs.combat.pressing import press
 from tests.envs.combat.still_fight import SHOOT, act, aim_at_body, hold, part, still_fight
 
 

@@ -162,7 +162,6 @@ def test_exploding_physics_ends_the_episode_without_a_non_finite_number():
     env.simulation.velocities[1, 5] = 1e12
     after = env.step(current.set("action", torch.zeros(3, 21)))["next"]
     assert after["terminated"].flatten().tolist() == [False, True, False]
-    assert env.divergences == 1
     assert torch.isfinite(after["style_features"]).all()
     assert torch.isfinite(after["task_reward"]).all()
 

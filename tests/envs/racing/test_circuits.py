@@ -6,7 +6,7 @@ from tensordict import TensorDict
 
 from coachable.envs.racing import RacingEnv
 from coachable.envs.racing.circuit.circuits import HELD_OUT, SETS, SHIPPED, TRAINED, load_track, load_tracks
-from coachable.envs.racing.circuit.profile import Envelope, speed_profile, speed_profiles
+from coachable.envs.racing.circuit.profile import Envelope, speed_profiles
 from coachable.envs.racing.circuit.track import clearance
 from coachable.envs.racing.physics.cars import load_car
 from coachable.envs.racing.race.observation import own_columns
@@ -44,7 +44,7 @@ def test_speeds_of_several_lines_are_those_of_each():
     envelope = Envelope(load_car("gt3"))
     both = speed_profiles(envelope, curvatures, spacings)
     for speeds, curvature, spacing in zip(both, curvatures, spacings, strict=True):
-        assert speeds == pytest.approx(speed_profile(envelope, curvature, spacing), rel=2e-3)
+        assert speeds == pytest.approx(speed_profiles(envelope, [curvature], [spacing])[0], rel=2e-3)
 
 
 def test_races_take_turns_on_the_circuits():

@@ -45,7 +45,7 @@ def test_finding_a_place_gives_it_back(ring):
     s = torch.linspace(1.0, ring.length * 0.99, 41, dtype=F64)
     offset = torch.linspace(-5.0, 5.0, 41, dtype=F64)
     x, y, _ = ring.place(s, offset)
-    for found, arc, _ in (ring.find(x, y), ring.project(x, y, s + 20.0), ring.project(x, y, s - 20.0)):
+    for found, arc, _ in (ring.project(x, y, s), ring.project(x, y, s + 20.0), ring.project(x, y, s - 20.0)):
         torch.testing.assert_close(found, s, atol=2e-3, rtol=0)
         torch.testing.assert_close(arc.offset, offset, atol=2e-3, rtol=0)
 

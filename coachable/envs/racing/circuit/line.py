@@ -8,10 +8,11 @@ import numpy as np
 
 from coachable.envs.racing.circuit.track import Track
 
+_ITERATIONS = 600
 BODY_MARGIN = 1.2  # [m] between the line and the edge of the track: half a car and a little more
 
 
-def minimum_curvature_line(track: Track, margin: float = BODY_MARGIN, rounds: int = 60) -> np.ndarray:
+def minimum_curvature_line(track: Track, margin: float = BODY_MARGIN) -> np.ndarray:
     """Return the offsets from the centre line that minimise Σ (change of direction)² within the track.
 
     The sum is quadratic in the offsets for fixed normals. It is minimised by the alternating direction method of
@@ -20,7 +21,6 @@ def minimum_curvature_line(track: Track, margin: float = BODY_MARGIN, rounds: in
     Args:
         track: Circuit.
         margin: Distance that the line keeps to the edges [m].
-        rounds: Number of iterations, in tens.
 
     Returns:
         Offsets (n,) to the left [m].
@@ -42,7 +42,7 @@ def minimum_curvature_line(track: Track, margin: float = BODY_MARGIN, rounds: in
     penalty = 1e-3
     solve = factorized((hessian + penalty * sparse.eye(n)).tocsc())
     clipped, dual = np.zeros(n), np.zeros(n)
-    for _ in range(rounds * 10):
+    for _ in range(_ITERATIONS):
         free = solve(penalty * (clipped - dual) - slope)
         clipped = np.clip(free + dual, low, high)
         dual = dual + free - clipped

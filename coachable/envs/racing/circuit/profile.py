@@ -97,29 +97,18 @@ def cornering_speed(envelope: Envelope, curvature: np.ndarray) -> np.ndarray:
     return low
 
 
-def speed_profile(envelope: Envelope, curvature: np.ndarray, spacing: np.ndarray | float) -> np.ndarray:
-    """Return the highest speeds on a closed line within the friction ellipse and the limits of engine and brakes.
-
-    Args:
-        envelope: Largest accelerations of the car.
-        curvature: Curvature (n,) of the line [1/m].
-        spacing: Distance from each point to the next, (n,) or one number [m].
-
-    Returns:
-        Speeds (n,) [m/s].
-    """
-    return speed_profiles(envelope, [curvature], [spacing])[0]
-
-
 def speed_profiles(
     envelope: Envelope, curvatures: Sequence[np.ndarray], spacings: Sequence[np.ndarray | float]
 ) -> list[np.ndarray]:
-    """Return what `speed_profile` returns for each of several closed lines; all are computed at once.
+    """Return the highest speeds on closed lines within the friction ellipse and the limits of engine and brakes.
 
     Args:
         envelope: Largest accelerations of the car.
         curvatures: Curvature (n,) of each line [1/m].
         spacings: Distance from each point to the next of each line, (n,) or one number [m].
+
+    Returns:
+        Speeds (n,) [m/s] on each line; all are computed at once.
     """
     counts = np.array([len(line) for line in curvatures])
     first = np.cumsum(counts) - counts
@@ -148,17 +137,3 @@ def speed_profiles(
 def _left(friction: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Return the longitudinal acceleration that the friction circle leaves beside a lateral one."""
     return np.sqrt(np.maximum(friction**2 - used**2, 0.0))
-
-
-def lap_time(speed: np.ndarray, spacing: np.ndarray | float) -> float:
-    """Return the time of a lap, with constant acceleration between two points.
-
-    Args:
-        speed: (n,) [m/s].
-        spacing: (n,) distance from each point to the next one [m], or one number for all.
-
-    Returns:
-        Time [s].
-    """
-    following = np.roll(speed, -1)
-    return float(np.sum(2 * np.asarray(spacing) / (speed + following)))

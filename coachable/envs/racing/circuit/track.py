@@ -364,14 +364,6 @@ class Course(torch.nn.Module):
         ahead = torch.clamp(arc.ahead, -self.spacing, self.spacing)  # pyright: ignore[reportCallIssue, reportArgumentType]
         return torch.remainder(self.distance(node) + ahead, self.length), arc, frame
 
-    def find(self, x: Tensor, y: Tensor) -> tuple[Tensor, Arc, Tensor]:
-        """Project points (N,) on the centre line of one circuit like `project`, without an estimate.
-
-        All nodes are compared.
-        """
-        distance = (x[..., None] - self.table[:, 0]) ** 2 + (y[..., None] - self.table[:, 1]) ** 2
-        return self.project(x, y, self.distance(distance.argmin(-1)))
-
     def place(self, s: Tensor, offset: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the positions of points beside the centre line, and the direction of the track there.
 

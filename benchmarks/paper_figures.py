@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from paper_tables import KINDS, WEAPON_STYLES
 
 from coachable.domains.combat.coached_fight import SOURCES, STATES
-from coachable.domains.combat.paper_tables import KINDS, WEAPON_STYLES
 from coachable.evaluation.figures import MARKERS, drawing
 from coachable.evaluation.wording import readable
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from coachable.envs.combat import constants as c
 from coachable.envs.combat.env import CombatEnv
 from coachable.envs.combat.gamepad import GAMEPAD, HEADS
-from coachable.envs.combat.player import to_stick, wrap
+from coachable.envs.combat.player import facing, wrap
 from coachable.envs.combat.state import ACTIVE, TELEGRAPH, nearest, pick
 from coachable.envs.combat.tables import AMMO, KINDS, WEAPONS
 from coachable.envs.combat.traits import FARTHEST, KIND, SPEED
@@ -21,6 +21,21 @@ _DODGE_WITHIN, _DODGE_SHARE, _SHOT_SHARE = 0.22, 0.6, 0.42  # [s] before an atta
 _SHOT_WITHIN = 0.25  # [s] before a shot lands
 _NEAR, _FAR, _STRAFE = 11.0, 16.0, 0.8  # [m], [m], of the stick
 _RANGED = KINDS.index("ranged")
+
+
+def to_stick(direction: Tensor, yaw: Tensor) -> Tensor:
+    """Convert directions of the world to a stick; the inverse of `from_stick`.
+
+    Args:
+        direction: (2, N).
+        yaw: Direction of the camera, counter-clockwise from +x (N,) [rad].
+
+    Returns:
+        Stick (2, N), x to the right and y forward.
+    """
+    x, y = direction
+    fx, fy = facing(yaw)
+    return torch.stack((fy * x - fx * y, fx * x + fy * y))
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from fight_queue import damage_by_source_and_state, source_damage
 
 from coachable.domains.combat.coached_fight import SOURCES
-from coachable.domains.combat.fight_queue import damage_by_source_and_state, source_damage
 from coachable.envs.combat.constants import PLAYER_HP
 from coachable.envs.combat.env import COMPONENTS_KEY
 from coachable.envs.combat.rewards import COMPONENT_SLICES

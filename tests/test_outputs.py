@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from coachable.evaluation.outputs import complete_file, complete_folder
+from coachable.outputs import complete_file, complete_folder
 
 
 def files_in(folder):
