@@ -181,8 +181,12 @@ class SceneView(View):
         camera.position, camera.look_at = camera_of(view)
         camera.fov = math.radians(45.0)
         camera.far = 4 * view.far
-        self._server.on_client_connect(lambda client: client.camera.on_update(partial(fit_camera, view=view)))
-        self._server.on_client_connect(lambda client: fit_camera(client.camera, view))
+
+        def on_connect(client: viser.ClientHandle) -> None:
+            fit_camera(client.camera, view)
+            client.camera.on_update(partial(fit_camera, view=view))
+
+        self._server.on_client_connect(on_connect)
 
 
 # viser takes the colours of batches and of fog as linear ones, unlike those of meshes.

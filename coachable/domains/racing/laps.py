@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 TRIAL_STEPS = 6000  # ten minutes: two laps of the longest circuit
 DRIVEN = (*SHIPPED, *HELD_OUT)
+_FUEL = 30.0  # [l], in the trainings of families that use none up
 _SHOWN = {"circuit": "", "trained": "", "kilometres": ".1f", "fuel": ".0f", "laps": "", "clean_laps": ".0%"}
 _SHOWN |= {"mean_lap": ".2f", "quasi_steady_state": ".2f", "over": "+.1%", "off": ".2%", "retired": ".0%"}
 _UNITS = {"fuel": "l", "mean_lap": "s", "quasi_steady_state": "s"}
@@ -68,9 +69,8 @@ def drive_circuits(domain: Domain, agent: LoadedPolicy, settings: EvaluationSett
         family "resources" starts with three quarters of a tank [l], the others with the fuel of their trainings.
     """
     family, trained_in = domain.name.removeprefix("racing_"), agent.config.get("env", {})
-    uses_fuel = family == "resources"  # the other families drive with the fuel that they start with
-    conditions = Conditions(fuel=0.75 * TANK) if uses_fuel else Conditions()  # enough for the whole trial
-    load = TANK / 2 if uses_fuel else conditions.fuel
+    # Enough for the whole trial, and half a tank; the other families keep the fuel that they start with.
+    fuel, load = (0.75 * TANK, TANK / 2) if family == "resources" else (_FUEL, _FUEL)
     tracks = load_tracks(DRIVEN)
     if "track" in settings.env_options:
         tracks += (settings.env_options["track"],)
@@ -88,7 +88,7 @@ def drive_circuits(domain: Domain, agent: LoadedPolicy, settings: EvaluationSett
         controlled=1,
         driver=None,
         scenarios=SOLO,
-        conditions=conditions,
+        conditions=Conditions(fuel=fuel),
         episode_steps=steps + 1,
         **{**settings.rollout, "steps": steps},
     )
@@ -108,7 +108,7 @@ def drive_circuits(domain: Domain, agent: LoadedPolicy, settings: EvaluationSett
                 "circuit": track.name,
                 "trained": "yes" if track.name in trained else "no",
                 "kilometres": track.length / 1000.0,
-                "fuel": conditions.fuel,
+                "fuel": fuel,
                 "laps": sum(map(len, times)),
                 "clean_laps": float(np.concatenate(clean).mean()) if sum(map(len, clean)) else 0.0,
                 "mean_lap": mean,
