@@ -67,6 +67,8 @@ def _declared(kind=Settings, path=()):
             yield (*path, entry.name), entry.metadata.get("range")
         for name, range_ in entry.metadata.get("ranges", {}).items():
             each = isinstance(range_, list)
+            if range_ is bool:
+                continue
             yield (*path, entry.name, name.replace("*", "any"), *["any"] * each), range_[0] if each else range_
 
 
