@@ -1,5 +1,8 @@
 """Circuits: sets of them, generated ones, and races that take turns on several."""
 
+import math
+
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -103,3 +106,19 @@ def test_curvature_replaces_the_place_on_the_lap():
     assert not seen_blind[:, place.start : place.start + 2].any() and seen[:, place.start].any()
     assert torch.equal(seen[:, place.stop :], seen_blind[:, place.stop : -20])
     torch.testing.assert_close(seen_blind[:, -20:], torch.full((2, 20), 30.0 / 200.0))
+
+
+def turning(name):
+    """How much a circuit turns, to either side [deg/km]."""
+    track = load_track(name)
+    return math.degrees(float(track.table[:, 4].abs().sum()) * track.spacing) / track.length * 1000
+
+
+def test_two_held_out_circuits_turn_more_than_nearly_all_that_are_trained_on():
+    """The numbers of docs/domains/racing.md."""
+    trained = np.array([turning(name) for name in TRAINED])
+    assert np.percentile(trained, [0, 50, 95, 100]) == pytest.approx([72, 116, 195, 237], abs=1)
+    held_out = {name: turning(name) for name in HELD_OUT}
+    assert held_out.pop("circuit-1003") == pytest.approx(208, abs=1)
+    assert held_out.pop("circuit-1006") == pytest.approx(254, abs=1)
+    assert max(held_out.values()) < 130
