@@ -139,9 +139,8 @@ def _draw_points(
 ) -> None:
     labels = [textwrap.fill(label, _LABEL) for label in table.labels]
     lines = sum(label.count("\n") + 1 for label in labels)
-    columns = min(len(metrics), _COLUMNS)
-    height = (0.9 + 0.16 * lines + 0.06 * len(labels)) * -(-len(metrics) // columns)
-    with _panels(path, len(metrics), (2.2 + 2.6 * columns, height), columns, sharey=True) as panels:
+    height = 0.9 + 0.16 * lines + 0.06 * len(labels)
+    with _panels(path, len(metrics), size=(2.6, height), margin=2.2, sharey=True) as panels:
         rows = list(range(len(labels)))
         for panel, metric in zip(panels, metrics, strict=True):
             estimates = [table.of(metric, [i]) for i in rows]
@@ -171,13 +170,13 @@ def _reach(estimates: Sequence[Estimate]) -> np.ndarray:
 
 @contextlib.contextmanager
 def _panels(
-    path: Path, count: int, size: tuple[float, float] | None = None, columns: int | None = None, sharey: bool = False
+    path: Path, count: int, size: tuple[float, float] = (4.0, 3.2), margin: float = 0.0, **options: Any
 ) -> Iterator[list[Axes]]:
-    """Provide `count` panels of a figure, see `drawing`."""
-    columns = columns or (2 if count == 4 else min(count, _COLUMNS))
+    """Provide `count` panels of a figure of some width and height each [inch], right of a margin; see `drawing`."""
+    columns = 2 if count == 4 else min(count, _COLUMNS)
     rows = -(-count // columns)
-    size = size or (4.0 * columns if count > 1 else 5.4, 3.2 * rows)
-    with drawing(path, rows, columns, size=size, sharey=sharey) as grid:
+    width, height = size
+    with drawing(path, rows, columns, size=(max(5.4, margin + width * columns), height * rows), **options) as grid:
         for panel in grid.flat[count:]:
             panel.set_visible(False)
         yield list(grid.flat[:count])

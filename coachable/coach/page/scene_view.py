@@ -130,11 +130,12 @@ class SceneView(View):
             _light(event.client.scene, self._stage.viewpoint, event.target.value)
 
     def _show(self, frame: Frame) -> None:
-        focus, turn = np.array([*frame.focus[:2], 0.0]), np.array(about_z(frame.heading))
+        focus = np.array([*frame.focus[:2], 0.0])
+        pose = focus, np.array(about_z(frame.heading))
         for (group, _), node in self._nodes.items():
-            node.show(getattr(frame, group), *(() if group == "marks" else (focus, turn)))
-        self._moving.position, self._moving.wxyz = focus, turn
-        self._move(frame)
+            node.show(getattr(frame, group), None if group == "marks" else pose)
+        self._moving.position, self._moving.wxyz = pose
+        self._move(focus, frame.heading)
         for index, handle in enumerate(self._labels):
             label = frame.labels[index] if index < len(frame.labels) else None
             if label is not None:
@@ -142,13 +143,12 @@ class SceneView(View):
             handle.visible = label is not None
         self.overlay = overlay_html(frame)
 
-    def _move(self, frame: Frame) -> None:
+    def _move(self, focus: np.ndarray, heading: float) -> None:
         """Move the world so that the agent stays in the middle, as the chosen mode of the camera wants it."""
         mode = self.mode.value
         if mode == STAY:
             return
-        turn = np.array(about_z(-frame.heading if mode == TURN else 0.0))
-        focus = np.array([*frame.focus[:2], 0.0])
+        turn = np.array(about_z(-heading if mode == TURN else 0.0))
         self._root.wxyz, self._root.position = turn, -rotated(turn, focus[None])[0]
         if self._travels:
             self._ground.position = np.round(focus)
@@ -206,16 +206,17 @@ class _Node:
         self.handle: Any = None
         self._room = 0
 
-    def show(self, parts: Parts, origin: np.ndarray | None = None, turn: np.ndarray | None = None) -> None:
+    def show(self, parts: Parts, pose: tuple[np.ndarray, np.ndarray] | None = None) -> None:
         """Show the primitives of this node's shape.
 
         Args:
             parts: The primitives.
-            origin: Position (3,) of the frame in which the node lies [m]; None for the world's.
-            turn: Its orientation, a quaternion (4,).
+            pose: Position (3,) [m] and orientation (4,), a quaternion, of the frame in which the node lies; None for
+                the world's.
         """
         batch = parts.of(self._shape)
-        if origin is not None and turn is not None:
+        if pose is not None:
+            origin, turn = pose
             back = turn * (1, -1, -1, -1)
             places = rotated(back, batch.positions - origin)
             batch = replace(batch, positions=places, wxyzs=multiplied(back, batch.wxyzs))

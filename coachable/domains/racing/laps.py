@@ -13,7 +13,7 @@ from coachable.domains.racing.metrics import TelemetryMeasures
 from coachable.envs.racing.circuit.circuits import HELD_OUT, SHIPPED, load_tracks
 from coachable.envs.racing.physics.cars import Resources, load_car
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
-from coachable.envs.racing.race.scenarios import SOLO, Conditions
+from coachable.envs.racing.race.scenarios import FUEL, SOLO, Conditions
 from coachable.evaluation.episode_records import record_styles
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.statistics import bootstrap_interval
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 TRIAL_STEPS = 6000  # ten minutes: two laps of the longest circuit
 DRIVEN = (*SHIPPED, *HELD_OUT)
-_FUEL = 30.0  # [l], in the trainings of families that use none up
 _SHOWN = {"circuit": "", "trained": "", "kilometres": ".1f", "fuel": ".0f", "laps": "", "clean_laps": ".0%"}
 _SHOWN |= {"mean_lap": ".2f", "quasi_steady_state": ".2f", "over": "+.1%", "off": ".2%", "retired": ".0%"}
 _UNITS = {"fuel": "l", "mean_lap": "s", "quasi_steady_state": "s"}
@@ -70,7 +69,7 @@ def drive_circuits(domain: Domain, agent: LoadedPolicy, settings: EvaluationSett
     """
     family, trained_in = domain.name.removeprefix("racing_"), agent.config.get("env", {})
     # Enough for the whole trial, and half a tank; the other families keep the fuel that they start with.
-    fuel, load = (0.75 * TANK, TANK / 2) if family == "resources" else (_FUEL, _FUEL)
+    fuel, load = (0.75 * TANK, TANK / 2) if family == "resources" else (FUEL, FUEL)
     tracks = load_tracks(DRIVEN)
     if "track" in settings.env_options:
         tracks += (settings.env_options["track"],)

@@ -23,6 +23,7 @@ _WEAR_MAX, _WEAR_SPREAD = 0.75, 0.05
 _FUEL = (10.0, 100.0)  # [l]
 _HEAT = (30.0, 130.0)  # [°C], as hot as a stint makes them
 _MEDIUM = COMPOUNDS.index("race_medium")
+FUEL = 30.0  # [l], of cars that use none up
 _DRAWS = 16  # random numbers per car and episode
 _SHARES = {"solo": 0.30, "one_to_one": 0.15, "field": 0.25, "rolling": 0.10, "slipstream": 0.10, "recovery": 0.10}
 _SHARES_ALONE = {"solo": 0.8, "recovery": 0.2}
@@ -109,7 +110,7 @@ class Conditions:
     """
 
     wear: bool = False
-    fuel: float | None = 30.0
+    fuel: float | None = FUEL
     heat: float | None = 80.0
     compounds: tuple[int, ...] = (_MEDIUM,)
 
