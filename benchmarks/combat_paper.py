@@ -2,6 +2,7 @@
 
     python benchmarks/combat_paper.py grid AGENT...        damage matrix, wins, records, radars, parts removed
     python benchmarks/combat_paper.py pareto AGENT...      style score against wins as six weights fall
+    python benchmarks/combat_paper.py pairs AGENT...       two weapons requested at once, in five mixtures (ours)
     python benchmarks/combat_paper.py apex AGENT           timeline and film under four requests, and brittle phases
     python benchmarks/combat_paper.py requests AGENT       how rare composed requests were in training
     python benchmarks/combat_paper.py tables               machines, weapons, heads and rewards beside the paper's
@@ -13,7 +14,6 @@ paper fights 10 times per style, machine and site. A thousand fights run at a ti
 
 import argparse
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,13 +31,19 @@ from coachable.domains.combat.coached_fight import SOURCES, STATES, draw_timelin
 from coachable.domains.combat.fights import PAIRS, PARTS, composed_styles, style_label
 from coachable.domains.combat.styles import single_styles
 from coachable.envs.combat.tables import MACHINES, UNSEEN_MACHINES
-from coachable.evaluation.statistics import bootstrap_interval, wilson_interval
+from coachable.evaluation.statistics import rank_correlation
 from coachable.evaluation.style_grid import write_csv
 from coachable.evaluation.video import write_video
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
 PARETO = ("melee", "sunscourge", "icestorm_boltblaster", "frost", "plasma", "carjas_bane")  # ours; the paper names none
 POINTS = 6  # weights of a curve
+PAIRED = (
+    ("ancestors_return", "carjas_bane"),
+    ("corrosive_blastsling", "ancestors_return"),
+    ("carjas_bane", "corrosive_blastsling"),
+)  # all presets have these weapons
+SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)  # of the first weapon's largest weight; the second gets the rest of its own
 COMPOSED = [("corrosive_blastsling", element) for element in ("acid", "plasma", "adhesive")]
 
 Agents = Mapping[str, LoadedPolicy]
@@ -110,22 +116,35 @@ def pareto(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
     rows: Rows = []
     for index, cell in enumerate(cells):
         style = styles[index // POINTS]
-        done = np.concatenate([result[style][index].reshape(-1) for result in results])
-        total = np.concatenate([result["damage"][index].reshape(-1) for result in results])
-        won = np.concatenate([result["won"][index].reshape(-1) for result in results])
-        order = np.arange(len(done))  # fights are drawn again, so that their two numbers stay together
-        low, high = bootstrap_interval(order, partial(share_of, done, total), resamples=500)
-        row: dict[str, Any] = {"style": style, "weight": cell[style], "style_score": share_of(done, total, order)}
-        row |= {"style_score_low": low, "style_score_high": high, "won": float(won.mean())}
-        row["won_low"], row["won_high"] = wilson_interval(int(won.sum()), len(won))
-        rows.append(row)
+        shares = {"style_score": ((style,), ("damage",))}
+        rows.append({"style": style, "weight": cell[style]} | paper_tables.share_columns(results, index, shares))
     write_tables({"pareto": rows}, out)
     paper_figures.draw_pareto(rows, out / "pareto.png")
 
 
-def share_of(done: np.ndarray, total: np.ndarray, drawn: np.ndarray, axis: int = -1) -> Any:
-    share = done[drawn].sum(axis) / np.maximum(total[drawn].sum(axis), 1e-9)
-    return share if np.ndim(share) else float(share)
+def pairs(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
+    """Fights against every machine in which two weapons are requested at once."""
+    space = next(iter(agents.values())).space
+    neutral = dict.fromkeys(space.names, 0.0)
+    mixtures = [(*pair, share) for pair in PAIRED if set(pair) <= set(space.names) for share in SHARES]
+    cells = [
+        neutral | {first: share * float(space[first].high), second: (1.0 - share) * float(space[second].high)}
+        for first, second, share in mixtures
+    ]
+    if not cells:
+        raise SystemExit("the agents have no two of the weapons that are paired")
+    opponents = [(name,) for name in machines_of(agents)]
+    results = [
+        fight_grid(domain, agent, cells, opponents, fights=fights, seed=seed, progress=f"{name}: mixtures")
+        for seed, (name, agent) in enumerate(agents.items())
+    ]
+    rows = paper_tables.mixture_rows(results, mixtures)
+    write_tables({"pairs": rows}, out)
+    paper_figures.draw_mixtures(rows, out / "pairs.png")
+    for pair in dict.fromkeys((first, second) for first, second, _ in mixtures):
+        of_pair = [row for row in rows if (row["first"], row["second"]) == pair]
+        shares, measured = (np.array([row[name] for row in of_pair]) for name in ("requested", "share"))
+        print(f"{' and '.join(pair)}: rank correlation {rank_correlation(shares, measured):.2f}")
 
 
 def apex(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
@@ -150,8 +169,8 @@ def apex(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
 
 def requests(_domain: Domain, agents: Agents, out: Path, _fights: int) -> None:
     space = next(iter(agents.values())).space
-    pairs = [pair for pair in COMPOSED if set(pair) <= set(space.names)]
-    write_tables({"requests": odds_rows(space, pairs, draws=1_000_000)}, out)
+    composed = [pair for pair in COMPOSED if set(pair) <= set(space.names)]
+    write_tables({"requests": odds_rows(space, composed, draws=1_000_000)}, out)
 
 
 def write_tables(tables: Mapping[str, Rows], out: Path) -> None:
@@ -163,7 +182,7 @@ def write_tables(tables: Mapping[str, Rows], out: Path) -> None:
             print(f"{name}: nothing that this agent has")
 
 
-FIGURES = {"grid": grid, "pareto": pareto, "apex": apex, "requests": requests}
+FIGURES = {"grid": grid, "pareto": pareto, "pairs": pairs, "apex": apex, "requests": requests}
 
 
 def main() -> None:

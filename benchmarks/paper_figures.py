@@ -13,7 +13,7 @@ from coachable.domains.combat.coached_fight import SOURCES, STATES
 from coachable.evaluation.figures import MARKERS, drawing
 from coachable.evaluation.wording import readable
 
-__all__ = ["draw_matrix", "draw_pareto", "draw_parts", "draw_radars", "draw_wins"]
+__all__ = ["draw_matrix", "draw_mixtures", "draw_pareto", "draw_parts", "draw_radars", "draw_wins"]
 
 Rows = Sequence[Mapping[str, Any]]
 
@@ -135,4 +135,27 @@ def draw_pareto(rows: Rows, path: Path) -> None:
         axes.set(xlabel="style score: share of the damage that counts", ylabel="fights won")
         axes.set_xlim(-0.03, 1.03)
         axes.set_ylim(None, 1.03)
+        axes.legend(fontsize=8)
+
+
+def draw_mixtures(rows: Rows, path: Path) -> None:
+    """Draw the measured over the requested share of two kinds of damage that are requested at once.
+
+    Args:
+        rows: Result of `mixture_rows`.
+        path: PNG file to write.
+    """
+    with drawing(path, size=(5.6, 4.4)) as ((axes,),):
+        axes.plot([0, 1], [0, 1], color="0.7", lw=1, ls="--")
+        for number, pair in enumerate(dict.fromkeys((row["first"], row["second"]) for row in rows)):
+            points = [row for row in rows if (row["first"], row["second"]) == pair]
+            x, y, low, high = (
+                np.array([p[n] for p in points]) for n in ("requested", "share", "share_low", "share_high")
+            )
+            line = {"marker": MARKERS[number % len(MARKERS)], "ms": 4, "lw": 1, "elinewidth": 0.6}
+            label = f"{readable(pair[0])}, not {readable(pair[1])}"
+            axes.errorbar(x, y, np.abs(np.stack([low, high]) - y), label=label, **line)
+        axes.set(xlabel="requested share of the first weapon", ylabel="its share of the damage of both")
+        axes.set_xlim(-0.03, 1.03)
+        axes.set_ylim(-0.03, 1.03)
         axes.legend(fontsize=8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,17 +12,19 @@ from coachable.domains.combat.coached_fight import SOURCES, STATES
 from coachable.domains.combat.fights import OUTCOMES, PARTS
 from coachable.envs.combat.rewards import WEAPON_OF
 from coachable.envs.combat.tables import AMMO, ELEMENTS, WEAPONS, load_table
-from coachable.evaluation.statistics import wilson_interval
+from coachable.evaluation.statistics import bootstrap_interval, wilson_interval
 
 __all__ = [
     "KINDS",
     "WEAPON_STYLES",
     "implied_kinds",
     "matrix_rows",
+    "mixture_rows",
     "obedience_rows",
     "part_rows",
     "radar_rows",
     "record_rows",
+    "share_columns",
     "win_rows",
 ]
 
@@ -208,6 +211,57 @@ def part_rows(grids: Grids, labels: Sequence[str]) -> list[dict[str, Any]]:
             row |= {f"{name}_low": float(low), f"{name}_high": float(high)}
         rows.append(row)
     return rows
+
+
+def mixture_rows(grids: Grids, mixtures: Sequence[tuple[str, str, float]]) -> list[dict[str, Any]]:
+    """Return how two kinds of damage that are requested at once share it.
+
+    `share` is the damage of the first kind over that of both, `both` the damage of both over all damage.
+
+    Args:
+        grids: Results of `fight_grid`, one per training seed, with a cell per mixture.
+        mixtures: Both kinds of each mixture, and the requested share of the first.
+    """
+    rows = []
+    for index, (first, second, requested) in enumerate(mixtures):
+        both = (first, second)
+        shares = {"share": ((first,), both), "both": (both, ("damage",))}
+        row = {"first": first, "second": second, "requested": requested}
+        rows.append(row | share_columns(grids, index, shares))
+    return rows
+
+
+def share_columns(
+    grids: Grids, index: int, shares: Mapping[str, tuple[Sequence[str], Sequence[str]]]
+) -> dict[str, float]:
+    """Return shares of damage under a request, with the fights and how many of them were won.
+
+    Shares have the 95 % bootstrap interval over fights, `won` has Wilson's (`_low`, `_high`).
+
+    Args:
+        grids: Results of `fight_grid`, one per training seed.
+        index: Number of the request.
+        shares: For each name of a share the measures that are summed above and below the line.
+    """
+    columns: dict[str, float] = {}
+    for name, measures in shares.items():
+        part, whole = (sum(_fights(grids, measure, index) for measure in each) for each in measures)
+        fights = np.arange(len(whole))  # fights are drawn again, so that their two numbers stay together
+        columns[name] = float(_ratio(part, whole, fights))
+        interval = bootstrap_interval(fights, partial(_ratio, part, whole), resamples=_RESAMPLES)
+        columns[f"{name}_low"], columns[f"{name}_high"] = interval
+    won = _fights(grids, "won", index)
+    columns |= {"fights": len(won), "won": float(won.mean())}
+    columns["won_low"], columns["won_high"] = wilson_interval(int(won.sum()), len(won))
+    return columns
+
+
+def _fights(grids: Grids, measure: str, index: int) -> np.ndarray:
+    return np.concatenate([grid[measure][index].reshape(-1) for grid in grids])
+
+
+def _ratio(part: np.ndarray, whole: np.ndarray, fights: np.ndarray, axis: int = -1) -> np.ndarray:
+    return part[fights].sum(axis) / np.maximum(whole[fights].sum(axis), 1e-9)
 
 
 def _resampled(grids: Grids, index: int, kinds: Sequence[str]) -> np.ndarray:

@@ -149,6 +149,16 @@ def test_rows_of_the_tables(tmp_path):
     assert len(list(tmp_path.iterdir())) == 5
 
 
+def test_two_kinds_of_damage_share_what_both_do(tmp_path):
+    grid = grids(melee=[30, 0, 0, 0, 0, 0], frost=[10, 50, 0, 0, 0, 0])
+    grid["won"][0] = 1.0
+    rows = paper_tables.mixture_rows([grid, grid], [("melee", "frost", 0.9), ("melee", "frost", 0.1)])
+    assert rows[0] == rows[0] | {"fights": 20, "share": 0.75, "share_low": 0.75, "both": 0.4, "won": 1.0}
+    assert rows[1] == rows[1] | {"requested": 0.1, "share": 0.0, "both": 0.5, "won": 0.0}
+    paper_figures.draw_mixtures(rows, tmp_path / "pairs.png")
+    assert matplotlib.image.imread(tmp_path / "pairs.png").std() > 0.05
+
+
 def test_a_fight_under_requests_in_turn_is_logged_and_drawn(domain):
     domain, agent = watched(domain, Bot("frost", "Advanced Frost Hunter Arrow"))
     names = apex_fight.requests_in_turn(agent.space.names)
