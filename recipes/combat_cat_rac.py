@@ -57,7 +57,9 @@ def build(config: dict[str, Any]) -> Trainer:
     # Replay buffer, which sums rewards over n steps; its samples are relabelled with other styles
     replay = boxes.make_replay(run, example)
     if cfg.impersonation.n:
-        replay.append_transform(TaskImpersonation(style_reward, n=cfg.impersonation.n, seed=cfg.seed))
+        tables = boxes.styles_of_tables(run, space, replay)
+        relabel = TaskImpersonation(style_reward, n=cfg.impersonation.n, seed=cfg.seed, tables=tables)
+        replay.append_transform(relabel)
     boxes.open_run_dir(run, example, replay)  # files are written from here on
 
     # Collector, evaluation and the training loop, which continues where a resumed run stopped

@@ -60,7 +60,9 @@ def build(config: dict[str, Any]) -> Trainer:
     if cfg.mirror:
         replay.append_transform(MirrorSymmetry(racing_mirror_maps(simulation_env(example)), cfg.mirror, seed=cfg.seed))
     if cfg.impersonation.n:
-        replay.append_transform(TaskImpersonation(style_reward, n=cfg.impersonation.n, seed=cfg.seed))
+        tables = boxes.styles_of_tables(run, space, replay)
+        relabel = TaskImpersonation(style_reward, n=cfg.impersonation.n, seed=cfg.seed, tables=tables)
+        replay.append_transform(relabel)
     boxes.open_run_dir(run, example, replay)  # files are written from here on
 
     # Collector, evaluation and the training loop, which continues where a resumed run stopped

@@ -24,7 +24,8 @@ from coachable.domain import domain_names, load_domain
 from coachable.keys import STYLE_FEATURES
 from coachable.replay import EventTableBuffer
 from coachable.replay.replay_files import replay_bytes
-from coachable.styles import StyleReward, StyleSpace
+from coachable.styles import Sampler, StyleReward, StyleSpace
+from coachable.styles.mixtures import single_weight
 from coachable.training.async_collector import AsyncCollector
 from coachable.training.checkpoint import CheckpointStore, check_unused, check_writable
 from coachable.training.collection import evaluate_policy, simulation_env
@@ -158,6 +159,26 @@ def make_replay(run: Run, env: EnvBase, *, mirrored: bool = False) -> ReplayBuff
             f"the {tables} tables ({', '.join(replay.names)})"
         )
     return replay
+
+
+def styles_of_tables(run: Run, space: StyleSpace, replay: ReplayBuffer) -> dict[int, Sampler]:
+    """Return a sampler of styles that ask for a table's event, by the number of the table, for `TaskImpersonation`.
+
+    There are none without `impersonation.own_table`.
+
+    Raises:
+        ValueError: If `impersonation.own_table` is set and no table has the name of a weight.
+    """
+    if not run.settings.impersonation.own_table:
+        return {}
+    names = replay.names if isinstance(replay, EventTableBuffer) else ()
+    tables = {number: single_weight(space, name) for number, name in enumerate(names) if name in space.names}
+    if not tables:
+        raise ValueError(
+            "impersonation.own_table=true: expected replay=event_tables with a table for each weight of "
+            f"{run.settings.domain}; the tables are {', '.join(names) or 'none'}"
+        )
+    return tables
 
 
 def make_collector(run: Run, make_env: Callable[..., EnvBase], actor: nn.Module) -> BaseCollector | AsyncCollector:

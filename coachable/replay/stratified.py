@@ -10,7 +10,6 @@ from torch import Tensor
 from torchrl.data.replay_buffers import Storage
 from torchrl.data.replay_buffers.samplers import Sampler
 
-from coachable.keys import TABLE
 from coachable.replay.regions import Regions
 from coachable.replay.sum_tree import SumTree
 
@@ -115,8 +114,8 @@ class StratifiedSampler(Sampler):
             batch_size: Number of slots.
 
         Returns:
-            Slots `(batch_size,)`, and a dictionary with `table` and, if prioritised, `priority_weight`, of that shape.
-            The weight is ``(n P(i))^-beta`` over the largest one of the batch. n is the number of records of the table,
+            Slots `(batch_size,)`, and a dictionary that contains `priority_weight` of that shape if prioritised. The
+            weight is ``(n P(i))^-beta`` over the largest one of the batch. n is the number of records of the table,
             P(i) the probability within it.
         """
         device = getattr(storage, "device", None)
@@ -124,7 +123,7 @@ class StratifiedSampler(Sampler):
         plan = self._plan(batch_size, device)
         # float64, because a float32 draw reaches at most 2^24 different records.
         uniform = torch.rand(batch_size, dtype=torch.float64, device=device, generator=self._rng)
-        info = {TABLE: plan.table.clone()}
+        info: dict[str, Any] = {}
         if not self.prioritized:
             return uniform.mul_(plan.size).long().add_(plan.offset), info
         tree = self._tree_on(device)

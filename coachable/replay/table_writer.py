@@ -144,6 +144,8 @@ class TableWriter(Writer):
         if not kept.all():
             rows, slot = rows[self._index(np.flatnonzero(kept))], slot[kept]
         index = self._index(slot)
+        # Transforms of samples read it, such as `TaskImpersonation`.
+        rows = rows.copy().set(TABLE, self._index(self.regions.table_of(slot)))
         # Writing consecutive slots as a slice is several times faster.
         run = slot[-1] - slot[0] + 1 == len(slot) and bool((np.diff(slot) == 1).all())
         storage = self._storage

@@ -8,7 +8,7 @@ from coachable.styles.parameters import Setpoint, Weight
 from coachable.styles.samplers import ContinuousOneHot, Mixture, OneHot, PointMass, Product, Sampler, Shared, Uniform
 from coachable.styles.space import StyleSpace
 
-__all__ = ["Single", "own", "style_mixture", "with_extremes", "with_requests"]
+__all__ = ["Single", "own", "single_weight", "style_mixture", "with_extremes", "with_requests"]
 
 Single = Literal["continuous_one_hot", "one_hot", "independent"]
 
@@ -16,6 +16,27 @@ Single = Literal["continuous_one_hot", "one_hot", "independent"]
 def own(space: StyleSpace) -> Sampler:
     """Return the space's own sampler."""
     return space.sampler
+
+
+def single_weight(space: StyleSpace, name: str) -> Sampler:
+    """Return the styles in which one weight is uniform between 0 and its upper bound and the others are 0.
+
+    Args:
+        space: Style space of weights.
+        name: Name of the weight.
+
+    Returns:
+        A sampler of the space's dimension.
+
+    Raises:
+        ValueError: If a parameter is not a weight, or there is none of this name.
+    """
+    if others := _others(space, (Weight,)):
+        raise ValueError(f"{name} alone leaves {', '.join(others)} at 0, which it cannot be: expected weights only")
+    if name not in space.names:
+        raise ValueError(f"there is no weight {name!r}: expected one of {', '.join(space.names)}")
+    high = [bound if other == name else 0.0 for other, bound in zip(space.names, space.high.tolist(), strict=True)]
+    return Uniform([0.0] * space.dim, high)
 
 
 def style_mixture(

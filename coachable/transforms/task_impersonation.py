@@ -1,5 +1,6 @@
 """`TaskImpersonation`, which relabels sampled transitions with further styles (paper, Task Impersonation)."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -7,7 +8,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import Transform
 
-from coachable.keys import STYLE, STYLE_FEATURES, STYLE_REWARD, TASK_REWARD
+from coachable.keys import STYLE, STYLE_FEATURES, STYLE_REWARD, TABLE, TASK_REWARD
 from coachable.ranges import AMOUNT
 from coachable.styles.reward import StyleReward
 from coachable.styles.samplers import Sampler
@@ -35,9 +36,12 @@ class TaskImpersonation(Transform):
         n: Number of further styles per transition (paper: 4).
         sampler: Distribution of styles; None for the space's own.
         seed: Seed of the transform's own generator, whose state is in the state dict.
+        tables: Samplers by the number of a table of `EventTableBuffer` (ours). Column 1 of a transition from such a
+            table is drawn from the table's sampler, so that what led to an event is relabelled with a style that asks
+            for the event. Without it, with 18 styles one label in 20 asks for it.
 
     Raises:
-        ValueError: If n is negative, or the sampler draws styles of another size.
+        ValueError: If n is negative, or a sampler draws styles of another size.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -58,6 +62,7 @@ class TaskImpersonation(Transform):
         n: int = 4,
         sampler: Sampler | None = None,
         seed: int = 0,
+        tables: Mapping[int, Sampler] | None = None,
     ) -> None:
         super().__init__(in_keys=[], out_keys=[])
         AMOUNT.check("n of TaskImpersonation", n)
@@ -65,11 +70,13 @@ class TaskImpersonation(Transform):
         self.space = style_reward.space if space is None else space
         self.n = int(n)
         self.sampler = self.space.sampler if sampler is None else sampler
-        if self.sampler.dim != self.space.dim:
-            raise ValueError(
-                f"the sampler of TaskImpersonation draws styles of {self.sampler.dim} numbers: expected "
-                f"{self.space.dim} ({', '.join(self.space.names)})"
-            )
+        self.tables = dict(tables or {})
+        for each in (self.sampler, *self.tables.values()):
+            if each.dim != self.space.dim:
+                raise ValueError(
+                    f"the sampler of TaskImpersonation draws styles of {each.dim} numbers: expected "
+                    f"{self.space.dim} ({', '.join(self.space.names)})"
+                )
         self.generator = torch.Generator().manual_seed(seed)
 
     def set_seed(self, seed: int) -> None:
@@ -97,6 +104,9 @@ class TaskImpersonation(Transform):
         shape = tensordict.batch_size
         # Batches of one, because `Shared` gives several rows of a batch the same style.
         drawn = self.sampler.sample((*shape, self.n, 1), self.generator, stored.device).squeeze(-2)
+        for number, sampler in self.tables.items():
+            rows = (tensordict.get(TABLE) == number).nonzero(as_tuple=True)
+            drawn[(*rows, 0)] = sampler.sample((len(rows[0]),), self.generator, stored.device)
         dim = len(shape)
         features = features.unsqueeze(dim)
         features = features.expand(*shape, self.n, *features.shape[dim + 1 :])

@@ -40,6 +40,7 @@ class Impersonation:
     """Relabelling of sampled transitions."""
 
     n: int = within(AMOUNT)
+    own_table: bool = False
 
 
 @dataclass

@@ -13,9 +13,11 @@ from tensordict import TensorDict
 
 from coachable.domains.racing.families import racing_family
 from coachable.envs.racing.race.observation import COURSE_POINTS
+from coachable.replay import KeyEvents
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
 from coachable.training.trainer import REPLAY_KEYS
 from coachable.training.weights import load_policy
+from coachable.transforms import TaskImpersonation
 
 RECIPES = sorted(file.stem for file in (Path(__file__).resolve().parents[2] / "recipes" / "configs").glob("*_*.yaml"))
 TINY = ["preset=smoke", "env.num_envs=2", "threads.simulator=1", "threads.learner=1", "train.eval_interval=0"]
@@ -100,6 +102,18 @@ def test_the_papers_racing_learns_with_dropout_and_acts_without(tmp_path):
     with torch.no_grad():
         again, mode = policy(acted.clone())["loc"], loaded(acted.clone())["loc"]
     assert torch.equal(again, mode) and torch.equal(loaded(acted.clone())["loc"], mode)
+
+
+def test_a_table_of_an_event_has_labels_of_its_own(tmp_path):
+    choice = ["impersonation.n=1", "impersonation.own_table=true"]
+    train = _train("combat_cat_rac", tmp_path, *choice, "events.every_style=true")
+    (relabel,) = (part for part in train.replay._transform if isinstance(part, TaskImpersonation))
+    asked = {train.replay.names[number]: sampler.sample((50,)) for number, sampler in relabel.tables.items()}
+    assert tuple(asked) == relabel.space.names and {*train.replay.names} - {*asked} <= {"default", "kill"}
+    assert all(((styles > 0).sum(0) > 0).nonzero().item() == i for i, styles in enumerate(asked.values()))
+    assert isinstance(train.replay._writer.events, KeyEvents)
+    with pytest.raises(ValueError, match=r"own_table=true: expected replay=event_tables.*the tables are default"):
+        _train("combat_cat_rac", tmp_path / "uniform", *choice, "replay=uniform")
 
 
 def test_most_requests_of_the_continuous_one_hot_sampler_are_one_weight_of_any_size(tmp_path):

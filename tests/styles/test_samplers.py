@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from coachable.styles import Choice, Sampler, Setpoint, Shared, StyleSpace, Weight
-from coachable.styles.mixtures import style_mixture, with_extremes, with_requests
+from coachable.styles.mixtures import single_weight, style_mixture, with_extremes, with_requests
 from coachable.styles.samplers import ContinuousOneHot, Mixture, OneHot, PointMass, Product, Uniform, UniformChoice
 
 N = 200_000
@@ -235,6 +235,8 @@ def test_names_of_samplers_are_unique():
         (lambda: style_mixture(StyleSpace([Weight("a", 0, 5)]), neutral=float("nan")), "neutral is nan: expected"),
         (lambda: style_mixture(StyleSpace([Weight("a", 0, 5)]), neutral=0.6, independent=0.6), "exceed 1 together"),
         (lambda: with_extremes(StyleSpace([Setpoint("pace", 0.0, 1.0)]), share=2.0), r"share is 2.0: .* in \[0, 1\]"),
+        (lambda: single_weight(StyleSpace([Setpoint("pace", 0, 1), Weight("a", 0, 5)]), "a"), "leaves pace at 0"),
+        (lambda: single_weight(StyleSpace([Weight("a", 0, 5)]), "b"), "no weight 'b': expected one of a"),
         (lambda: Mixture([PointMass(0)], [float("nan")]), "probabilities that sum to 1"),
         (lambda: Uniform(0, float("inf")), "a value of Uniform is inf: expected a number that is finite"),
         (lambda: PointMass(float("nan")), "a value of PointMass is nan"),

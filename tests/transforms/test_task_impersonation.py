@@ -26,7 +26,7 @@ from coachable.styles import (
     Weight,
     WeightedFeature,
 )
-from coachable.styles.mixtures import Single, own, style_mixture, with_extremes, with_requests
+from coachable.styles.mixtures import Single, own, single_weight, style_mixture, with_extremes, with_requests
 from coachable.transforms import StyleRewardTransform, TaskImpersonation
 from tests.echo import echo_space
 
@@ -297,6 +297,40 @@ def test_works_with_event_tables_and_priorities():
         largest = sample["td_error"][index == slot].max()
         expected = (largest.double() + 1e-8) ** 0.6
         assert torch.isclose(buffer.sampler._tree.get(slot), expected)
+
+
+def test_what_led_to_an_event_is_relabelled_with_the_style_of_its_table():
+    space = StyleSpace([Weight("fuel", 0.0, 2.0), Weight("hit", -1.0, 3.0)])
+    reward = StyleReward(space, {"fuel": WeightedFeature("fuel", 0), "hit": WeightedFeature("hit", 1)})
+    steps = {"style": torch.zeros(300, 2), "next": {}}
+    steps["next"] = {
+        "style_features": torch.rand(300, 2),
+        "task_reward": torch.rand(300, 1),
+        "style": torch.zeros(300, 2),
+    }
+    td = TensorDict(steps, [300])
+    td["next", "reward"] = td["next", "task_reward"].clone()
+    td["next", "done"] = torch.zeros(300, 1, dtype=torch.bool)
+    td["next", "events"] = torch.rand(300, 1) < 0.2
+    buffer = EventTableBuffer(
+        {"default": 300, "hit": 100}, events=KeyEvents(["hit"]), event_horizon=3, num_envs=1, batch_size=64
+    )
+    tables = {buffer.names.index("hit"): single_weight(space, "hit")}
+    buffer.append_transform(TaskImpersonation(reward, n=2, tables=tables))
+    buffer.extend(td)
+    sample = buffer.sample()
+    led = sample["table"][:, 0] == 1
+    assert led.sum() == 32
+    own, others = sample["style"][led, 1], torch.cat([sample["style"][~led, 1], sample["style"][:, 2]])
+    assert (own[:, 0] == 0).all() and (own[:, 1] > 0).all() and own[:, 1].std() > 0.5
+    assert (others != 0).any(0).all() and (others[:, 1] < 0).any()  # of the training's distribution
+    assert not sample["style"][:, 0].any()  # the stored label stays
+    expected = sample["next", "task_reward"] + (sample["style"] * sample["next", "style_features"]).sum(
+        -1, keepdim=True
+    )
+    torch.testing.assert_close(sample["next", "reward"], expected)
+    with pytest.raises(ValueError, match="draws styles of 1 numbers: expected 2"):
+        TaskImpersonation(reward, tables={1: Uniform(0.0, 1.0)})
 
 
 def test_the_loss_is_the_same_for_any_order_of_labels():

@@ -93,12 +93,14 @@ def endurance() -> Track:
 _BUILDERS = {"lakeside": lakeside, "ridge": ridge, "endurance": endurance, "ring": ring, "oval": oval}
 CIRCUITS = tuple(_BUILDERS)
 SHIPPED = ("lakeside", "ridge", "endurance")
-# Of the numbers from 128 to 999, the 32 circuits that turn the most per kilometre, by 197 to 242 degrees. Of the others only one
-# in twenty turns by more than 195.
+# Of the numbers from 128 to 999, the 32 circuits that turn the most per kilometre, by 197 to 242 degrees. Only one in
+# twenty of the others turns by more than 195.
+# fmt: off
 _TWISTY = (
     128, 193, 259, 310, 319, 338, 403, 406, 421, 463, 470, 501, 508, 517, 546, 550, 570, 600, 613, 662, 673,
     677, 716, 735, 759, 796, 863, 880, 904, 967, 968, 997,
 )
+# fmt: on
 TRAINED = tuple(f"circuit-{number}" for number in (*range(128), *_TWISTY))
 HELD_OUT = tuple(f"circuit-{number}" for number in range(1000, 1008))
 SETS = {"training": (*SHIPPED, *TRAINED), "held_out": HELD_OUT}
