@@ -53,10 +53,11 @@ def batch_row(config: dict[str, Any]) -> dict[str, Any]:
     train, labels = config["train"], config["impersonation"]["n"]
     tables = space.dim + config["env"]["kill_event"]
     table = train["batch_size"] * config["event_share"] / tables
-    # Of the admitted fights, those with this style alone; the others have all weights.
+    # Of the admitted fights, those with this style alone. The others have all weights, or any style.
     several = float(((theta != 0).sum(-1) > 1).float().mean())
-    own = table * label / (label + several)
-    relabelled = table * labels * label
+    own = table * label / (1.0 if config["events"].get("every_style") else label + several)
+    asked = min(labels, int(config["impersonation"]["own_table"]))  # labels that ask for the table's event
+    relabelled = table * (asked + (labels - asked) * label)
     updates = train["total_frames"] * train["utd_ratio"]
     return {
         "preset": name_of(config),
