@@ -1,7 +1,7 @@
 """Writer of steps to their tables, with n-step assembly, routing, and copies of the windows before events."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -142,7 +142,7 @@ class TableWriter(Writer):
     def _put(self, slot: np.ndarray, rows: TensorDictBase) -> Tensor:
         kept = slot >= 0  # later records of this batch replace the others
         if not kept.all():
-            rows, slot = rows[self._index(np.flatnonzero(kept))], slot[kept]
+            rows, slot = cast(TensorDictBase, rows[self._index(np.flatnonzero(kept))]), slot[kept]
         index = self._index(slot)
         # Transforms of samples read it, such as `TaskImpersonation`.
         rows = rows.copy().set(TABLE, self._index(self.regions.table_of(slot)))
