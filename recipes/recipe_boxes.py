@@ -91,6 +91,10 @@ def make_style_reward(run: Run, factory: Callable[..., StyleReward], space: Styl
         raise ValueError(f"style_reward has {', '.join(sorted(unknown))}: {settings.domain} takes {expected}")
     style_reward = factory(space, **settings.style_reward)
     n = settings.impersonation.n
+    if settings.impersonation.own_table and not n:
+        raise ValueError(
+            "impersonation.own_table=true with impersonation.n=0, which has no further label: expected n >= 1"
+        )
     if n and settings.n_steps > 1 and not style_reward.is_linear:
         raise ValueError(
             f"impersonation.n={n} with n_steps={settings.n_steps}: the style reward of {settings.domain} is not "

@@ -104,8 +104,13 @@ class TaskImpersonation(Transform):
         shape = tensordict.batch_size
         # Batches of one, because `Shared` gives several rows of a batch the same style.
         drawn = self.sampler.sample((*shape, self.n, 1), self.generator, stored.device).squeeze(-2)
+        table = tensordict.get(TABLE, None)
+        if self.tables and table is None:
+            raise KeyError(
+                f"TaskImpersonation with tables found no {TABLE!r} in the sample: expected an EventTableBuffer"
+            )
         for number, sampler in self.tables.items():
-            rows = (tensordict.get(TABLE) == number).nonzero(as_tuple=True)
+            rows = (table == number).nonzero(as_tuple=True)
             drawn[(*rows, 0)] = sampler.sample((len(rows[0]),), self.generator, stored.device)
         dim = len(shape)
         features = features.unsqueeze(dim)

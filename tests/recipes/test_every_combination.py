@@ -114,6 +114,8 @@ def test_a_table_of_an_event_has_labels_of_its_own(tmp_path):
     assert isinstance(train.replay._writer.events, KeyEvents)
     with pytest.raises(ValueError, match=r"own_table=true: expected replay=event_tables.*the tables are default"):
         _train("combat_cat_rac", tmp_path / "uniform", *choice, "replay=uniform")
+    with pytest.raises(ValueError, match=r"own_table=true with impersonation.n=0"):
+        _train("combat_cat_rac", tmp_path / "none", "impersonation.n=0", choice[1])
 
 
 def test_most_requests_of_the_continuous_one_hot_sampler_are_one_weight_of_any_size(tmp_path):

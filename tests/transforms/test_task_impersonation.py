@@ -329,6 +329,8 @@ def test_what_led_to_an_event_is_relabelled_with_the_style_of_its_table():
         -1, keepdim=True
     )
     torch.testing.assert_close(sample["next", "reward"], expected)
+    with pytest.raises(KeyError, match="found no 'table' in the sample"):
+        TaskImpersonation(reward, tables=tables)(td)
     with pytest.raises(ValueError, match="draws styles of 1 numbers: expected 2"):
         TaskImpersonation(reward, tables={1: Uniform(0.0, 1.0)})
 
