@@ -10,7 +10,8 @@ import coachable.pretrained
 from coachable.domain import load_domain
 from coachable.training.weights import load_policy
 
-ANOTHER_NAME = {"racing_traffic": "racing_resources"}  # what it does says more than cpu_late_traffic
+# What they do says more than the names of their presets.
+ANOTHER_NAME = {"racing_traffic": "racing_resources", "combat_full": "combat"}
 SHIPPED = sorted(file.parent.name for file in Path(coachable.pretrained.__path__[0]).glob("*/weights.pt"))
 
 
