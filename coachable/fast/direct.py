@@ -111,6 +111,7 @@ def has_direct_gradients(loss_module: LossModule, *plans: Plan) -> bool:
         and getattr(head, "distribution_class", None) is TanhGaussian
         and not head.distribution_kwargs
         and type(critic) is StyleCritic
+        and critic.action_features is None
     )
 
 

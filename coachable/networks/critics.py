@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Protocol
 
 from torch import Tensor
 from torchrl.modules import ValueOperator
@@ -11,12 +11,44 @@ from torchrl.modules import ValueOperator
 from coachable.networks.actors import StyleEncoding, StyleNetwork, TensorModule
 
 
+class ActionFeatures(Protocol):
+    """Function of the action that a critic sees beside the action itself."""
+
+    width: int
+
+    def __call__(self, action: Tensor, /) -> Tensor:
+        """Return features `(..., width)` of actions `(..., action_dim)`, differentiable."""
+        ...
+
+
 class StyleCritic(StyleNetwork):
     """Network of an action value, its quantiles, or logits over its bins.
 
-    The trunk's input is `cat(observation, encode(theta), action)`. The head has one output for a scalar value, else one
-    for each quantile or bin.
+    The trunk's input is `cat(observation, encode(theta), action, features of the action)`. The head has one output for
+    a scalar value, else one for each quantile or bin.
+
+    Args:
+        space: Style space that encodes theta; None for no style.
+        inputs: Width of observation and action together.
+        outputs: Width of the head.
+        widths: Widths of the residual layers.
+        action_features: Further input computed from the action; None for none.
+        **trunk: Further arguments of :class:`~coachable.networks.residual.ResidualMLP`.
     """
+
+    def __init__(
+        self,
+        space: StyleEncoding | None,
+        inputs: int,
+        outputs: int,
+        widths: Sequence[int],
+        *,
+        action_features: ActionFeatures | None = None,
+        **trunk: Any,
+    ) -> None:
+        extra = 0 if action_features is None else action_features.width
+        super().__init__(space, inputs + extra, outputs, widths, **trunk)
+        self.action_features = action_features
 
     def forward(self, observation: Tensor, action: Tensor, style: Tensor | None = None) -> Tensor:
         """Return the critic's output.
@@ -32,7 +64,9 @@ class StyleCritic(StyleNetwork):
         Raises:
             ValueError: If the network has a style space and `style` is None.
         """
-        return self.head(observation, style, action)
+        if self.action_features is None:
+            return self.head(observation, style, action)
+        return self.head(observation, style, action, self.action_features(action))
 
 
 class CriticModule(TensorModule, ValueOperator):
@@ -46,6 +80,7 @@ def make_critic(
     widths: Sequence[int] = (512, 512, 512),
     *,
     num_outputs: int = 1,
+    action_features: ActionFeatures | None = None,
     **trunk: Any,
 ) -> ValueOperator:
     """Build one critic.
@@ -59,10 +94,12 @@ def make_critic(
         space: Style space that encodes theta, which is read from the key `style`; None for no style.
         widths: Widths of the residual layers.
         num_outputs: 1 for a scalar value, else the number of quantiles or logits.
+        action_features: Further input of the critic computed from the action; None for none.
         **trunk: Further arguments of :class:`~coachable.networks.residual.ResidualMLP`.
 
     Returns:
         A `ValueOperator` that reads `observation`, `action` and `style` and writes `state_action_value`.
     """
-    critic = StyleCritic(space, obs_dim + action_dim, num_outputs, widths, **trunk)
+    inputs = obs_dim + action_dim
+    critic = StyleCritic(space, inputs, num_outputs, widths, action_features=action_features, **trunk)
     return CriticModule(critic, in_keys=critic.in_keys("observation", "action"), out_keys=["state_action_value"])

@@ -36,3 +36,21 @@ def test_without_style():
     assert list(critic.in_keys) == ["observation", "action"]
     td = TensorDict({"observation": torch.randn(3, 6), "action": torch.randn(3, 2)}, [3])
     assert critic(td)["state_action_value"].shape == (3, 1)
+
+
+class Squares:
+    width = 2
+
+    def __call__(self, action):
+        return action.square()
+
+
+def test_features_of_the_action_come_last():
+    critic = make_critic(6, 2, ScaledStyle(), (16, 16), action_features=Squares()).module
+    obs, action, style = torch.randn(4, 6), torch.randn(4, 2, requires_grad=True), torch.randn(4, 3)
+    value = critic(obs, action, style)
+    expected = critic.trunk(torch.cat((obs, style / 2, action, action**2), -1))
+    torch.testing.assert_close(value, expected, rtol=0, atol=0)
+    (gradient,) = torch.autograd.grad(value.sum(), action)
+    (through,) = torch.autograd.grad(expected.sum(), action)
+    torch.testing.assert_close(gradient, through)

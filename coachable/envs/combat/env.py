@@ -212,7 +212,7 @@ class CombatEnv(EnvBase):
         ended = (won | lost[0]).unsqueeze(-1) & (not reset)
         late = (self.state.steps >= self.episode_steps).unsqueeze(-1) & ~ended & (not reset)
         values = (self._weights @ components).T
-        events = (self._fires @ components > 0).T
+        events = (self._fires @ components.clamp(min=0.0) > 0).T  # build-up also decays
         if self.kill_event:
             events = torch.cat([events, won.unsqueeze(-1)], -1)
         ammo = self._ammo.index_select(0, self.state.weapon * AMMO_SLOTS + self.state.section).T

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from coachable.distributions.action_heads import ActionHeads
+from coachable.ranges import COUNT
 from coachable.signals import Signal
 
 FACE = ("none", "cross", "circle", "square")
@@ -102,3 +103,41 @@ def read_pad(rows: Tensor) -> Pad:
         *("left_shoulder.L1", "left_shoulder.L2", "right_shoulder.R1", "right_shoulder.R2"),
     )
     return Pad(*(rows[_ROWS[name]] for name in names), left_stick=rows[20:22], right_stick=rows[22:24])
+
+
+class WheelDirection:
+    """Features for critics (ours): where the right stick points on the weapon wheel, while L1 keeps the wheel open.
+
+    One of 17 kinds of ammunition takes 20 or 30 degrees of the wheel. From the stick's two axes alone a critic learns
+    late that its value changes there. The features are `L1 Re(z^k)` and `L1 Im(z^k)` for k = 1..K with
+    `z = (x + iy) / sqrt(x^2 + y^2 + 0.01)`, where the stick counts as (0, 0) while its thumb is on the buttons. They are
+    defined and differentiable for relaxed actions, too.
+
+    Args:
+        orders: K; the highest order tells directions half a period, 180 / K degrees, apart.
+
+    Raises:
+        ValueError: If `orders` is not positive.
+
+    Example:
+        >>> action = torch.zeros(24)
+        >>> action[[11, 19, 23]] = 1.0  # L1, thumb on the joystick, upwards
+        >>> [round(value, 1) for value in WheelDirection(2)(action).tolist()]
+        [0.0, 1.0, -1.0, 0.0]
+    """
+
+    def __init__(self, orders: int = 9) -> None:
+        COUNT.check("orders of WheelDirection", orders)
+        self.width = 2 * orders
+
+    def __call__(self, action: Tensor) -> Tensor:
+        """Return the features `(..., 2 K)` of actions `(..., 24)`."""
+        open_, mode = action[..., _ROWS["left_shoulder.L1"]], action[..., _ROWS["right_mode.joystick"]]
+        x, y = (action[..., -2:] * mode.unsqueeze(-1)).unbind(-1)
+        shrink = (x.square() + y.square() + 0.01).rsqrt()
+        x, y = x * shrink, y * shrink
+        powers = [(x, y)]
+        for _ in range(self.width // 2 - 1):
+            real, imaginary = powers[-1]
+            powers.append((real * x - imaginary * y, real * y + imaginary * x))
+        return torch.stack([part for power in powers for part in power], -1) * open_.unsqueeze(-1)

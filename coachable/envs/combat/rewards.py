@@ -126,9 +126,12 @@ def style_weights(reward_scale: str) -> Tensor:
 
 
 def event_components() -> Tensor:
-    """Return which components make an event fire when they are above 0, (18, 44), 0 or 1."""
+    """Return which components make an event fire when they are above 0, (18, 44), 0 or 1.
+
+    Build-up is an event of its element, because what a policy has to learn first is to choose the ammunition and to hit.
+    """
     weights = style_weights("paper")
-    quiet = [COMPONENT_SLICES[name] for name in ("proximity", "lure", "ammo_change", "buildup")]
+    quiet = [COMPONENT_SLICES[name] for name in ("proximity", "lure", "ammo_change")]
     fires = (weights != 0).float()
     for piece in quiet:
         fires[:, piece] = 0.0
@@ -138,5 +141,6 @@ def event_components() -> Tensor:
 def style_counts(styles: Sequence[str]) -> Tensor:
     """Return which components count for each style, (len(styles), 44), 0 or 1: damage, or removals for part styles."""
     counts = event_components()
-    counts[:, COMPONENT_SLICES["part_damage"]] = 0.0
+    for name in ("part_damage", "buildup"):
+        counts[:, COMPONENT_SLICES[name]] = 0.0
     return counts[[STYLES.index(name) for name in styles]]

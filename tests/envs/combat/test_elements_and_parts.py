@@ -9,7 +9,7 @@ from coachable.envs.combat import CombatEnv
 from coachable.envs.combat import constants as c
 from coachable.envs.combat.damage import ACID, BURNING, FROST, PLASMA, SHOCK, Totals, damage_parts
 from coachable.envs.combat.state import ACTIVE, IDLE, STAGGERED
-from coachable.envs.combat.tables import MACHINES, WEAPONS, resistance
+from coachable.envs.combat.tables import MACHINES, STYLES, WEAPONS, resistance
 from coachable.envs.combat.traits import KIND
 from tests.envs.combat.still_fight import NEVER, NOTHING, SHOOT, act, act_plain, aim_at_body, hold, part, still_fight
 
@@ -79,6 +79,24 @@ def test_build_up_to_the_trigger_and_decay_are_counted_and_the_reset_is_not():
     aim_at_body(env)
     components, _ = act(env, SHOOT)
     assert part(components, "buildup")[..., ACID].item() == pytest.approx(0.1, abs=1e-3)
+
+
+def test_build_up_and_damage_in_the_state_are_events_of_an_element_and_decay_is_not():
+    def events(after):
+        return {STYLES[i] for i in after["events"][0].nonzero()[:, 0].tolist()}
+
+    env = still_fight("Slaughterspine")
+    env.state.gauge[ACID] = 0.5
+    assert events(act(env, NOTHING)[1]) == set()
+    hold(env, "Corrosive Blastsling")
+    aim_at_body(env)
+    components, after = act(env, SHOOT)
+    assert part(components, "state_damage").sum() == 0
+    assert events(after) == {"corrosive_blastsling", "acid"}
+    env.state.gauge[FROST] = 0.5  # it decays while the other state hurts
+    env.state.state_timer[ACID] = 300.0
+    env.state.source[ACID] = WEAPONS.index("Sunscourge")
+    assert events(act(env, NOTHING)[1]) == {"sunscourge", "acid"}
 
 
 @pytest.mark.parametrize("machine", list(MACHINES))

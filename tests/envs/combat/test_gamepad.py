@@ -2,9 +2,10 @@
 
 from itertools import product
 
+import pytest
 import torch
 
-from coachable.envs.combat.gamepad import GAMEPAD, HEADS, canonical_rows, read_pad
+from coachable.envs.combat.gamepad import GAMEPAD, HEADS, WheelDirection, canonical_rows, read_pad
 from tests.envs.combat.pressing import press
 
 
@@ -63,3 +64,33 @@ def test_a_stick_cannot_be_pushed_beyond_its_rim():
     assert canonical(action)[20:].tolist() == [1.0, -1.0, 1.0, -1.0]
     pad = read_pad(canonical_rows(action[:, None]))
     assert (pad.left_stick[:, 0].tolist(), pad.right_stick[:, 0].tolist()) == ([1.0, -1.0], [1.0, -1.0])
+
+
+def test_the_direction_on_the_wheel_as_harmonics():
+    angle = torch.linspace(-3.0, 3.0, 50)
+    actions = torch.stack([press("L1", right=(x, y)) for x, y in zip(angle.cos(), angle.sin(), strict=True)])
+    harmonics = WheelDirection(4)(actions)
+    assert harmonics.shape == (50, 8)
+    orders = torch.arange(1, 5)
+    turned = orders * angle[:, None]
+    expected = torch.stack((turned.cos(), turned.sin()), -1) * 1.01 ** (-0.5 * orders[:, None])
+    torch.testing.assert_close(harmonics, expected.flatten(-2))
+
+
+def test_no_direction_without_the_wheel_or_with_the_thumb_on_the_buttons():
+    stick = (0.6, -0.8)
+    assert WheelDirection()(press("L1", right=stick)).abs().min() > 0
+    thumb_up = torch.cat((press("L1")[:-2], torch.tensor(stick)))
+    for action in (press(right=stick), press("L2", right=stick), thumb_up):
+        assert WheelDirection()(action).abs().max() == 0
+
+
+def test_the_direction_on_the_wheel_is_differentiable_at_rest():
+    action = GAMEPAD.from_choices(torch.zeros(1, 6, dtype=torch.long), torch.zeros(1, 4))
+    action[:, [11, 19]] = 0.5  # as in relaxed actions
+    action.requires_grad_()
+    (gradient,) = torch.autograd.grad(WheelDirection()(action).sum(), action)
+    assert gradient.isfinite().all()
+    assert gradient[0, 22] > 0
+    with pytest.raises(ValueError, match="orders of WheelDirection"):
+        WheelDirection(0)
