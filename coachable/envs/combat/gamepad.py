@@ -110,8 +110,8 @@ class WheelDirection:
 
     One of 17 kinds of ammunition takes 20 or 30 degrees of the wheel. From the stick's two axes alone a critic learns
     late that its value changes there. The features are `L1 Re(z^k)` and `L1 Im(z^k)` for k = 1..K with
-    `z = (x + iy) / sqrt(x^2 + y^2 + 0.01)`, where the stick counts as (0, 0) while its thumb is on the buttons. They are
-    defined and differentiable for relaxed actions, too.
+    `z = (x + iy) / sqrt(x^2 + y^2 + 0.01)`, where the stick counts as (0, 0) while its thumb is on the buttons. They
+    are defined and differentiable for relaxed actions, too.
 
     Args:
         orders: K; the highest order tells directions half a period, 180 / K degrees, apart.

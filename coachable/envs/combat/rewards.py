@@ -128,7 +128,7 @@ def style_weights(reward_scale: str) -> Tensor:
 def event_components() -> Tensor:
     """Return which components make an event fire when they are above 0, (18, 44), 0 or 1.
 
-    Build-up is an event of its element, because what a policy has to learn first is to choose the ammunition and to hit.
+    Build-up is an event of its element, because a policy first has to learn to choose the ammunition and to hit.
     """
     weights = style_weights("paper")
     quiet = [COMPONENT_SLICES[name] for name in ("proximity", "lure", "ammo_change")]

@@ -183,7 +183,7 @@ def test_a_car_follows_its_sliders_and_asks_no_other_site(browser, stepped_site,
         assert browser.evaluate("document.querySelector('.asked').textContent").startswith("weight 0")
         angles = []
         for weight in (0.0, 5.0):
-            # One expression, so that the car cannot enter a corner between the request and the look at what was measured.
+            # One expression, so that the car cannot enter a corner between the request and the look at the measure.
             measured = browser.evaluate(
                 "(() => { for (const name of ['slip_angle_rear', 'slip_ratio_rear']) {"
                 " const slider = document.getElementById(`request-${name}`);"
