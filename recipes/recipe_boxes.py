@@ -233,7 +233,7 @@ def open_run_dir(run: Run, env: EnvBase, replay: ReplayBuffer) -> None:
         check_unused(run_dir)
     check_writable(run_dir)
     if settings.checkpoint.replay:  # two at a time: the old one is removed when the new one is complete
-        size = replay_bytes(env, stored_keys(run, env, replay), settings.replay_capacity)
+        size = replay_bytes(replay, env, stored_keys(run, env, replay))
         check_writable(run_dir, required_bytes=2 * size)
     (run_dir / "config.json").write_text(json.dumps(run.config, indent=1) + "\n", encoding="utf-8")
 

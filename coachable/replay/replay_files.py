@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import torch
 from tensordict import NestedKey
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
@@ -52,14 +53,17 @@ def read_replay(replay: ReplayBuffer, folder: Path) -> int:
     return filled
 
 
-def replay_bytes(env: EnvBase, keys: Iterable[NestedKey], capacity: int) -> int:
+def replay_bytes(replay: ReplayBuffer, env: EnvBase, keys: Iterable[NestedKey]) -> int:
     """Return the size of a full buffer [bytes].
 
     Args:
+        replay: The buffer, whose records may also hold the number of their table.
         env: Batched environment whose transitions are stored.
-        keys: Keys of the stored entries.
-        capacity: Number of records.
+        keys: Keys of the stored entries of a transition.
     """
-    record = env.fake_tensordict().select(*keys, strict=False)
-    values = record.values(include_nested=True, leaves_only=True)
-    return capacity * sum(v.element_size() * v.numel() for v in values) // max(1, record.numel())
+    transitions = env.fake_tensordict().select(*keys, strict=False)
+    values = transitions.values(include_nested=True, leaves_only=True)
+    record = sum(v.element_size() * v.numel() for v in values) // max(1, transitions.numel())
+    if hasattr(replay, "regions"):
+        record += torch.int64.itemsize
+    return replay.storage.max_size * record

@@ -8,6 +8,7 @@ from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from coachable.replay import EventTableBuffer, KeyEvents
+from coachable.replay.replay_files import replay_bytes, write_replay
 
 with warnings.catch_warnings():  # TorchRL warns about its own classes while it is imported
     warnings.simplefilter("ignore")
@@ -75,6 +76,18 @@ def test_batches_of_a_collector():
         assert buffer.write_count == 180
         check(buffer)
         assert buffer.sample()["table"].bincount().tolist() == [8, 8]
+
+
+def test_the_size_of_a_full_buffer_with_its_event_tables(tmp_path):
+    keys = ("observation", "action", ("next", "observation"), ("next", "events"), ("next", "done"))
+    buffer = EventTableBuffer({"default": 300, "hit": 90}, events=KeyEvents(["hit"]), event_horizon=2)
+    for data in Collector(Counter(), None, frames_per_batch=300, total_frames=600):
+        buffer.extend(data.select(*keys))
+    assert (len(buffer.table("default")), len(buffer.table("hit"))) == (300, 90)
+    write_replay(buffer, tmp_path)
+    written = sum(file.stat().st_size for file in tmp_path.glob("*.npy"))
+    headers = 128 * len(list(tmp_path.glob("*.npy")))
+    assert replay_bytes(buffer, Counter(), keys) == written - headers
 
 
 def test_n_step_sums_from_a_collector():
