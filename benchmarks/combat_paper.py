@@ -3,6 +3,7 @@
     python benchmarks/combat_paper.py grid AGENT...        damage matrix, wins, records, radars, parts removed
     python benchmarks/combat_paper.py pareto AGENT...      style score against wins as six weights fall
     python benchmarks/combat_paper.py pairs AGENT...       two weapons requested at once, in five mixtures (ours)
+    python benchmarks/combat_paper.py elements AGENT...    use of ammunition and states under requests (ours)
     python benchmarks/combat_paper.py apex AGENT           timeline and film under four requests, and brittle phases
     python benchmarks/combat_paper.py requests AGENT       how rare composed requests were in training
     python benchmarks/combat_paper.py tables               machines, weapons, heads and rewards beside the paper's
@@ -22,6 +23,7 @@ import numpy as np
 import paper_figures
 import paper_tables
 import torch
+from element_use import element_rows
 from fight_queue import fight_grid
 from reference_tables import reference_tables
 from request_odds import odds_rows
@@ -167,6 +169,16 @@ def apex(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
     print(f"{int(log.won.sum())} of {fights} fights under {', '.join(names)} won; number {chosen} is drawn")
 
 
+def elements(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
+    """A minute under each request for an elemental state."""
+    machines = machines_of(agents)
+    rows: Rows = []
+    for seed, (name, agent) in enumerate(agents.items()):
+        found = element_rows(domain, agent, machines, fights=fights, seconds=60.0, seed=seed)
+        rows += [{"agent": name} | row for row in found]
+    write_tables({"elements": rows}, out)
+
+
 def requests(_domain: Domain, agents: Agents, out: Path, _fights: int) -> None:
     space = next(iter(agents.values())).space
     composed = [pair for pair in COMPOSED if set(pair) <= set(space.names)]
@@ -182,7 +194,7 @@ def write_tables(tables: Mapping[str, Rows], out: Path) -> None:
             print(f"{name}: nothing that this agent has")
 
 
-FIGURES = {"grid": grid, "pareto": pareto, "pairs": pairs, "apex": apex, "requests": requests}
+FIGURES = {"grid": grid, "pareto": pareto, "pairs": pairs, "elements": elements, "apex": apex, "requests": requests}
 
 
 def main() -> None:

@@ -10,6 +10,7 @@ import paper_tables
 import pytest
 import torch
 from combat_bots import Bot
+from element_use import element_rows
 from fight_queue import fight_grid, run_fights
 from paper_tables import KINDS
 from reference_tables import head_rows, reference_tables
@@ -18,6 +19,7 @@ from request_odds import odds_rows, probability_of_pair
 from coachable.domain import load_domain
 from coachable.domains.combat.coached_fight import SOURCES, STATES
 from coachable.domains.combat.fights import PARTS
+from coachable.domains.combat.styles import combat_style_space
 from coachable.envs.combat.tables import MACHINES
 from coachable.training.weights import LoadedPolicy
 
@@ -77,6 +79,18 @@ def test_damage_in_a_state_is_divided_among_the_sources(domain):
         np.testing.assert_allclose(found["by_state"][:, :, number].sum(-1), found[state], rtol=1e-4, atol=1e-3)
     assert found["frost"].sum() > 0
     assert found["by_state"][:, SOURCES.index("sunscourge"), 2].sum() == pytest.approx(found["frost"].sum(), rel=1e-3)
+
+
+def test_use_of_ammunition_and_states(domain):
+    domain, agent = watched(domain, Bot("frost", "Advanced Frost Hunter Arrow"))
+    [row] = element_rows(domain, agent, ["Longleg"], fights=2, seconds=30.0, seed=0)
+    assert row["requested"] == "frost" and row["ammunition_otherwise"] is None
+    assert 0.85 < row["ammunition"] <= 1.0  # from the second step of a fight on
+    assert 0.2 < row["state"] < 0.9 and 0.2 < row["share"] < 1.0
+    assert row["state"] < row["begins"] * 12.0 / 60.0  # a state lasts 12 s, or until the end of the fight
+    assert row["damage_per_second"] > 0 and row["selection_per_second"] > 0 and row["build_up_per_second"] > 0
+    without = LoadedPolicy(agent.actor, combat_style_space(["melee"]), agent.config, {})
+    assert element_rows(domain, without, ["Longleg"], fights=1, seconds=1.0, seed=0) == []
 
 
 def test_a_grid_has_every_style_opponent_and_site(domain):
