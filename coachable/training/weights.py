@@ -206,11 +206,18 @@ def export_weights(checkpoint: Path | str, out: Path | str) -> Path:
             agent[part] = {name: value.clone() for name, value in agent[part].items()}
         counters = {"frames": state["loop"]["frames"], "updates": state["learner"]["updates"]}
     check_finite({"actor": agent["actor"], "critics": agent["critics"]}, source)
-    agent["config"] = {**agent["config"], **dict.fromkeys(_PATHS)}
+    agent["config"] = _without_paths(agent["config"])
     out = Path(out)
     with complete_file(out) as unfinished, space_named(out, tensor_bytes(agent)):
         save_state({"schema": SCHEMA_VERSION, **agent, "counters": counters}, unfinished)
     return out
+
+
+def _without_paths(config: dict[str, Any]) -> dict[str, Any]:
+    stages = config.get("stages")
+    if isinstance(stages, list):
+        config = {**config, "stages": [_without_paths(stage) if isinstance(stage, dict) else stage for stage in stages]}
+    return {**config, **dict.fromkeys(_PATHS)}
 
 
 def initialise_from(

@@ -32,3 +32,10 @@ def test_shipped_weights_act_in_their_domain(name):
         same = TensorDict({"observation": start["observation"][:1].expand(8, -1), "style": styles}, [8])
         loc = agent.actor(same)["loc"]
     assert (loc.std(0) > 0).any()  # the policy looks at the style
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_weights_name_no_path_of_the_machine_that_trained(name):
+    config = load_policy(name).config
+    for settings in (config, *config.get("stages", [])):
+        assert not any(settings.get(key) for key in ("run_dir", "resume", "init_from"))

@@ -249,6 +249,19 @@ def test_a_file_cannot_choose_what_is_called(make_train, tmp_path):
         load_policy(tmp_path / "harmful.pt")
 
 
+def test_weights_name_no_path_of_the_machine_that_trained(make_train, tmp_path):
+    train = make_train(total_frames=120)
+    describe, paths = (
+        train.describe,
+        {"run_dir": "/home/me/run", "resume": "/home/me/run", "init_from": "/home/me/other"},
+    )
+    train.describe = lambda: describe() | {"config": {"seed": 0, **paths, "stages": [{"seed": 0, **paths}]}}
+    train.run()
+    config = load_policy(export_weights(tmp_path / "run", tmp_path / "weights.pt")).config
+    none = {"seed": 0, "run_dir": None, "resume": None, "init_from": None}
+    assert config == none | {"stages": [none]}
+
+
 def test_initialise_from_copies_actor_critics_and_targets(make_train, echo_space, tmp_path):
     first = make_train(total_frames=120)
     first.run()
