@@ -62,6 +62,10 @@ class FightLog:
         self.player, self.machine, self.alive = record["player"], record["machine"], record["alive"]
         self.won = np.asarray((record["won"] & record["alive"]).any(0))
 
+    def best(self) -> int:
+        """Return the number of a fight that was won, or else of the one that left the machine with the least health."""
+        return int(np.where(self.alive, self.machine, 1.0).min(0).argmin())
+
     def timeline(self, fight: int) -> list[dict[str, Any]]:
         """Return one fight with a row per step, for `draw_timeline`."""
         rows = []

@@ -150,11 +150,11 @@ def pairs(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
 
 
 def apex(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
-    """Fights under four requests, of which one that was won is drawn and filmed, and fights for frost."""
+    """Fights under four requests, of which one that was won, or the one closest to it, is drawn; and fights for frost."""
     agent = next(iter(agents.values()))
     names = apex_fight.requests_in_turn(agent.space.names)
     log, _ = apex_fight.log_fights(domain, agent, names, fights=fights, seed=0, draw=None)
-    chosen = int(log.won.argmax())
+    chosen = log.best()
     renderer = domain.make_renderer(640, 436)
     _, frames = apex_fight.log_fights(domain, agent, names, fights=fights, seed=0, draw=(renderer, chosen))
     renderer.close()

@@ -253,7 +253,7 @@ def test_weights_name_no_path_of_the_machine_that_trained(make_train, tmp_path):
     train = make_train(total_frames=120)
     describe, paths = (
         train.describe,
-        {"run_dir": "/home/me/run", "resume": "/home/me/run", "init_from": "/home/me/other"},
+        {"run_dir": "/my/run", "resume": "/my/run", "init_from": "/my/other"},
     )
     train.describe = lambda: describe() | {"config": {"seed": 0, **paths, "stages": [{"seed": 0, **paths}]}}
     train.run()

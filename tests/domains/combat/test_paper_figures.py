@@ -183,6 +183,8 @@ def test_a_fight_under_requests_in_turn_is_logged_and_drawn(domain):
     assert len(frames) == log.alive[:, 1].sum() and frames[0].shape == (164, 160, 3)
     expected = ((1.0 - log.machine[:-1]) * 3).astype(int).clip(max=2)
     assert (log.request[1:] == np.maximum.accumulate(expected)).all()
+    lowest = [log.machine[log.alive[:, fight], fight].min() for fight in range(2)]
+    assert log.best() == int(np.argmin(lowest))
     rows = log.timeline(0)
     assert len(rows) == log.alive[:, 0].sum() and rows[-1]["ended"] == "not won"
     with pytest.raises(ValueError, match="expected at least one of"):
