@@ -150,7 +150,7 @@ def pairs(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
 
 
 def apex(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
-    """Fights under four requests, of which one that was won, or the one closest to it, is drawn; and fights for frost."""
+    """Fights under four requests, of which one that was won or came closest to it is drawn, and fights for frost."""
     agent = next(iter(agents.values()))
     names = apex_fight.requests_in_turn(agent.space.names)
     log, _ = apex_fight.log_fights(domain, agent, names, fights=fights, seed=0, draw=None)
