@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor
 
 from coachable.domains.combat.coached_fight import STATES
 from coachable.envs.combat.env import COMPONENTS_KEY
 from coachable.envs.combat.player import element_of
-from coachable.envs.combat.rewards import COMPONENT_SLICES, style_weights
+from coachable.envs.combat.rewards import COMPONENT_SLICES, NUM_COMPONENTS, style_weights
 from coachable.envs.combat.tables import ELEMENTS, SITES, STYLES
 from coachable.envs.combat.traits import AMMO_SLOTS, ammo_table
 from coachable.training.rollout import Rollout
@@ -49,9 +48,7 @@ def element_rows(
     fight = [(name, machine, site) for name in names for machine in machines for site in SITES for _ in range(fights)]
     if not fight:
         return []
-    theta = torch.zeros(len(fight), agent.space.dim)
-    for row, (name, _, _) in enumerate(fight):
-        theta[row, agent.space.names.index(name)] = agent.space[name].high
+    theta = agent.space.make_all({name: agent.space[name].high} for name, _, _ in fight)
     env = domain.styled_env(agent.space, len(fight), seed=seed, num_enemies=1)
     simulation: Any = env.base_env
     simulation.assign([(machine,) for _, machine, _ in fight], [site for _, _, site in fight])
@@ -60,11 +57,11 @@ def element_rows(
     ammo = ammo_table(torch.device("cpu"))
     steps = max(1, round(seconds / domain.control_step))
     selected, active, begun = (torch.zeros(len(fight), len(ELEMENTS)) for _ in range(3))
-    components: Tensor | float = 0.0
+    components = torch.zeros(len(fight), NUM_COMPONENTS)
     for _ in range(steps):
         before = simulation.state.state_timer[:, 0].T > 0
         transition = rollout.step(agent.actor, theta)
-        components = components + transition.get(("next", COMPONENTS_KEY))
+        components += transition.get(("next", COMPONENTS_KEY))
         state = simulation.state
         during = state.state_timer[:, 0].T > 0
         selected += element_of(state.weapon * AMMO_SLOTS + state.section, ammo).T
@@ -74,8 +71,11 @@ def element_rows(
         if done.any():
             rollout.begin_rows(done)
     env.close()
-    assert isinstance(components, Tensor)
     weights = style_weights(agent.config["env"].get("reward_scale", "sim"))
+
+    def otherwise(values: torch.Tensor) -> float | None:
+        return float(values[~own, element].mean()) / steps if len(names) > 1 else None
+
     rows = []
     for name in names:
         element, own = ELEMENTS.index(name), torch.tensor([asked == name for asked, _, _ in fight])
@@ -89,9 +89,9 @@ def element_rows(
             {
                 "requested": name,
                 "ammunition": float(selected[own, element].mean()) / steps,
-                "ammunition_otherwise": float(selected[~own, element].mean()) / steps if len(names) > 1 else None,
+                "ammunition_otherwise": otherwise(selected),
                 "state": float(active[own, element].mean()) / steps,
-                "state_otherwise": float(active[~own, element].mean()) / steps if len(names) > 1 else None,
+                "state_otherwise": otherwise(active),
                 "begins": float(begun[own, element].mean()) / seconds * 60.0,
                 "share": float(components[own][:, COMPONENT_SLICES["state_damage"]][:, element].sum() / damage),
             }
