@@ -36,6 +36,7 @@ from coachable.envs.combat.tables import MACHINES, UNSEEN_MACHINES
 from coachable.evaluation.statistics import rank_correlation
 from coachable.evaluation.style_grid import write_csv
 from coachable.evaluation.video import write_video
+from coachable.styles import StyleSpace
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
 PARETO = ("melee", "sunscourge", "icestorm_boltblaster", "frost", "plasma", "carjas_bane")  # ours; the paper names none
@@ -50,6 +51,7 @@ COMPOSED = [("corrosive_blastsling", element) for element in ("acid", "plasma", 
 
 Agents = Mapping[str, LoadedPolicy]
 Rows = list[dict[str, Any]]
+Cells = list[dict[str, float]]
 
 
 def load(sources: Sequence[str]) -> tuple[Domain, dict[str, LoadedPolicy]]:
@@ -66,30 +68,39 @@ def machines_of(agents: Agents) -> list[str]:
     return list(next(iter(agents.values())).config["env"].get("machines") or MACHINES)
 
 
+def space_of(agents: Agents) -> StyleSpace:
+    return next(iter(agents.values())).space
+
+
+def fight_grids(
+    domain: Domain, agents: Agents, cells: Cells, opponents: Sequence[tuple[str, ...]], fights: int, what: str
+) -> list[dict[str, np.ndarray]]:
+    """The results of `fight_grid`, one per agent."""
+    return [
+        fight_grid(domain, agent, cells, opponents, fights=fights, seed=seed, progress=f"{name}: {what}")
+        for seed, (name, agent) in enumerate(agents.items())
+    ]
+
+
 def grid(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
     """Fights in every style against every machine, the unseen ones and pairs."""
-    space = next(iter(agents.values())).space
+    space = space_of(agents)
     cells = single_styles(space) + composed_styles(space)
     labels = [style_label(cell) for cell in cells]
     machines = machines_of(agents)
-    known = [(name,) for name in machines]
-    alone, twice = [(name,) for name in UNSEEN_MACHINES], [(name, name) for name in PAIRS]
-    found: list[list[Mapping[str, np.ndarray]]] = [[], [], []]
-    for seed, (name, agent) in enumerate(agents.items()):
-        for results, opponents, what in zip(found, (known, alone, twice), ("machines", "unseen", "pairs"), strict=True):
-            results.append(
-                fight_grid(domain, agent, cells, opponents, fights=fights, seed=seed, progress=f"{name}: {what}")
-            )
-    wins = paper_tables.win_rows(found[0], labels, machines)
-    wins += paper_tables.win_rows(found[1], labels, list(UNSEEN_MACHINES))
-    wins += paper_tables.win_rows(found[2], labels, [f"two {name}" for name in PAIRS])
+    known = fight_grids(domain, agents, cells, [(name,) for name in machines], fights, "machines")
+    unseen = fight_grids(domain, agents, cells, [(name,) for name in UNSEEN_MACHINES], fights, "unseen")
+    twice = fight_grids(domain, agents, cells, [(name, name) for name in PAIRS], fights, "pairs")
+    wins = paper_tables.win_rows(known, labels, machines)
+    wins += paper_tables.win_rows(unseen, labels, list(UNSEEN_MACHINES))
+    wins += paper_tables.win_rows(twice, labels, [f"two {name}" for name in PAIRS])
     tables: dict[str, Rows] = {
-        "matrix": paper_tables.matrix_rows(found[0], labels),
-        "obedience": paper_tables.obedience_rows(found[0], labels),
+        "matrix": paper_tables.matrix_rows(known, labels),
+        "obedience": paper_tables.obedience_rows(known, labels),
         "wins": wins,
-        "records": paper_tables.record_rows(found[0], labels, machines),
-        "radars": paper_tables.radar_rows(found[0], labels, list(agents)),
-        "parts": paper_tables.part_rows(found[0], labels),
+        "records": paper_tables.record_rows(known, labels, machines),
+        "radars": paper_tables.radar_rows(known, labels, list(agents)),
+        "parts": paper_tables.part_rows(known, labels),
     }
     write_tables(tables, out)
     damage = [row for row in tables["matrix"] if row["requested"] not in PARTS]  # parts have a figure of their own
@@ -103,18 +114,14 @@ def grid(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
 
 def pareto(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
     """Fights at weights from 0 to the maximum, against every machine."""
-    space = next(iter(agents.values())).space
+    space = space_of(agents)
     measured = [name for name in space.names if name in (*SOURCES, *STATES)]
     styles = [name for name in PARETO if name in measured]
     styles += [name for name in measured if name not in styles][: len(PARETO) - len(styles)]
     neutral = dict.fromkeys(space.names, 0.0)
     shares = np.linspace(0.0, 1.0, POINTS)
     cells = [neutral | {name: float(share * space[name].high)} for name in styles for share in shares]
-    opponents = [(name,) for name in machines_of(agents)]
-    results = [
-        fight_grid(domain, agent, cells, opponents, fights=fights, seed=seed, progress=f"{name}: weights")
-        for seed, (name, agent) in enumerate(agents.items())
-    ]
+    results = fight_grids(domain, agents, cells, [(name,) for name in machines_of(agents)], fights, "weights")
     rows: Rows = []
     for index, cell in enumerate(cells):
         style = styles[index // POINTS]
@@ -126,7 +133,7 @@ def pareto(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
 
 def pairs(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
     """Fights against every machine in which two weapons are requested at once."""
-    space = next(iter(agents.values())).space
+    space = space_of(agents)
     neutral = dict.fromkeys(space.names, 0.0)
     mixtures = [(*pair, share) for pair in PAIRED if set(pair) <= set(space.names) for share in SHARES]
     cells = [
@@ -135,11 +142,7 @@ def pairs(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
     ]
     if not cells:
         raise SystemExit("the agents have no two of the weapons that are paired")
-    opponents = [(name,) for name in machines_of(agents)]
-    results = [
-        fight_grid(domain, agent, cells, opponents, fights=fights, seed=seed, progress=f"{name}: mixtures")
-        for seed, (name, agent) in enumerate(agents.items())
-    ]
+    results = fight_grids(domain, agents, cells, [(name,) for name in machines_of(agents)], fights, "mixtures")
     rows = paper_tables.mixture_rows(results, mixtures)
     write_tables({"pairs": rows}, out)
     paper_figures.draw_mixtures(rows, out / "pairs.png")
@@ -180,7 +183,7 @@ def elements(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
 
 
 def requests(_domain: Domain, agents: Agents, out: Path, _fights: int) -> None:
-    space = next(iter(agents.values())).space
+    space = space_of(agents)
     composed = [pair for pair in COMPOSED if set(pair) <= set(space.names)]
     write_tables({"requests": odds_rows(space, composed, draws=1_000_000)}, out)
 
