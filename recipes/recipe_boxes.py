@@ -123,9 +123,11 @@ def make_loss(run: Run, actor: nn.Module, critics: list[nn.Module], env: EnvBase
         env: Its action specification bounds the policy.
 
     Raises:
-        ValueError: If the loss does not serve the actions.
+        ValueError: If the loss does not serve the actions, or needs more critics.
     """
     settings = run.settings
+    if settings.loss._target_.endswith(".SACLoss") and len(critics) < 2:
+        raise ValueError(f"network.num_critics is {len(critics)}: expected at least 2 with loss=sac")
     buttons = settings.network.actor.get("heads", {}).get("categorical")
     if settings.loss._target_.endswith(".SACLoss") and buttons:
         raise ValueError(f"loss=sac serves continuous actions only, {settings.domain} has buttons: expected cat_rac")
@@ -234,7 +236,8 @@ def open_run_dir(run: Run, env: EnvBase, replay: ReplayBuffer) -> None:
     check_writable(run_dir)
     if settings.checkpoint.replay:  # two at a time: the old one is removed when the new one is complete
         size = replay_bytes(replay, env, stored_keys(run, env, replay))
-        check_writable(run_dir, required_bytes=2 * size)
+        kept = sum(file.stat().st_size for file in run_dir.glob("checkpoints/*/replay/*"))
+        check_writable(run_dir, required_bytes=max(0, 2 * size - kept))
     (run_dir / "config.json").write_text(json.dumps(run.config, indent=1) + "\n", encoding="utf-8")
 
 

@@ -47,6 +47,17 @@ _FIXED = (
     "style_reward",
     "replay",
     "replay_capacity",
+    "mirror",
+    "impersonation",
+    # The saved settings of loss and replay contain the values of these.
+    "alpha",
+    "entropy_samples",
+    "n_steps",
+    "events",
+    "event_capacity",
+    "event_share",
+    "event_horizon",
+    "critic_support",
     "init_from",
     "init_new_observations",
     "stage",
@@ -130,6 +141,8 @@ def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
     Raises:
         SystemExit: If a key, a choice or a type is wrong; the message lists the valid choices.
     """
+    if any(argument.startswith("seeds=") for argument in arguments):
+        raise SystemExit(f"error: several seeds are trained with coachable train {config_name} seeds=0,1,2")
     options, given, overrides = _hydra_arguments(config_name, arguments)
     jobs = [given]
     if options.multirun:
@@ -244,7 +257,7 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
                 for key, value in said.items():
                     OmegaConf.update(stage, key, value, merge=False)
             cfg = OmegaConf.create(OmegaConf.to_container(before, resolve=True, throw_on_missing=True))
-    elif cfg.get("stages"):
+    elif cfg.get("stages") or cfg.stage is not None:
         stages = composed_stages(cfg, {key: OmegaConf.select(cfg, key) for key in _said(overrides)})
         cfg = _chosen_stage(cfg, stages)
     config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)  # pyright: ignore
@@ -298,6 +311,11 @@ def announce(config: dict[str, Any], trainer: Trainer) -> None:
     if later:
         estimate += f"; with the stages that follow about {time_left + later:.1f} h"
     print(estimate)
+    if remaining and settings.train.warmup_frames >= settings.train.total_frames:
+        print(
+            f"warning: no update will be made, because train.warmup_frames={settings.train.warmup_frames:,} is not "
+            f"below train.total_frames={settings.train.total_frames:,}"
+        )
     print(f"Writing to {settings.run_dir}; Ctrl-C saves a checkpoint and stops")
 
 

@@ -69,7 +69,7 @@ class StyleWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         self.space = style_reward.space
         self.style_reward = style_reward
         self.features = features
-        self.sampler = self.space.sampler if sampler is None else sampler
+        self.sampler = self.space.sampler if sampler is None else self.space.with_sampler(sampler).sampler
         self.flat = flat
         style = spaces.Box(self.space.low.numpy(), self.space.high.numpy(), dtype=np.float32)
         if flat:

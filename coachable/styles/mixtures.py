@@ -95,7 +95,7 @@ def with_requests(space: StyleSpace, *, positive: float = 0.25, full: float = 0.
 
 
 def with_extremes(
-    space: StyleSpace, *, share: float = 0.5, shared: bool = True, only: Sequence[str] | None = None
+    space: StyleSpace, *, share: float = 0.5, shared: bool = True, only: str | Sequence[str] | None = None
 ) -> Sampler:
     """Return the space's own sampler mixed with styles in which every parameter is at one of its bounds.
 
@@ -104,8 +104,8 @@ def with_extremes(
     Args:
         space: Style space of weights and set-points.
         share: Probability that every parameter is at its lower or its upper bound, each equally likely.
-        only: Names of the parameters that are at a bound in that share; the others are then at their default. By
-            default all.
+        only: Name or names of the parameters that are at a bound in that share; the others are then at their
+            default. By default all.
         shared: Whether rows that share a style in the space's own sampler (`Shared`), such as the cars of a race, still
             share it. Otherwise each row has its own style, so that agents meet others of other styles.
 
@@ -117,7 +117,7 @@ def with_extremes(
     """
     SHARE.check("share", share)
     _require((Weight, Setpoint), space, "sampler with_extremes asks for bounds, which {} cannot have (a choice)")
-    chosen = space.names if only is None else tuple(only)
+    chosen = space.names if only is None else (only,) if isinstance(only, str) else tuple(only)
     if unknown := sorted(set(chosen) - set(space.names)):
         raise ValueError(f"extremes of {', '.join(unknown)} asked for: expected some of {', '.join(space.names)}")
     bounds = zip(space.names, space.low.tolist(), space.high.tolist(), space.default.tolist(), strict=True)

@@ -6,7 +6,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from coachable.styles.space import StyleSpace
-from coachable.styles.terms import Features, StyleTerm, WeightedFeature, WeightedSum
+from coachable.styles.terms import ChoiceTolerance, Features, StyleTerm, WeightedFeature, WeightedSum
 
 __all__ = ["StyleReward"]
 
@@ -118,6 +118,9 @@ def _check_terms(space: StyleSpace, terms: Mapping[str, Any], scales: Mapping[st
         unknown = [p for p in parameters if p not in space]
         if unknown:
             problems.append(f"term {name!r} reads {unknown}, which the space lacks")
+        elif isinstance(term, ChoiceTolerance) and term.num_options != space[parameters[0]].width:
+            options = space[parameters[0]].width
+            problems.append(f"term {name!r} has bounds for {term.num_options} options, {parameters[0]} has {options}")
         read.update(parameters)
     unread = [p for p in space.names if p not in read]
     if unread:

@@ -285,7 +285,8 @@ class StyleSpace:
             if entry.get("kind") not in _KINDS:
                 raise ValueError(f"style parameter of kind {entry.get('kind')!r}: expected one of {sorted(_KINDS)}.")
             parameters.append(_KINDS[entry["kind"]](**arguments))
-        return cls(parameters, Sampler.from_dict(description["sampler"]), description.get("name", ""))
+        sampler = None if description["sampler"] is None else Sampler.from_dict(description["sampler"])
+        return cls(parameters, sampler, description.get("name", ""))
 
     def to_json(self) -> str:
         """Return the description of `to_dict` as a JSON string."""

@@ -254,7 +254,7 @@ class ChoiceTolerance:
                 f"ChoiceTolerance for {parameter!r} has bounds of shapes {tuple(lower.shape)}, {tuple(upper.shape)}: "
                 "expected two (n_options, k) matrices with lower <= upper."
             )
-        self.parameters = (parameter,)
+        self.parameters, self.num_options = (parameter,), len(lower)
         self.key, self.margin, self.sigmoid, self.value_at_margin = key, margin, sigmoid, value_at_margin
         # Both bounds are in one table (n_options, 2k), so that a step needs one look-up instead of two.
         self._bounds = {lower.device: torch.cat([lower, upper], dim=-1)}

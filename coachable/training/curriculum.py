@@ -50,6 +50,8 @@ class Curriculum:
         else:
             check_unused(self.run_dir)
             self.number = 0
+        for later in range(self.number + 1, len(self.stages)):
+            check_unused(self.folder(later))
         # The rounding of sums depends on the number of threads, so all stages and resumptions use the same.
         learner = share_threads(**self.stages[0]["threads"]).learner
         for stage in self.stages:
@@ -64,8 +66,13 @@ class Curriculum:
         """
         while True:
             latest = self.train.run()
-            if self.train.frames < self.train.settings.total_frames or self.number + 1 == len(self.stages):
+            if self.train.stopped or self.number + 1 == len(self.stages):
                 return latest
+            if not _is_finished(str(self.folder(self.number)), self.stages[self.number]):
+                raise CheckpointError(
+                    f"the end of stage {self.stages[self.number]['stage']} was not saved, and the next stage starts "
+                    f"from it. When there is space again, continue with resume={self.run_dir}"
+                )
             self.number += 1
             # The next stage needs the memory of this one's replay buffer. When a SerialEnv is collected, TorchRL also
             # raises the number of threads, which must happen before the next stage sets it.

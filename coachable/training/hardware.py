@@ -82,7 +82,10 @@ def pick_device(name: str = "auto") -> torch.device:
         >>> pick_device("cpu")
         device(type='cpu')
     """
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else torch.device(name)
+    try:
+        device = torch.device("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else torch.device(name)
+    except RuntimeError:
+        raise ValueError(f"device={name}: expected auto, cpu, cuda or cuda:0") from None
     if device.type != "cuda":
         return device
     if not torch.cuda.is_available():

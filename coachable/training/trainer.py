@@ -110,10 +110,13 @@ class Trainer:
         self.evaluate = evaluate
         self.replay_keys = replay_keys
         self.frames = 0
+        self.stopped = False  # whether a signal asked the last run to end
         self.pending_updates = 0.0  # updates that utd_ratio asks for and that have not been made yet
         parts = ("collect", "store", "update", "evaluate", "log", "checkpoint", "wait")
         self.seconds: dict[str, float] = dict.fromkeys(parts, 0.0)
         self._device = next(learner.loss_module.parameters()).device
+        for factor in (settings.entropy_factor(settings.total_frames), 1.0):
+            learner.scale_entropy_weight(factor)  # refuses now what it cannot scale later
         self._throttle = Throttle(settings.throttle)
         self._episodes = EpisodeStatistics(style_terms)
         self._losses = Means()
@@ -142,16 +145,15 @@ class Trainer:
             self.collector.after_update(self.learner.updates)  # of a checkpoint, if this training is resumed
         try:
             self.learner.check_weights()
-            with stop_signals() as stop, worker_errors(self.collector):
-                batches = iter(self.collector)
-                while self.frames < self.settings.total_frames and self._await_batch(stop):
-                    data = self._collect(batches)
-                    self._store(data)
-                    self._update(data.numel(), stop)
-                    self._evaluate_if_due()
-                    self._log_if_due()
-                    self._checkpoint_if_due()
+            with stop_signals() as stop:
+                try:
+                    with worker_errors(self.collector):
+                        self._loop(stop)
+                except WorkerError:
+                    if not stop.is_set():  # a signal to the whole process group ends the workers, too
+                        raise
                 self._finish(interrupted=stop.is_set())
+                self.stopped = stop.is_set()
         except (NonFiniteError, WorkerError) as error:
             error.args = (f"{error} The training stopped at env-step {self.frames:,}, without another checkpoint.",)
             raise
@@ -159,6 +161,16 @@ class Trainer:
             self.progress.close()
             self.collector.shutdown()
         return self._latest
+
+    def _loop(self, stop: threading.Event) -> None:
+        batches = iter(self.collector)
+        while self.frames < self.settings.total_frames and self._await_batch(stop):
+            data = self._collect(batches)
+            self._store(data)
+            self._update(data.numel(), stop)
+            self._evaluate_if_due()
+            self._log_if_due()
+            self._checkpoint_if_due()
 
     def _await_batch(self, stop: threading.Event) -> bool:
         """Wait until workers have a batch or a signal asks to stop; return whether the training goes on."""

@@ -243,7 +243,7 @@ def initialise_from(
     file = _locate(path_or_domain)
     state = _read_agent(file)
     with refusing(file, "a style space"):
-        _check_space({**state["space"], "sampler": space.to_dict()["sampler"]}, space, file)
+        _check_space({**state["space"], "sampler": None}, StyleSpace(space.parameters, name=space.name), file)
     present = loss_module.state_dict()
     for part, fresh in (("actor", _tensors(actor.state_dict())), ("critics", _tensors(present, _CRITICS))):
         if new_observations:

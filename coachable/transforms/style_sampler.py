@@ -51,17 +51,13 @@ class StyleSampler(Transform):
             `CoachableEnv.set_seed` also sets it.
 
     Raises:
-        ValueError: If the sampler's dimension is not the space's.
+        ValueError: If the sampler does not fit the space.
     """
 
     def __init__(self, space: StyleSpace, sampler: Sampler | None = None, seed: int | None = None) -> None:
         super().__init__(in_keys=[], out_keys=[STYLE])
         self.space = space
-        self.sampler = space.sampler if sampler is None else sampler
-        if self.sampler.dim != space.dim:
-            raise ValueError(
-                f"sampler has dimension {self.sampler.dim}, the style space {list(space.names)} has {space.dim}."
-            )
+        self.sampler = space.sampler if sampler is None else space.with_sampler(sampler).sampler
         self.generator = torch.Generator()
         self._held: Tensor | None = None
         self._seeded = False

@@ -48,6 +48,8 @@ def test_finished_trainings_are_shown_and_not_repeated(tmp_path, capsys):
     for zero, one, mean, _ in rows.values():
         assert mean == pytest.approx((zero + one) / 2, rel=1e-3)
     assert not list(tmp_path.glob("*.log"))
+    assert main(["train", "rare_targets", *TINY, "loss=qr_sac", "seeds=0,1", f"run_dir={tmp_path}"]) == 2
+    assert re.search(r"holds trainings with .*: expected the same settings", capsys.readouterr().err)
     assert [(tmp_path / f"seed_{seed}" / "metrics.csv").read_text() for seed in (0, 1)] == before
 
 

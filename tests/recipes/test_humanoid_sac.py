@@ -6,11 +6,12 @@ import json
 import subprocess
 import sys
 from dataclasses import fields
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 import torch
-from recipe_config import checked_arguments, compose_config
+from recipe_config import announce, checked_arguments, compose_config
 
 from coachable.domains.humanoid import humanoid_style_reward
 from coachable.envs.humanoid import HumanoidEnv
@@ -130,6 +131,29 @@ def test_the_bare_command_chooses_a_preset():
     assert _compose()["preset"] == chosen.removeprefix("preset=humanoid_sac/")
 
 
+def test_several_seeds_are_for_the_command():
+    with pytest.raises(SystemExit, match="coachable train humanoid_sac seeds=0,1,2"):
+        checked_arguments("humanoid_sac", ["preset=smoke", "seeds=0,1"])
+
+
+def test_one_critic_is_refused_where_the_loss_takes_the_smaller_value(tmp_path):
+    config = compose_config("humanoid_sac", ["preset=smoke", "network.num_critics=1", f"run_dir={tmp_path}"])
+    with pytest.raises(ValueError, match=r"network.num_critics is 1: expected at least 2 with loss=sac"):
+        import_module("humanoid_sac").build(config)
+
+
+def test_a_learned_entropy_weight_that_is_to_be_annealed_is_refused_at_the_start(tmp_path):
+    settings = ["loss.fixed_alpha=false", "train.anneal=0.5", "train.anneal_entropy=0.4", f"run_dir={tmp_path}"]
+    with pytest.raises(ValueError, match="no fixed entropy weight to scale"):
+        import_module("humanoid_sac").build(compose_config("humanoid_sac", ["preset=smoke", *settings]))
+
+
+def test_a_training_too_short_for_an_update_says_so(tmp_path, capsys):
+    config = compose_config("rare_targets", ["preset=smoke", "train.total_frames=100", f"run_dir={tmp_path}"])
+    announce(config, import_module("rare_targets").build(config))
+    assert "warning: no update will be made, because train.warmup_frames=" in capsys.readouterr().out
+
+
 def test_hydras_options_pass_through():
     arguments = checked_arguments("humanoid_sac", ["preset=cpu", "--cfg", "job", "train.total_frames=1e6"])
     assert arguments == ["--cfg", "job", "train.total_frames=1e6", "preset=humanoid_sac/cpu"]
@@ -169,6 +193,8 @@ def test_a_resumed_run_keeps_its_configuration(tmp_path):
     assert config["run_dir"] == str(tmp_path / "run")
     with pytest.raises(SystemExit, match=r"gamma cannot change in a resumed run: start a new one with init_from="):
         _compose(f"resume={tmp_path / 'run'}", "gamma=0.9")
+    with pytest.raises(SystemExit, match=r"n_steps, alpha cannot change in a resumed run"):
+        _compose(f"resume={tmp_path / 'run'}", "n_steps=5", "alpha=0.5")
     with pytest.raises(ValueError, match=r"train.batch_size=0: expected a whole number of at least 1"):
         _compose(f"resume={tmp_path / 'run'}", "train.batch_size=0")
     with pytest.raises(SystemExit, match="a resumed run keeps its preset"):

@@ -76,15 +76,16 @@ def test_every_recipe_trains_with_a_worker(recipe, tmp_path, quick_starts):
     assert not multiprocessing.active_children()
 
 
-def test_ctrl_c_ends_workers_and_training(tmp_path, quick_starts):
-    """It reaches the workers, too, who leave it to the training process."""
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_to_all_processes_ends_workers_and_training(number, tmp_path, quick_starts):
+    """Workers leave SIGINT to the training process, and SIGTERM ends them."""
     train = build("humanoid_sac", tmp_path, "collector.num_collectors=2", "train.total_frames=10_000")
     workers = [worker.pid for worker in train.collector.procs]
 
     def interrupt():
         if train.learner.updates >= 4:
             for process in (*workers, os.getpid()):
-                os.kill(process, signal.SIGINT)
+                os.kill(process, number)
 
     distances = watch_actions(train, interrupt)
     train.run()

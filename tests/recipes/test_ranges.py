@@ -158,7 +158,7 @@ def test_shares_above_one():
         with pytest.raises(ValueError, match="expected a number in"):
             compose_config("rare_targets", ["preset=smoke", argument])
     with pytest.raises(ValueError, match=r"sampler.share=2: expected a number in \[0, 1\]"):
-        compose_config("racing_qr_sac", ["preset=smoke", "sampler=with_extremes", "+sampler.share=2"])
+        compose_config("racing_qr_sac", ["preset=smoke", "sampler=with_extremes", "sampler.share=2"])
 
 
 def test_whole_numbers_may_be_written_with_an_exponent():

@@ -1,15 +1,16 @@
 """A training in stages: one run folder, resumed in any stage, bit for bit."""
 
+import os
 import shutil
+import signal
 import weakref
 from importlib import import_module
-from types import SimpleNamespace
 
 import pytest
 import torch
 from recipe_config import compose_config, start_training
 
-from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
+from coachable.training.checkpoint import CheckpointError, CheckpointStore, find_checkpoint, read_state
 from coachable.training.curriculum import Curriculum
 from coachable.training.trainer import Trainer
 from tests.random_kills import differences
@@ -75,11 +76,49 @@ def test_a_stage_starts_from_the_weights_of_the_one_before(tmp_path):
         start(*TINY, STAGES, f"run_dir={tmp_path}")
 
 
-def test_a_stage_is_forgotten_before_the_next_one_is_built(tmp_path):
+def test_a_signal_at_the_end_of_a_stage_ends_the_training(whole, tmp_path, monkeypatch):
+    run, evaluate = tmp_path / "run", Trainer._evaluate
+
+    def interrupted(train):
+        if (train.describe()["config"]["stage"], train.frames) == ("first", 24):
+            os.kill(os.getpid(), signal.SIGTERM)
+        evaluate(train)
+
+    monkeypatch.setattr(Trainer, "_evaluate", interrupted)
+    start(*TINY, STAGES, f"run_dir={run}").run()
+    assert [folder.name for folder in (run / "stages").iterdir()] == ["1_first"]
+    start(f"resume={run}").run()
+    assert differences(run / "stages" / "2_second", whole / "stages" / "2_second") in ([], ["metrics/episodes"])
+
+
+@pytest.mark.filterwarnings("ignore:.*was not written")
+def test_a_stage_whose_end_is_not_saved_is_followed_by_none(tmp_path, monkeypatch):
+    run, save = tmp_path / "run", CheckpointStore.save
+
+    def fail(store, state, *arguments):
+        if state["loop"]["frames"] >= 16:
+            raise OSError(28, "No space left on device")
+        return save(store, state, *arguments)
+
+    monkeypatch.setattr(CheckpointStore, "save", fail)
+    with pytest.raises(CheckpointError, match="the end of stage first was not saved"):
+        start(*TINY, STAGES, f"run_dir={run}").run()
+    monkeypatch.setattr(CheckpointStore, "save", save)
+    start(f"resume={run}").run()
+    assert (run / "stages" / "2_second" / "checkpoints" / "LATEST").exists()
+
+
+def test_an_earlier_stage_is_not_repeated_into_a_later_one(whole):
+    earlier = sorted((whole / "stages" / "1_first" / "checkpoints").glob("frames_*"))[-2]
+    with pytest.raises(CheckpointError, match="2_second holds a run already"):
+        start(f"resume={earlier}")
+
+
+def test_a_stage_is_forgotten_before_the_next_one_is_built(tmp_path, monkeypatch):
     """Its replay buffer takes memory, and TorchRL raises the number of threads when its environments are closed."""
 
     class Stage:
-        frames, settings = 1, SimpleNamespace(total_frames=1)
+        stopped = False
 
         def __init__(self):
             self.cycle = self
@@ -96,6 +135,7 @@ def test_a_stage_is_forgotten_before_the_next_one_is_built(tmp_path):
         built.append(config["stage"])
         return stage
 
+    monkeypatch.setattr("coachable.training.curriculum._is_finished", lambda *_: True)
     threads = {"simulator": 1, "learner": 1}
     stages = [{"stage": name, "threads": threads} for name in ("first", "second", "third")]
     Curriculum({"run_dir": str(tmp_path), "stages": stages, "init_from": None, "resume": None}, build).run()
@@ -113,6 +153,8 @@ def test_one_stage_can_be_trained_on_its_own():
     assert config["stages"] == [] and config["alpha"] == 0.2 and config["train"]["total_frames"] == 40
     with pytest.raises(ValueError, match=r"stage=third does not exist.* Valid: first, second"):
         compose_config("rare_targets", [*TINY, STAGES, "stage=third"])
+    with pytest.raises(ValueError, match=r"stage=third does not exist"):
+        compose_config("rare_targets", [*TINY, "stage=third"])
 
 
 @pytest.mark.parametrize(

@@ -276,9 +276,10 @@ def test_extremes_are_drawn_beside_the_spaces_own_styles(copies, shared):
     assert same == 1.0 if copies == 3 and shared else same == pytest.approx(4 * 0.1**2, abs=0.005)
 
 
-def test_extremes_of_some_parameters_leave_the_others_at_their_default():
+@pytest.mark.parametrize("only", ["a", ["a"]])
+def test_extremes_of_some_parameters_leave_the_others_at_their_default(only):
     space = StyleSpace([Setpoint("a", 0.0, 2.0), Setpoint("b", 0.0, 1.0, default=0.2), Weight("c", -1.0, 1.0)])
-    theta = with_extremes(space, share=0.4, only=["a"]).sample((N,), torch.Generator().manual_seed(0))
+    theta = with_extremes(space, share=0.4, only=only).sample((N,), torch.Generator().manual_seed(0))
     first, second, third = theta.unbind(-1)
     rest = (second == space.default[1]) & (third == 0.0)
     for bound in (0.0, 2.0):

@@ -162,6 +162,8 @@ def test_choice_tolerance_uses_the_bounds_of_the_option():
     torch.testing.assert_close(term(features, style), torch.tensor([(1 + 0.55) / 2, 0.0, 1.0]))
     with pytest.raises(ValueError, match="lower <= upper"):
         ChoiceTolerance("pose", 0, lower=[[1.0]], upper=[[0.0]], margin=1.0)
+    with pytest.raises(ValueError, match="term 'pose' has bounds for 2 options, pose has 3"):
+        StyleReward(StyleSpace([Choice("pose", ("a", "b", "c"))]), {"pose": term})
 
 
 def combat_reward() -> StyleReward:

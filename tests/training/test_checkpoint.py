@@ -14,6 +14,7 @@ from coachable.files import save_state
 from coachable.replay import EventTableBuffer, KeyEvents
 from coachable.replay.replay_files import read_replay, write_replay
 from coachable.styles import Setpoint, StyleSpace
+from coachable.styles.samplers import PointMass, Uniform
 from coachable.training.checkpoint import CheckpointError, CheckpointStore, check_writable, find_checkpoint, read_state
 from coachable.training.rng import preserved_rng, rng_state, seed_everything, set_rng_state
 from coachable.training.weights import export_weights, initialise_from, load_policy
@@ -278,6 +279,11 @@ def test_initialise_from_copies_actor_critics_and_targets(make_train, echo_space
     assert second.learner.updates == 0
     second.run()
     assert second.learner.updates > 0
+    # The styles of the new training may be drawn in another way, but must mean the same.
+    initialise_from(weights, second.collector.policy, loss, echo_space.with_sampler(PointMass([0.0])))
+    wider = StyleSpace([Setpoint("target", -9.0, 9.0)], Uniform([6.0], [9.0]), name="echo")
+    with pytest.raises(CheckpointError, match=r"was trained on another style space: .*target"):
+        initialise_from(weights, second.collector.policy, loss, wider)
 
 
 def test_weights_name_no_place_on_the_machine_that_trained(make_train, tmp_path):

@@ -6,7 +6,14 @@ import time
 import pytest
 import torch
 
-from coachable.training.hardware import Hardware, Threads, choose_preset, estimate_update_seconds, share_threads
+from coachable.training.hardware import (
+    Hardware,
+    Threads,
+    choose_preset,
+    estimate_update_seconds,
+    pick_device,
+    share_threads,
+)
 
 
 def machine(cores=12, busy=0.0, gpu=None):
@@ -55,3 +62,8 @@ def test_an_update_takes_sixteen_products_which_are_half_of_its_time(monkeypatch
     monkeypatch.setattr(torch, "ones", lambda *_, **__: small)  # so that it need not be waited for
     assert estimate_update_seconds(512 * 512, 256, bf16=False) == pytest.approx(2 * 16 / 20 + 0.003)
     assert estimate_update_seconds(2 * 512 * 512, 64, bf16=True) == pytest.approx(16 / 20 + 0.003)
+
+
+def test_a_device_that_torch_does_not_know_is_named():
+    with pytest.raises(ValueError, match="device=cude: expected auto, cpu, cuda or cuda:0"):
+        pick_device("cude")

@@ -105,8 +105,10 @@ def test_styles_are_not_the_numbers_of_the_environment(space):
 def test_own_sampler(make_env):
     corner = PointMass([0.0, 1.0, 0.65, 105.0])
     assert make_env(sampler=corner).reset()["style"].unique(dim=0).shape[0] == 1
-    with pytest.raises(ValueError, match=r"dimension 1, the style space .* has 4"):
+    with pytest.raises(ValueError, match=r"the sampler draws 1 numbers, .* need 4"):
         make_env(sampler=PointMass(0.0))
+    with pytest.raises(ValueError, match="the sampler does not fit the parameters"):
+        make_env(sampler=PointMass([0.0, 1.0, 99.0, 105.0]))
 
 
 def test_imposed_at_reset(make_env, space):
