@@ -347,16 +347,13 @@ def _format(text: str) -> str:
     return text
 
 
-def _style(text: str) -> dict[str, Any]:
-    style: dict[str, Any] = {}
+def _style(text: str) -> dict[str, str]:
+    style: dict[str, str] = {}
     for part in text.split(","):
         name, equals, value = part.partition("=")
         if not equals:
             raise argparse.ArgumentTypeError(f"{part!r}: expected NAME=VALUE")
-        try:
-            style[name.strip()] = float(value)
-        except ValueError:
-            style[name.strip()] = value.strip()
+        style[name.strip()] = value.strip()
     return style
 
 

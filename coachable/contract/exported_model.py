@@ -56,6 +56,8 @@ class OnnxRun:
             raise ContractError(f"its graph has the outputs {self._names}: its contract says {list(outputs)}")
         rows = self(*(np.zeros((2, width), np.float32) for width in expected.values()))
         for name, width in outputs.items():
+            if rows[name].dtype.kind != ("i" if name == "choices" else "f"):
+                raise ContractError(f"its output {name} has the type {rows[name].dtype}: expected that of its contract")
             if rows[name].shape != (2, width):
                 raise ContractError(f"its output {name} has the shape {rows[name].shape}: its contract says {width}")
 

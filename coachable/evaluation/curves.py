@@ -86,6 +86,8 @@ def summarise_runs(runs: Sequence[Path], x: str, y: str, smooth: int = 5) -> tup
         window = min(smooth, len(values))
         curves.append((at[window - 1 :], np.convolve(values, np.ones(window) / window, mode="valid")))
     grid = np.linspace(max(at[0] for at, _ in curves), min(at[-1] for at, _ in curves), _POINTS)
+    if grid[0] > grid[-1]:
+        raise ValueError(f"the runs {', '.join(map(str, runs))} have no {x!r} in common: expected runs that overlap")
     table = np.stack([np.interp(grid, at, values) for at, values in curves])  # (runs, P)
     interval = np.array([bootstrap_interval(column) for column in table.T]).T
     return grid, table.mean(axis=0), interval

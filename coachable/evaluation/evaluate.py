@@ -167,7 +167,7 @@ def _report(
 ) -> str:
     rows, response, medians, trials = (tables[name] for name in ("grid", "response", "medians", "trials"))
     columns = {name: ".6g" if isinstance(value, float) else "" for name, value in grid.cells[0].items()}
-    columns |= published(domain, grid.episodes)
+    columns |= published(domain, grid.episodes, grid.cells[0])
     text = f"# {domain.name}: requested and measured style\n\n"
     text += f"{policy_sentence(agent)}; {counted(int(rows[0]['episodes']), 'episode')} of "
     text += f"{grid.steps} steps per style, seed {grid.seed}.\n\n![style grid](grid.png)\n\n"

@@ -84,7 +84,7 @@ def draw_style_grid(grid: StyleGrid, domain: Domain, space: StyleSpace, path: Pa
         title: Title of the figure.
     """
     axis, lines = grid_lines(grid.cells, space)
-    rows, formats = grid.rows(), published(domain, grid.episodes)
+    rows, formats = grid.rows(), published(domain, grid.episodes, grid.cells[0])
     columns = {measured_column(name, grid.cells[0]): name for name in grid.episodes}
     names = [columns[column] for column in formats if column in columns and columns[column] not in space]
     names = [name for name in ((axis,) if axis in grid.episodes else ()) + tuple(names) if name != f"{axis}_error"]

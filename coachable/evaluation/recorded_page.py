@@ -100,7 +100,7 @@ def export_recordings(
     recordings = record(
         domain, agent.actor, thetas, requests, space=agent.space, steps=steps, seed=seed, progress=progress
     )
-    columns = domain.recorded.columns or published(domain, recordings[0].measured)
+    columns = domain.recorded.columns or published(domain, recordings[0].measured, requests[0])
     shown = [_measure(domain, agent.space, *column) for column in columns.items()]
     if unknown := {measure["name"] for measure in shown} - recordings[0].measured.keys():
         raise ValueError(

@@ -260,6 +260,7 @@ class _Sections:
         """Add the tables and figures that the domain's own evaluation writes for the first agent."""
         assert self.domain.evaluation is not None
         folder = self.out / self.domain.name
+        folder.mkdir(exist_ok=True)
         self.domain.evaluation(self.domain, self.agent, folder, settings)
         for file in sorted(folder.glob("*.csv")):
             with file.open(newline="", encoding="utf-8") as lines:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,7 +57,8 @@ class StyleGrid:
             episodes), `rank_correlation`, and `mean_error`. Of several set-points, the one that is measured is empty.
         """
         rows = []
-        names = [p.name for p in space.parameters if isinstance(p, Setpoint) and p.name in self.episodes]
+        known = self.episodes.keys() & self.cells[0].keys()
+        names = [p.name for p in space.parameters if isinstance(p, Setpoint) and p.name in known]
         for name in names:
             own = {name: ""} if len(names) > 1 else {}
             others = [{k: v for k, v in (cell | own).items() if k != name or own} for cell in self.cells]
@@ -65,7 +67,8 @@ class StyleGrid:
                 realised = self.episodes[name][members].ravel()
                 requested = np.repeat([self.cells[i][name] for i in members], len(realised) // len(members))
                 valid = ~np.isnan(realised)
-                slope = np.polyfit(requested[valid], realised[valid], 1)[0] if valid.sum() > 1 else float("nan")
+                tells = valid.any() and np.ptp(requested[valid]) > 0
+                slope = np.polyfit(requested[valid], realised[valid], 1)[0] if tells else float("nan")
                 row = {**group, "parameter": name, "slope": float(slope)}
                 row["rank_correlation"] = rank_correlation(requested, realised)
                 rows.append(row | {"mean_error": mean_of(np.abs(realised - requested))})
@@ -99,6 +102,8 @@ def evaluate_grid(
     if episodes < 1:
         raise ValueError(f"episodes per cell must be at least 1, got {episodes}")
     cells = domain.cells() if cells is None else [dict(cell) for cell in cells]
+    default, names = space.describe(space.default), dict.fromkeys(name for cell in cells for name in cell)
+    cells = [{name: cell.get(name, default.get(name)) for name in names} for cell in cells]  # as many columns in each
     theta = space.make_all(cells).repeat_interleave(episodes, 0)
     label = f"{len(cells)} styles x {episodes} episodes"
     record = record_styles(domain, policy, space, theta, label, **options, **(env_options or {}))
@@ -158,15 +163,24 @@ def write_results(
     Args:
         out: The folder.
         report: Markdown for `report.md`.
-        summary: Numbers for `summary.json`.
+        summary: Numbers for `summary.json`; null stands for NaN there.
         tables: Rows by file name without `.csv`; a table without rows is left out.
     """
     for name, rows in tables.items():
         if rows:
             write_csv(rows, out / f"{name}.csv")
-    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    (out / "summary.json").write_text(json.dumps(_without_nan(summary), indent=2) + "\n")
     (out / "report.md").write_text(report)
     return report
+
+
+def _without_nan(value: Any) -> Any:
+    """Return nested dictionaries and lists with None instead of NaN and infinity, which JSON does not have."""
+    if isinstance(value, Mapping):
+        return {name: _without_nan(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def markdown_table(
@@ -198,15 +212,15 @@ def training_counts(agent: LoadedPolicy) -> str:
     return ", ".join(f"{count:,} {name}" for name, count in counts.items() if count)
 
 
-def published(domain: Domain, episodes: Mapping[str, Any]) -> dict[str, str]:
+def published(domain: Domain, episodes: Mapping[str, Any], cell: Mapping[str, Any]) -> dict[str, str]:
     """Return the format of each column of a domain's table: of those that it declares, otherwise of every metric.
 
     Args:
         domain: The domain.
         episodes: Metrics by name, as in `StyleGrid.episodes`.
+        cell: A style of the table.
     """
-    parameters = domain.make_space().names
-    everything = {f"measured_{name}" if name in parameters else name: ".3g" for name in episodes}
+    everything = {measured_column(name, cell): ".3g" for name in episodes}
     return dict(domain.columns) or everything | {"survived": ".0%"}
 
 

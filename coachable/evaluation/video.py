@@ -186,6 +186,7 @@ def _film(
     env = domain.styled_env(space, 1, seed=seed, num_threads=1, **domain.coached)
     renderer = domain.make_renderer(size[0], size[1] - CAPTION)
     rollout, failures, steps = Rollout(env, seed), 0, itertools.count()
+    window = max(1, round(domain.window / domain.control_step))
     short = size[0] < _NARROW
     rollout.begin(thetas[0][None])
     try:
@@ -194,7 +195,7 @@ def _film(
             recent: list[dict[str, Tensor]] = []
             for step in range(1, period + 1):
                 transition = rollout.step(policy, theta[None])
-                recent = [*recent, domain.measures.step(transition)][-round(domain.window / domain.control_step) :]
+                recent = [*recent, domain.measures.step(transition)][-window:]
                 last = [1.0] if step == period else []
                 shares = last if fps is None else _shares(next(steps), domain.control_step * fps)
                 measured = _measured_line(domain, space, style, recent, failures, short) if shares else ""

@@ -19,7 +19,7 @@ def readable_number(value: float, unit: str = "") -> str:
         value: The number.
         unit: Unit to append, or "".
     """
-    number = f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+    number = f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"
     return f"{number} {unit}".rstrip()
 
 

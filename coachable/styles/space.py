@@ -166,8 +166,9 @@ class StyleSpace:
                 theta[self.slices[name]] = torch.tensor([float(o == value) for o in parameter.options])
             else:
                 try:
-                    theta[self.slices[name]] = float(value)
-                except (TypeError, ValueError):
+                    largest = torch.finfo(theta.dtype).max  # torch does not convert larger ones; NaN stays
+                    theta[self.slices[name]] = min(max(float(value), -largest), largest)
+                except (TypeError, ValueError, OverflowError):
                     raise ValueError(
                         f"{name} = {value!r} is no number: expected one in [{parameter.low}, {parameter.high}]."
                     ) from None

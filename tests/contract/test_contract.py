@@ -218,3 +218,16 @@ def test_other_outputs_than_the_contract_says(file):
     content = file.read_bytes()
     with pytest.raises(ContractError, match=r"has the outputs .*: its contract says \['action'\]"):
         OnnxRun(content, replace(CONTRACT, choice_sizes=()))
+
+
+@pytest.mark.parametrize("kind", [onnx.TensorProto.STRING, onnx.TensorProto.INT64])
+def test_an_action_that_is_no_number_is_refused(file, kind):
+    model = onnx.load(file)
+    out = model.graph.output[0]
+    for node in model.graph.node:
+        node.output[:] = ["number" if name == out.name else name for name in node.output]
+        node.input[:] = ["number" if name == out.name else name for name in node.input]
+    model.graph.node.append(onnx.helper.make_node("Cast", ["number"], [out.name], to=kind))
+    out.type.tensor_type.elem_type = kind
+    with pytest.raises(ContractError, match=r"its output \w+ has the type .*: expected that of its contract"):
+        OnnxRun(model.SerializeToString(), CONTRACT)

@@ -38,6 +38,15 @@ def test_the_common_part_of_unequal_runs_is_drawn(tmp_path):
     assert (tmp_path / "curves.png").stat().st_size > 1000
 
 
+def test_runs_without_a_common_part_are_refused(tmp_path):
+    runs = [make_run(tmp_path / "a", 1.0, rows=10), tmp_path / "b"]
+    runs[1].mkdir()
+    rows = (runs[0] / "metrics.csv").read_text().splitlines()
+    (runs[1] / "metrics.csv").write_text("\n".join([rows[0], *(f"9{row}" for row in rows[1:])]))
+    with pytest.raises(ValueError, match="in common: expected runs that overlap"):
+        draw_learning_curves({"both": runs}, tmp_path / "curves.png", smooth=1)
+
+
 def test_stages_follow_one_another(tmp_path):
     for number, slope in ((10, 3.0), (9, 2.0)):
         make_run(tmp_path / "run" / "stages" / f"{number}_name", slope, rows=3)

@@ -125,6 +125,25 @@ def test_a_domain_without_trials_and_targets_reports_none(tmp_path):
     }
 
 
+def test_styles_may_name_some_parameters_only(tmp_path):
+    """The others have their default, and a table has the same columns in every row."""
+    domain = replace(DOMAIN, grid=[{"speed": 2.0}, {"hat": "blue"}])
+    settings = EvaluationSettings(episodes=1, switch_episodes=1, progress=False)
+    _, found = evaluate_styles(domain, LoadedPolicy(POLICY, SPACE, {}, {}), tmp_path, settings)
+    assert found.cells == [{"speed": 2.0, "hat": "red"}, {"speed": 1.0, "hat": "blue"}]
+    domain = replace(DOMAIN, grid={"hat": ("red",)})  # the speed is measured
+    _, found = evaluate_styles(domain, LoadedPolicy(POLICY, SPACE, {}, {}), tmp_path, settings)
+    assert found.cells == [{"hat": "red"}]
+    text = (tmp_path / "summary.json").read_text()
+    assert "NaN" not in text and json.loads(text)
+
+
+def test_one_request_has_no_slope():
+    domain = replace(DOMAIN, grid=[{"hat": "red", "speed": 2.0}])
+    [row] = evaluate_grid(domain, POLICY, SPACE, episodes=3, progress=False).response(SPACE)
+    assert np.isnan(row["slope"]) and row["mean_error"] == pytest.approx(0.0)
+
+
 def test_without_switch_episodes_the_style_does_not_switch(tmp_path):
     settings = EvaluationSettings(episodes=1, switch_episodes=0, progress=False)
     report, _ = evaluate_styles(DOMAIN, LoadedPolicy(POLICY, SPACE, {}, {}), tmp_path, settings)

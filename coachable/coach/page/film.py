@@ -107,7 +107,8 @@ def film(
     out.parent.mkdir(parents=True, exist_ok=True)
     replica = session.replica()
     try:
-        write_video(_frames(replica, recording, last, size, on_progress), out, round(1 / session.domain.control_step))
+        fps = max(1, round(1 / session.domain.control_step))
+        write_video(_frames(replica, recording, last, size, on_progress), out, fps)
     finally:
         replica.close()
     return out

@@ -112,7 +112,7 @@ class SceneView(View):
         if not self._server.get_clients():
             return
         session = self._session
-        present = (session.step_count, session.episode, tuple(session.style.items()))
+        present = (session.seed, session.step_count, session.episode, tuple(session.style.items()))
         if present != self._seen or self.frame is None:
             self._seen, self._before = present, self.frame
             self.frame = self._stage.frame(session.env, 0, session.style)

@@ -14,7 +14,7 @@ from typing import cast
 from coachable.coach.phrases import segments
 from coachable.coach.phrases.amounts import Last, amount, dimension_of, wrapped
 from coachable.coach.phrases.segments import Mention, Segment
-from coachable.coach.phrases.vocabulary import RESERVED, stem, tokenise
+from coachable.coach.phrases.vocabulary import FILLERS, RESERVED, stem, tokenise
 from coachable.evaluation.wording import readable, readable_number
 from coachable.styles import Choice, Parameter, StyleSpace, Weight
 
@@ -154,7 +154,9 @@ class StyleGrammar:
             for word in tokenise(name):
                 if counts[word] == 1 and self._is_free(word):
                     self._add(word, mention)
-            self._add(name, mention)
+            word, *others = tokenise(name) or [""]
+            ambiguous = not others and (word in FILLERS or not word.isalpha())  # such as "on", "a" and "2"
+            self._add(f"{mention.names[0]} {name}" if ambiguous else name, mention)
 
     def _add_help(self) -> None:
         """Add the words of the help texts that occur with one parameter only."""
@@ -196,7 +198,8 @@ class StyleGrammar:
         for name in segment.names:  # "the warrior bow": one word is the name, the other one describes it
             segment.unknown = [word for word in segment.unknown if stem(word) not in self._context[name]]
         unknown = f"unknown: {', '.join(segment.unknown)}"
-        if segment.negated and segment.unknown:  # the negation may refer to the unknown word
+        no_unit = segment.number is not None and not segment.number[1]
+        if segment.unknown and (segment.negated or no_unit):  # the negation or number may refer to the unknown word
             reading.failed.append(f"'{segment.text}' ({unknown})")
             return
         if any(mention.value is not None for mention in segment.mentions):

@@ -18,7 +18,7 @@ UNITS = {
     **dict.fromkeys(("cm", "centimetre", "centimeter"), (LENGTH, 0.01)),
     **dict.fromkeys(("mm", "millimetre", "millimeter"), (LENGTH, 0.001)),
     **dict.fromkeys(("km", "kilometre", "kilometer"), (LENGTH, 1000.0)),
-    **dict.fromkeys(("ft", "foot"), (LENGTH, 0.3048)),
+    **dict.fromkeys(("ft", "foot", "feet"), (LENGTH, 0.3048)),
     **dict.fromkeys(("inch", "inche"), (LENGTH, 0.0254)),
     "m/s": (SPEED, 1.0),
     **dict.fromkeys(("km/h", "kmh", "kph"), (SPEED, 1 / 3.6)),
@@ -107,6 +107,8 @@ _TENS = ("ten", "twenty", "thirty", "forty", "fifty", "sixty", "seventy", "eight
 _NUMBERS: dict[str, float] = {word: i + 1.0 for i, word in enumerate(_ONES)} | {"fifteen": 15.0}
 _NUMBERS |= {word: 10.0 * (i + 1) for i, word in enumerate(_TENS)}
 _FRACTIONS = {"half": 0.5, "quarter": 0.25}
+_MIXED = re.compile(rf"\b(\d+|{'|'.join(_NUMBERS)}) and a (half|quarter)\b")
+_RATIO = re.compile(r"(?<![\d./])(\d{1,4})/([1-9]\d{0,3})(?![\d./])")
 _TOKEN = re.compile(r"[+-]?\d+(?:\.\d+)?|m/s|km/h|[a-z°]+|%|[,;.!?:]")
 
 
@@ -129,6 +131,8 @@ def tokenise(phrase: str) -> list[str]:
     text = re.sub(r"(?<=[a-z])[-_](?=[a-z])", " ", text)
     text = re.sub(r"(?<=\d),(?=\d)", ".", text)
     text = re.sub(r"(?<![\d.])\.(?=\d)", "0.", text)
+    text = _MIXED.sub(lambda m: f"{(_NUMBERS.get(m[1]) or float(m[1])) + _FRACTIONS[m[2]]:g}", text)  # "one and a half"
+    text = _RATIO.sub(lambda m: f"{int(m[1]) / int(m[2]):.6f}", text)
     return [token for token in _spelt_numbers(_TOKEN.findall(text)) if token not in _ARTICLES]
 
 

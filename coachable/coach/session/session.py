@@ -207,7 +207,8 @@ class CoachSession:
             values = self._preset(style) if isinstance(style, str) else dict(style)
             theta = self.space.make(strict=self.strict, **(self.style | values))
             request = {name: value for name, value in self.space.describe(theta).items() if name in values}
-            agenda[round(seconds / self.domain.control_step)] = {"style": request}
+            step = round(min(seconds / self.domain.control_step, 1e18))
+            agenda.setdefault(step, {"style": {}})["style"] |= request
         self._timeline.plan(agenda)
 
     @property
@@ -241,6 +242,11 @@ class CoachSession:
         self._episodes.seed(seed)
         self._influences.steer(self.base_env)
         self._begin_episode()
+
+    @property
+    def seed(self) -> int:
+        """Seed with which the session last started over."""
+        return self._timeline.seed
 
     @property
     def step_count(self) -> int:

@@ -32,6 +32,12 @@ class Timeline:
         self._recording = recording
         self._agenda: deque[tuple[int, Event]] = deque()
         self._expected: dict[int, int] = {}
+        self._repeats = False  # whether the coming events are those of a recording
+
+    @property
+    def seed(self) -> int:
+        """Seed of the recording."""
+        return self._recording.seed
 
     def note(self, event: Event) -> None:
         """Record an event before the next step."""
@@ -45,16 +51,16 @@ class Timeline:
     def repeat(self, recording: Recording) -> None:
         """Replace the coming events by those of a recording, and compare observations with it from now on."""
         self._agenda = deque((event["step"], event) for event in recording.events)
-        self.replayed, self._expected = recording, dict(recording.checks)
+        self.replayed, self._expected, self._repeats = recording, dict(recording.checks), True
 
     def cancel(self) -> None:
         """Drop all coming events."""
         self._agenda.clear()
-        self.replayed, self._expected = None, {}
+        self.replayed, self._expected, self._repeats = None, {}, False
 
     def take_over(self) -> None:
         """End a replay because of a new request; a plan continues."""
-        if self.replayed is not None:
+        if self._repeats:
             self.cancel()
 
     @property

@@ -39,14 +39,15 @@ def _as_trained(settings: Mapping[str, Any]) -> Domain:
     """Return the domain with the machines, styles, observation and episode length of a training."""
     options = {name: value for name, value in settings.items() if name not in ("_target_", "num_envs", "components")}
     styles: Sequence[str] | None = settings.get("styles")
-    make_space = partial(combat_style_space, styles, settings.get("reward_scale", "sim"))
+    scale = settings.get("reward_scale", "sim")
+    make_space = partial(combat_style_space, styles, scale)
     machines: Sequence[str] = settings.get("machines") or ("Scrounger",)
     return replace(
         DOMAIN,
         recorded=replace(DOMAIN.recorded, alike=lambda _: {"machines": machines[-1:], "sites": SITES[-1:]}),
         make_env=partial(make_combat_env, **options),
         make_space=make_space,
-        measures=CombatMeasures(styles),
+        measures=CombatMeasures(styles, scale),
         grid=single_styles(make_space()),
         episode_steps=settings.get("episode_steps", EPISODE_STEPS),
         observation_groups=observation_groups(settings.get("observation", "full")),

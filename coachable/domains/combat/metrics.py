@@ -27,9 +27,9 @@ class CombatMeasures:
     needs = "damage, under a weight above 0"
     """Condition under which compliance can be judged."""
 
-    def __init__(self, styles: Sequence[str] | None = None) -> None:
+    def __init__(self, styles: Sequence[str] | None = None, reward_scale: str = "sim") -> None:
         self.styles = check_styles(styles)
-        self._high = combat_style_space(self.styles).high
+        self._high = combat_style_space(self.styles, reward_scale).high
         self._rows = torch.tensor([STYLES.index(name) for name in self.styles])
         self._counts = style_counts(STYLES)  # (18, 44)
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
-from coachable.evaluation.style_grid import markdown_table, rows_where
+from coachable.evaluation.style_grid import markdown_table, mean_of, rows_where
 
 Row = Mapping[str, Any]
 
@@ -98,7 +98,12 @@ def lap_bounds(circuits: Sequence[Row], home: str) -> list[dict[str, Any]]:
         label = f"{len(unseen)} held-out circuits"
         rows += [
             bound(f"clean laps on {label}", clean.mean(), bootstrap_interval(clean), at_least=CLEAN),
-            bound(f"lap over quasi-steady state on {label}", *_mean(over), at_most=OVER_HELD_OUT),
+            bound(
+                f"lap over quasi-steady state on {label}",
+                mean_of(over),
+                bootstrap_interval(over),
+                at_most=OVER_HELD_OUT,
+            ),
         ]
     for row in own:
         interval = row["over_low"], row["over_high"]
@@ -199,9 +204,3 @@ def rank_interval(margins: np.ndarray, values: np.ndarray) -> tuple[float, float
     ]
     low, high = np.nanpercentile(ranks, [2.5, 97.5]) if not np.isnan(ranks).all() else (math.nan, math.nan)
     return float(low), float(high)
-
-
-def _mean(values: np.ndarray) -> tuple[float, tuple[float, float]]:
-    """Return the mean of the values that are not NaN, and its 95 % interval."""
-    known = values[~np.isnan(values)]
-    return float(known.mean()) if len(known) else math.nan, bootstrap_interval(values)

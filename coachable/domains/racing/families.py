@@ -70,15 +70,15 @@ def rival_env(num_envs: int = AGENTS * 21, **options: Any) -> RacingEnv:
     """Make races of GT3 cars against rivals, which are scripted or copies of the policy, from all kinds of starts.
 
     Args:
-        num_envs: Number of cars that the agent drives: three of the five cars of each race (fewer if `cars` is less),
-            or one if it is not a multiple of three.
+        num_envs: Number of cars that the agent drives: three of the five cars of each race, or one if it is no multiple
+            of three or `cars` is less.
         **options: Options of `RacingEnv`.
     """
     tracks, driver = _line_follower(options, "aggressiveness")
     space = styles.aggressiveness_style_space()
     defaults: dict[str, Any] = {
         "cars": CARS,
-        "controlled": min(AGENTS, options.get("cars", CARS)) if num_envs % AGENTS == 0 else 1,
+        "controlled": AGENTS if num_envs % AGENTS == 0 and options.get("cars", CARS) >= AGENTS else 1,
         "driver": Rivals(driver, (space.low, space.high), slowest=0.8 / RIVALS_GRIP),
         "car": CAR["aggressiveness"],
         "scenarios": race_scenarios(CARS),

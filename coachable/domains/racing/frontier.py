@@ -36,7 +36,7 @@ from coachable.envs.racing.race.driver import line_geometry
 from coachable.evaluation.figures import drawing
 
 STAGE = 6.0  # [m], about
-SPEEDS = np.linspace(12.0, 100.0, 353)  # [m/s]
+SPEEDS = np.linspace(4.0, 100.0, 385)  # [m/s], from below the speed of the slowest corner
 THROTTLE = np.linspace(0.0, 1.0, 12)  # share of the engine's power; 0 is coasting
 BRAKE = np.array([0.15, 0.3, 0.5, 0.75, 0.9, 1.0])  # share of the braking that the ellipse leaves
 RESOURCES = ("tyre", "fuel")

@@ -219,7 +219,11 @@ def _drifting(sideslip: Tensor, speed: Tensor, curvature: Tensor, asked: Tensor)
 def _margins_kept(features: Tensor, theta: Tensor) -> Tensor:
     """Return whether no opponent is within the longitudinal and the lateral margin at once, (N,) bool."""
     long, lat, near = gap_columns(features)
-    return ~((near > 0.0) & (long < theta[:, :1]) & (lat < theta[:, 1:2])).any(-1)
+    ahead, aside = long < theta[:, :1], lat < theta[:, 1:2]
+    close = (ahead & (aside | (lat == 0.0))) | (
+        aside & (long == 0.0)
+    )  # cars that overlap are closer than a margin of 0
+    return ~((near > 0.0) & close).any(-1)
 
 
 def nearest_gaps(features: Tensor) -> tuple[Tensor, Tensor]:

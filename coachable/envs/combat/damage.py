@@ -100,7 +100,7 @@ def shoot(
     Returns:
         Hits (E, N), 0 or 1; factor of the body's damage (E, N); factor of the parts' damage (12, E, N).
     """
-    fires = intent.shooting & (s.timers[NO_SHOT].amax(0) <= 0) & (intent.loaded > 0)
+    fires = intent.shooting & (s.hp > 0) & (s.timers[NO_SHOT].amax(0) <= 0) & (intent.loaded > 0)
     intent.loaded = intent.loaded - 1.0 * fires
     rows_where(s.timers, FIRE, fires, intent.ammo[INTERVAL])
     rows_where(s.timers, RELOAD, fires & (intent.loaded <= 0), intent.ammo[RELOAD_FRAMES])
@@ -202,7 +202,7 @@ def swing(s: State, intent: Intent, traits: Traits) -> Tensor:
     Returns:
         Damage (E, N) [HP].
     """
-    wanted = (intent.light | intent.heavy) & (s.timers[NO_SWING].amax(0) <= 0)
+    wanted = (intent.light | intent.heavy) & (s.hp > 0) & (s.timers[NO_SWING].amax(0) <= 0)
     duration = torch.where(intent.heavy, c.HEAVY_TIME * c.FPS, c.LIGHT_TIME * c.FPS)
     rows_where(s.timers, MELEE, wanted, duration)
     second = nearest(s)

@@ -30,7 +30,6 @@ from coachable.envs.combat.traits import RELOAD as RELOAD_FRAMES
 from coachable.signals import Signal
 
 SMALL_PARTS = 4
-_GAME_TIMERS = slice(0, 11)
 _SPEED_SCALE, _TIMER_SCALE = 0.1, 0.5 / c.FPS  # per m/s, per frame
 _HP_MAX = 8500.0  # [HP], the strongest machine of the paper
 _LONGEST_STATE = 14.0 * c.FPS  # [frames]
@@ -212,7 +211,7 @@ def observe(s: State, traits: Traits, ammo: Tensor, observation: str, episode_st
 def _player_rows(s: State, ammo: Tensor, axes: Tensor, episode_steps: int) -> Tensor:
     timers = s.timers * _TIMER_SCALE
     magazine = s.magazine.gather(0, (s.weapon * AMMO_SLOTS + s.section).unsqueeze(0))[0]
-    others = [timers[i] for i in range(*_GAME_TIMERS.indices(len(timers))) if i not in (AIR, DODGE, STAGGER)]
+    others = [timer for i, timer in enumerate(timers) if i not in (AIR, DODGE, STAGGER)]
     element = ammo[11:]
     rows = [
         s.hp / c.PLAYER_HP,

@@ -6,8 +6,18 @@ import torch
 from torch import Tensor
 
 from coachable.envs.combat import constants as c
-from coachable.envs.combat.damage import ACID, BURNING, BY_ACID, BY_FIRE, BY_PLASMA, BY_SHOT, BY_SPEAR, BY_TRAP, PLASMA
-from coachable.envs.combat.damage import Totals as Totals
+from coachable.envs.combat.damage import (
+    ACID,
+    BURNING,
+    BY_ACID,
+    BY_FIRE,
+    BY_PLASMA,
+    BY_SHOT,
+    BY_SPEAR,
+    BY_TRAP,
+    PLASMA,
+    Totals,
+)
 from coachable.envs.combat.features import kept_features, one_hot_rows
 from coachable.envs.combat.gamepad import read_pad
 from coachable.envs.combat.player import command, element_of, wrap

@@ -217,6 +217,7 @@ def strike_player(
     # Only the worst hit of a frame counts, because a hit makes the player invulnerable for a moment.
     worst = torch.maximum(direct.amax(0), shots.amax((0, 1)))
     worst = torch.maximum(worst, self_damage * ~safe)
+    worst = worst * (s.enemy_hp > 0).any(0)  # otherwise the fight is over
     charged = ((direct >= worst) & charge).any(0)
     _suffer(s, worst, charged)
     return worst

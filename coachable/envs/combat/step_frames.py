@@ -171,6 +171,7 @@ def run_frame(
     blow, zone = decide(s, traits, strength, gap, shocked, noise.choice, noise.pause)
     leave_zone(s, zone)
     move_machines(s, traits, site, blow, noise.flip[frame])
+    burns = burns * (s.enemy_hp > 0).any(0)  # otherwise the fight is over
     s.hp = (s.hp - burns).clamp(min=0.0)
     taken = strike_player(
         s, traits, blow, strength, self_damage, noise.hit, noise.shot[frame], noise.aim[frame], rules.pillars, blocks

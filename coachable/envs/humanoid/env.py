@@ -105,7 +105,8 @@ class HumanoidEnv(EnvBase):
             NOT_NEGATIVE.check(f"costs.{name}", weight)
         super().__init__(device="cpu", batch_size=torch.Size((num_envs,)))
         if num_threads is None:
-            num_threads = min(len(os.sched_getaffinity(0)), num_envs)
+            affinity = getattr(os, "sched_getaffinity", None)  # missing on macOS and Windows
+            num_threads = min(len(affinity(0)) if affinity else os.cpu_count() or 1, num_envs)
         self.num_envs = num_envs
         self.episode_steps = episode_steps
         self.start_speed, self.end_at_timeout = start_speed, end_at_timeout

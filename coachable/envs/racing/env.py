@@ -197,7 +197,7 @@ class RacingEnv(EnvBase):
         self.seeds = start * 1_000_003 + self._start_of_race
         self.episode = torch.zeros_like(self.episode)
         self.course.assign(self.circuit.repeat(self.cars))
-        self.garage.reset(start)
+        self.garage.reset()
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDictBase:
         partial = None if tensordict is None else tensordict.get("_reset", None)

@@ -13,7 +13,7 @@ from typing import Any
 
 from coachable import __version__
 from coachable.export.graph import import_onnx
-from coachable.export.onnx import TOLERANCE, export
+from coachable.export.onnx import TOLERANCE, write_onnx
 from coachable.export.web.part import PagePart
 from coachable.export.web.pinned_files import Package, packages, provide
 from coachable.outputs import complete_folder
@@ -66,7 +66,7 @@ def export_page(
         vendored = provide(assets, *part.packages)
         files = part.files()
         copy_page(folder, vendored, part.licence)
-        export(source, folder / _POLICY)
+        write_onnx(agent, domain_of(agent), folder / _POLICY)
         for name, content in files.items():
             (folder / name).write_bytes(content)
         manifest = manifest_of(agent, part) | ({} if home is None else {"home": home})

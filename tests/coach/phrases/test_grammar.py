@@ -41,6 +41,8 @@ UNDERSTOOD = [
     (".4", {"step_length": 0.4}),
     ("40 cm", {"step_length": 0.4}),
     ("half a metre", {"step_length": 0.5}),
+    ("1/2 metre", {"step_length": 0.5}),
+    ("one and a half feet", {"step_length": 0.4572}),
     ("steps of forty five centimetres", {"step_length": 0.45}),
     ("reduce the step length to 0.4", {"step_length": 0.4}),
     ("reduce the step length by 0.1", {"step_length": 0.375}),
@@ -65,6 +67,7 @@ NOT_UNDERSTOOD = [
     ("don't wave", "unknown: wave"),
     ("walk faster", "nothing here has a speed"),
     ("0.4 kg", "unknown: kg"),
+    ("0.5 yards longer", "unknown: yards"),
     ("0.4 s", "nothing here has a time"),
     ("step length 20 degrees", "step length is no angle, it is in m"),
     ("steps", "how much"),
@@ -165,6 +168,20 @@ def test_weights_are_encouraged_and_discouraged():
         assert grammar.read(phrase, now).changes == pytest.approx(changes), phrase
     assert grammar.read("not left", now).changes == {"side": "right"}
     assert "of what: melee or fire or frost or speed?" in grammar.read("more", now).failed[0]
+
+
+def test_options_that_are_common_words_need_their_parameter():
+    gap, now = Setpoint("gap", 0.0, 5.0, unit="m"), {"gap": 2.5, "mode": "b", "lights": "off", "gear": "3"}
+    choices = [Choice("mode", ("a", "b")), Choice("lights", ("off", "on")), Choice("gear", ("1", "2", "3"))]
+    grammar = StyleGrammar([gap, *choices])
+    for phrase, changes in [
+        ("gap 2 m", {"gap": 2.0}),
+        ("a wider gap", {"gap": 3.5}),
+        ("gear 2", {"gear": "2"}),
+        ("lights on", {"lights": "on"}),
+        ("mode a", {"mode": "a"}),
+    ]:
+        assert grammar.read(phrase, now).changes == pytest.approx(changes), phrase
 
 
 class CountingLexicon(dict):

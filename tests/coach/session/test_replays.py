@@ -57,6 +57,19 @@ def test_a_replay_in_the_same_session(session):
         assert session.base_env.simulator_state()["position"].equal(state)
 
 
+def test_a_request_after_a_replay_counts(session):
+    """The recording ends with a request that no step followed."""
+    session.set(target=0.1)
+    session.run(0.5)
+    session.set(target=0.2)
+    recording = session.recording()
+    session.replay(recording)
+    session.run(0.5)
+    session.set(target=0.7)
+    session.step()
+    assert session.style["target"] == pytest.approx(0.7)
+
+
 def test_a_request_takes_over_from_a_replay(session):
     coached(session)
     recording = session.recording()

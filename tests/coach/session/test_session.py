@@ -205,6 +205,9 @@ def test_schedules(session):
         session.step()
         seen.append((session.style["target"], session.style["mood"], session.style["fire"]))
     assert seen == [(0.0, "wild_card", 0.0)] * 2 + [(0.25, "wild_card", 0.0)] * 2 + [(0.75, "wild_card", 1.0)] * 2
+    session.schedule({0.10: {"mood": "calm"}, 0.11: {"target": 0.5}, 1e308: {"target": 0.0}})  # in one step, and never
+    session.run(0.2)
+    assert (session.style["target"], session.style["mood"]) == (0.5, "calm")
     session.schedule({1.0: {"target": 0.0}})
     session.cancel()
     assert session.scheduled == 0

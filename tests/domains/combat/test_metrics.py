@@ -39,6 +39,13 @@ def test_the_style_asked_for_most_is_the_one_closest_to_its_own_limit(asked, cou
     assert (row["damage"].item(), row["melee"].item(), row["skykiller"].item()) == (11.0, 7.0, 4.0)
 
 
+def test_the_papers_weights_have_ranges_of_their_own():
+    styles = ("skykiller", "icestorm_boltblaster")
+    high = combat_style_space(styles, "paper").high
+    row = CombatMeasures(styles, "paper").step(transition(high * torch.tensor([1.0, 0.1]), damage=5.0, Skykiller=5.0))
+    assert row["requested"].item() == 5.0
+
+
 def test_shares_not_products_decide():
     """For every pair of styles, 0.9 of one range beats 0.8 of another, whichever range is wider."""
     space = combat_style_space()

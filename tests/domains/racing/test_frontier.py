@@ -11,6 +11,7 @@ from coachable.domains.racing import frontier
 from coachable.domains.racing.frontier import SPEEDS, TANK, THROTTLE, WORN, LapProgramme
 from coachable.envs.racing.circuit.circuits import load_track
 from coachable.envs.racing.circuit.profile import Envelope, speed_profiles
+from coachable.envs.racing.circuit.track import Track
 from coachable.envs.racing.physics.cars import Resources, load_car
 from coachable.envs.racing.physics.powertrain import drive_wheels
 from coachable.envs.racing.race.driver import line_geometry
@@ -67,6 +68,14 @@ def test_a_ring_is_driven_at_the_speed_that_friction_allows():
     programme = LapProgramme(track, car, Resources(1.0, 1.0), line=np.zeros(len(track.table)))
     [lap] = programme.laps("tyre", [0.0])
     assert lap.time == pytest.approx(track.length / speed, rel=0.01)
+
+
+def test_hairpins_are_driven(long_stages):
+    turns = [(100.0, 180.0, 14.0), (200.0, 180.0, 14.0), (100.0, 0.0, 14.0)]
+    track, car = Track.from_turns(turns, width=8.0, margin=3.0), load_car("street")
+    profile = speed_profiles(Envelope(car), [track.table[:, 4].numpy()], [track.spacing])[0]
+    [lap] = LapProgramme(track, car, Resources(1.0, 1.0), line=np.zeros(len(track.table))).laps("fuel", [0.0])
+    assert lap.time == pytest.approx((track.spacing / profile).sum(), rel=0.1)
 
 
 @pytest.mark.parametrize("car", ["gt3", "x2019"])

@@ -45,6 +45,16 @@ def test_margins_are_judged_by_cars_nearby(gaps, judged, kept, longitudinal, lat
     assert measures.needs == "another car within 10 m"
 
 
+@pytest.mark.parametrize("margins", [(0.0, 1.0), (2.0, 0.0)])
+def test_a_margin_of_nothing_leaves_the_other_one(margins):
+    """Cars side by side or in line overlap in one direction; those that are diagonal to each other do not."""
+    measures = RacingMeasures("aggressiveness")
+    gaps = {(0.0, 1.0): [(0.0, 0.4, 1.0)], (2.0, 0.0): [(1.5, 0.0, 1.0)]}[margins]
+    for gap, kept in ((gaps, False), ([(1.5, 0.4, 1.0)], True)):
+        record = {name: value[None] for name, value in measures.step(race(gap, [*margins])).items()}
+        assert measures.complies(record).item() is kept
+
+
 def test_the_smallest_gap_is_what_a_margin_is_about():
     measures = RacingMeasures("aggressiveness")
     gaps = ([(4.0, 0.0, 1.0)], [(1.5, 0.0, 1.0)], [(0.2, 0.0, 1.0)])

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from coachable.envs.combat import constants as c
-from coachable.envs.combat.state import AIR, DODGE, SLIDE
+from coachable.envs.combat.state import AIR, DODGE, MELEE, SLIDE
 from coachable.envs.combat.tables import ALL_MACHINES, AMMO, ELEMENTS, WEAPONS, load_table, resistance
 from tests.envs.combat.pressing import press
 from tests.envs.combat.still_fight import SHOOT, act, aim_at_body, hold, part, still_fight
@@ -80,6 +80,20 @@ def test_overkill_is_clipped_before_it_is_attributed():
     assert part(components, "damage").item() == 95.0
     assert part(components, "weapon_damage").sum().item() == 95.0
     assert after["terminated"].item()
+
+
+def test_a_fight_ends_with_the_first_who_falls():
+    """In the frames that the step has left, a shot in flight hurts no winner, and a dead player does not strike."""
+    for hp, machine_hp, landing, swing in ((10.0, 5.0, 4.0, 0.0), (10.0, 90.0, 1.0, 3.0)):
+        env = still_fight("Ravager", 1.5)
+        s = env.state
+        s.hp, s.enemy_hp[0] = torch.full_like(s.hp, hp), machine_hp
+        s.land_timer[0], s.shot_damage[0] = landing, 50.0
+        s.timers[MELEE] = swing
+        components, after = act(env, press("R1"))
+        won = landing > 1.0
+        assert (part(components, "death").item(), part(components, "damage").item() > 0) == (0.0 if won else 1.0, won)
+        assert after["terminated"].item()
 
 
 def test_the_dead_do_nothing():

@@ -81,7 +81,10 @@ class Track:
                 raise ValueError(f"{path}, line {number}: got {line[:80]!r}, expected x, y, w_right, w_left in metres")
             rows.append(values)
         if len(rows) < 8:
-            raise ValueError(f"{path} has {len(rows)} points: expected at least 8 on a closed centre line")
+            raise ValueError(
+                f"{path} has {len(rows)} points: expected at least 8 on a closed centre line, each in a line of x, y, "
+                "w_right, w_left in metres, separated by commas"
+            )
         points = np.array(rows)
         return cls.from_points(points[:, :2], points[:, 3], points[:, 2], name or path.stem, margin)
 
@@ -104,13 +107,13 @@ class Track:
         """
         from scipy.interpolate import CubicSpline  # slow to import, and needed here only
 
-        ends = np.linalg.norm(points[0] - points[-1])
         steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
-        if ends < 1e-6:  # the first point repeated
-            points, left, right = points[:-1], left[:-1], right[:-1]
-        elif ends > max(3.0 * steps.max(), _CLOSURE):
+        while len(points) > 1 and np.linalg.norm(points[0] - points[-1]) < 0.25 * np.median(steps):
+            points, left, right = points[:-1], left[:-1], right[:-1]  # the first point repeated, perhaps rounded
+        ends, steps = np.linalg.norm(points[0] - points[-1]), steps[: len(points) - 1]
+        if ends > max(3.0 * steps.max(), _CLOSURE):
             raise ValueError(f"track {name!r} is open: {ends:.1f} m between its ends, expected a closed centre line")
-        if not steps[: len(points) - 1].all():
+        if not steps.all():
             twice = int(steps.argmin())
             raise ValueError(
                 f"track {name!r}: points {twice + 1} and {twice + 2} are the same, expected different ones"

@@ -42,7 +42,7 @@ class Garage:
             self.model = torch.zeros(races, dtype=torch.int64, device=device)
             self._assemble()
 
-    def reset(self, seed: int) -> None:
+    def reset(self) -> None:
         """Forget how often the models have spun."""
         if self.pooled:
             self.spinning.zero_()
