@@ -11,6 +11,7 @@ from typing import Any
 
 import recipe_boxes as boxes
 import torch
+from absl import logging
 from recipe_config import run_recipe
 from tensordict import TensorDictBase
 from torchrl.data import Composite, Unbounded
@@ -80,6 +81,7 @@ def cheetah_env(num_envs: int = 16, seed: int = 0, seconds: float = 10.0) -> Env
         seed: Seed of the initial states.
         seconds: Length of an episode [s].
     """
+    logging.set_verbosity(logging.ERROR)  # each cheetah would print that a setting in the suite's file is deprecated
     cheetahs = SerialEnv(num_envs, lambda: DMControlEnv("cheetah", "run", frame_skip=4, time_limit=seconds))
     env = TransformedEnv(
         cheetahs,
