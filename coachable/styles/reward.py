@@ -41,21 +41,16 @@ class StyleReward(nn.Module):
         super().__init__()
         self.space = space
         _check_terms(space, terms, scales or {})
+        self.terms = dict(terms)
         self.scales = {name: float((scales or {}).get(name, 1.0)) for name in terms}
-        self._terms: tuple[tuple[str, StyleTerm, float], ...] = tuple((n, t, self.scales[n]) for n, t in terms.items())
         # Registered, so that `.to(device)` reaches the weights of a module used as a term.
         functions = {name: getattr(term, "function", None) for name, term in terms.items()}
         self.modules_of_terms = nn.ModuleDict({n: f for n, f in functions.items() if isinstance(f, nn.Module)})
 
     @property
-    def terms(self) -> dict[str, StyleTerm]:
-        """Terms by name, in the order in which they are added."""
-        return {name: term for name, term, _ in self._terms}
-
-    @property
     def is_linear(self) -> bool:
         """Whether the reward is known to be linear in the features, so that features of several steps may be summed."""
-        return all(isinstance(term, WeightedFeature | WeightedSum) for _, term, _ in self._terms)
+        return all(isinstance(term, WeightedFeature | WeightedSum) for term in self.terms.values())
 
     def forward(self, features: Features, theta: Tensor) -> Tensor:
         """Return the style part of the reward.
@@ -70,12 +65,10 @@ class StyleReward(nn.Module):
         Raises:
             ValueError: If a term does not return one number per style.
         """
-        style = self.space.view(theta)
         total: Tensor | None = None
-        for name, term, scale in self._terms:
-            value = self._checked(name, term(features, style), theta)
-            if scale != 1.0:
-                value = scale * value
+        for name, value in self.terms_of(features, theta).items():
+            if self.scales[name] != 1.0:
+                value = self.scales[name] * value
             total = value if total is None else total + value
         assert total is not None  # a space has parameters, and each has a term
         return total.to(theta.dtype).unsqueeze(-1)
@@ -94,7 +87,7 @@ class StyleReward(nn.Module):
             ValueError: If a term does not return one number per style.
         """
         style = self.space.view(theta)
-        return {name: self._checked(name, term(features, style), theta) for name, term, _ in self._terms}
+        return {name: self._checked(name, term(features, style), theta) for name, term in self.terms.items()}
 
     @staticmethod
     def _checked(name: str, value: Tensor, theta: Tensor) -> Tensor:

@@ -246,7 +246,7 @@ class Trainer:
             metrics = {f"eval/{name}": value for name, value in self.evaluate().items()}
         self._evaluated_frames = self.frames
         self._latest |= metrics
-        self._write({**self._position(), **self._minutes(), **metrics})
+        self._write(metrics)
 
     def _log_if_due(self) -> None:
         if time.monotonic() - self._logged >= self.settings.log_interval:
@@ -264,20 +264,17 @@ class Trainer:
             if isinstance(self.collector, AsyncCollector):
                 row |= self.collector.metrics()
             self._latest |= row
-            self._write({**self._position(), **self._minutes(), **row})
+            self._write(row)
 
     def _write(self, row: Mapping[str, float]) -> None:
+        minutes = round(sum(self.seconds.values()) / 60, 3)  # without pauses between a stop and its resumption
         try:
-            self.log.write(row)
+            self.log.write({**self._position(), "minutes": minutes, **row})
         except OSError as error:  # a full disk must not end a training
             warnings.warn(f"metrics at {self.frames} frames were not written: {error}", stacklevel=2)
 
     def _position(self) -> dict[str, float]:
         return {"frames": self.frames, "updates": self.learner.updates}
-
-    def _minutes(self) -> dict[str, float]:
-        """Return the time of training, without pauses between a stop and its resumption."""
-        return {"minutes": round(sum(self.seconds.values()) / 60, 3)}
 
     def _checkpoint_if_due(self) -> None:
         if time.monotonic() - self._saved >= self.settings.checkpoint_interval:
