@@ -257,7 +257,8 @@ def _measured_line(
     ranked = [*(m for name in asked for m in owned[name] if not m.endswith("_error"))]
     ranked += [name for name in columns if name in domain.units] or ([] if ranked else columns)
     names = [name for name in dict.fromkeys(ranked) if name in known] or list(known)
-    names = names[: _FEWEST if short else _MOST]
+    fewest = max(_FEWEST, sum(bool(owned[name]) for name in asked))  # one of each that is asked for
+    names = names[: min(fewest, _MOST) if short else _MOST]
     shown = ", ".join(f"{domain.words.name(name)} {measured_text(domain, space, name, known[name])}" for name in names)
     count = "" if not failures or short else f"; {failures} {'failure' if failures == 1 else 'failures'}"
     return f"measured: {shown or 'nothing yet'}{count}"

@@ -1,5 +1,6 @@
 """Films: encoders, captions and the tour of styles."""
 
+import re
 import warnings
 from dataclasses import replace
 from functools import partial
@@ -195,3 +196,11 @@ class BlankRenderer:
 def test_the_tour_of_weights_is_the_grid():
     domain = load_domain("racing_drift")
     assert default_tour(domain, domain.make_space()) == domain.cells()
+
+
+def test_a_narrow_caption_measures_everything_that_is_asked_for(monkeypatch):
+    captions = []
+    monkeypatch.setattr(video, "caption", lambda frame, lines: captions.append(lines))
+    agent, domain = load_policy("humanoid_gait"), replace(load_domain("humanoid_gait"), make_renderer=BlankRenderer)
+    assert len(list(video._film(domain, agent.actor, agent.space, [{}], 60, (64, 64), 0, None))) == 1
+    assert re.fullmatch(r"measured: pose held \d+%, step length [\d.]+ m, speed [\d.]+ m/s", captions[0][1])
