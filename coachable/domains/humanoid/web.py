@@ -145,10 +145,11 @@ def humanoid_web(
         shown: Those of them that the page shows.
         step_max: Option of the `HumanoidEnv`.
     """
+    asked = "an arm pose, a step length and a speed" if "speed" in space else "a step length and an arm pose"
     features = WalkFeatures(measures, [measure.name for measure in shown], step_max)
     return WebPart(
         title="A walker that you coach",
-        summary="Ask for a step length and an arm pose, and see beside each request what the walker does.",
+        summary=f"Ask for {asked}, and see beside each request what the walker does.",
         dynamics=_xml(dynamics_spec()),
         kinematics=_xml(kinematics_spec()),
         features=features,
