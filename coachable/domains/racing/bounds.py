@@ -95,15 +95,10 @@ def lap_bounds(circuits: Sequence[Row], home: str) -> list[dict[str, Any]]:
     rows = []
     if unseen:
         clean, over = (np.array([row[name] for row in unseen]) for name in ("clean_laps", "over"))
-        label = f"{len(unseen)} held-out circuits"
+        label, interval = f"{len(unseen)} held-out circuits", bootstrap_interval(over)
         rows += [
             bound(f"clean laps on {label}", clean.mean(), bootstrap_interval(clean), at_least=CLEAN),
-            bound(
-                f"lap over quasi-steady state on {label}",
-                mean_of(over),
-                bootstrap_interval(over),
-                at_most=OVER_HELD_OUT,
-            ),
+            bound(f"lap over quasi-steady state on {label}", mean_of(over), interval, at_most=OVER_HELD_OUT),
         ]
     for row in own:
         interval = row["over_low"], row["over_high"]

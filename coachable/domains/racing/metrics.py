@@ -220,9 +220,8 @@ def _margins_kept(features: Tensor, theta: Tensor) -> Tensor:
     """Return whether no opponent is within the longitudinal and the lateral margin at once, (N,) bool."""
     long, lat, near = gap_columns(features)
     ahead, aside = long < theta[:, :1], lat < theta[:, 1:2]
-    close = (ahead & (aside | (lat == 0.0))) | (
-        aside & (long == 0.0)
-    )  # cars that overlap are closer than a margin of 0
+    # Cars that overlap in one direction are closer than any margin in it, also than one of 0.
+    close = (ahead & (aside | (lat == 0.0))) | (aside & (long == 0.0))
     return ~((near > 0.0) & close).any(-1)
 
 
