@@ -27,12 +27,14 @@ class UnsavableError(ValueError):
     """A part of an environment's state cannot be saved or restored; the message names it."""
 
 
-def save_object(thing: Any) -> dict[str, Any]:
+def save_object(thing: Any, known: dict[int, tuple[int, Any]] | None = None) -> dict[str, Any]:
     """Save the attributes of an environment of another library, including nested wrappers, tasks and generators.
 
     Args:
         thing: Object of `gymnasium` or `dm_control`. Spaces, models and functions are left out, because they are equal
             in all environments that are made in the same way.
+        known: Numbers of the arrays, lists and dicts that were saved before, by identity; None if this is the first
+            object. What several attributes share is saved once, and shared again when it is restored.
 
     Returns:
         Tensors and plain containers.
@@ -42,72 +44,96 @@ def save_object(thing: Any) -> dict[str, Any]:
     """
     kind = type(thing).__name__
     changing = {name: value for name, value in vars(thing).items() if not _is_constant(value)}
-    return {name: _pack(value, f"{kind}.{name}") for name, value in changing.items()}
+    known = {} if known is None else known
+    return {name: _pack(value, f"{kind}.{name}", known) for name, value in changing.items()}
 
 
-def load_object(thing: Any, state: dict[str, Any]) -> None:
+def load_object(thing: Any, state: dict[str, Any], known: list[Any] | None = None) -> None:
     """Restore the output of `save_object`.
 
     Args:
         thing: Object of the same kind as the saved one.
         state: Output of `save_object`.
+        known: Arrays, lists and dicts that were restored before, by their numbers; None if this is the first object.
 
     Raises:
         UnsavableError: If the state does not fit the object.
     """
+    known = [] if known is None else known
     for name, saved in state.items():
         if name not in vars(thing) and hasattr(type(thing), name):
             raise UnsavableError(f"{type(thing).__name__}.{name} belongs to its class, not to a checkpoint")
-        vars(thing)[name] = _unpack(saved, vars(thing).get(name), f"{type(thing).__name__}.{name}")
+        vars(thing)[name] = _unpack(saved, vars(thing).get(name), f"{type(thing).__name__}.{name}", known)
 
 
-def _pack(value: Any, where: str) -> Any:
+def _pack(value: Any, where: str, known: dict[int, tuple[int, Any]]) -> Any:
     if value is None or type(value) in (bool, int, float, str):
         return value
+    if id(value) in known:
+        return {"same": known[id(value)][0]}
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+        arrays = (other for _, other in known.values() if isinstance(other, np.ndarray))
+        if any(np.may_share_memory(value, other) for other in arrays):
+            raise UnsavableError(f"{where} is a view of another attribute's array, which cannot be saved")
+    if isinstance(value, np.ndarray) or type(value) in (list, dict):
+        known[id(value)] = len(known), value  # with the value, so that nothing else gets its identity
     if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in "biuf":
         return {"numpy": torch.from_numpy(np.array(value)), "scalar": isinstance(value, np.generic)}
     for kind in (list, tuple):
         if type(value) is kind:
-            return {kind.__name__: [_pack(part, where) for part in value]}
+            return {kind.__name__: [_pack(part, where, known) for part in value]}
     if type(value) is dict:
-        return {"keys": [_pack(key, where) for key in value], "values": [_pack(v, where) for v in value.values()]}
+        keys, values = ([_pack(part, where, known) for part in parts] for parts in (value, value.values()))
+        return {"keys": keys, "values": values}
     if isinstance(value, np.random.Generator):
-        return {"generator": _pack(value.bit_generator.state, where)}
+        return {"generator": _pack(value.bit_generator.state, where, known)}
     if isinstance(value, np.random.RandomState):
-        return {"generator": _pack(value.get_state(legacy=False), where)}
+        return {"generator": _pack(value.get_state(legacy=False), where, known)}
     if (physics := _mujoco(value)) is not None:
         return {"mujoco": _save_mujoco(*physics)}
     if _is_one_of(value, _STATEFUL):
-        return {"object": save_object(value)}
+        return {"object": save_object(value, known)}
     raise UnsavableError(f"{where} is of type {type(value).__name__}, which cannot be saved")
 
 
-def _unpack(saved: Any, present: Any, where: str) -> Any:
+def _unpack(saved: Any, present: Any, where: str, known: list[Any]) -> Any:
     """Return the value of an attribute; generators, simulations and objects are restored in place and returned."""
     if isinstance(saved, str) and saved != present:  # a checkpoint must not change texts such as names of files
         raise UnsavableError(f"{where} is text that changes, which is not restored")
     if not isinstance(saved, dict):
         return saved
+    if "same" in saved:
+        return known[saved["same"]]
     if "numpy" in saved:
         array = saved["numpy"].numpy().copy()
-        return array[()] if saved["scalar"] else array
+        if saved["scalar"]:
+            return array[()]
+        known.append(array)
+        return array
     if "keys" in saved:
-        keys = [_unpack(key, key, where) for key in saved["keys"]]
+        restored: dict[Any, Any] = {}
+        known.append(restored)  # before its parts, as it was numbered
+        keys = [_unpack(key, key, where, known) for key in saved["keys"]]
         before = present if isinstance(present, dict) else {}
-        return {k: _unpack(v, before.get(k), where) for k, v in zip(keys, saved["values"], strict=True)}
+        restored |= {k: _unpack(v, before.get(k), where, known) for k, v in zip(keys, saved["values"], strict=True)}
+        return restored
     for kind in (list, tuple):
         if kind.__name__ in saved:
             items, fits = saved[kind.__name__], isinstance(present, list | tuple)
             before = present if fits and len(present) == len(items) else [None] * len(items)
-            return kind(_unpack(item, old, where) for item, old in zip(items, before, strict=True))
+            parts: list[Any] = []
+            if kind is list:
+                known.append(parts)
+            parts += [_unpack(item, old, where, known) for item, old in zip(items, before, strict=True)]
+            return parts if kind is list else tuple(parts)
     if "generator" in saved and isinstance(present, np.random.Generator):
-        present.bit_generator.state = _unpack(saved["generator"], present.bit_generator.state, where)
+        present.bit_generator.state = _unpack(saved["generator"], present.bit_generator.state, where, known)
     elif "generator" in saved and isinstance(present, np.random.RandomState):
-        present.set_state(_unpack(saved["generator"], present.get_state(legacy=False), where))
+        present.set_state(_unpack(saved["generator"], present.get_state(legacy=False), where, known))
     elif "mujoco" in saved and (physics := _mujoco(present)) is not None:
         _load_mujoco(*physics, saved["mujoco"])
     elif "object" in saved and _is_one_of(present, _STATEFUL):
-        load_object(present, saved["object"])
+        load_object(present, saved["object"], known)
     else:
         raise UnsavableError(f"{where} is of type {type(present).__name__} here, and was of another kind when saved")
     return present

@@ -347,3 +347,27 @@ def test_training_on_a_gymnasium_environment(tmp_path):
 def test_the_documented_program_runs():
     text = (Path(__file__).resolve().parent.parent / "docs" / "guides" / "gymnasium.md").read_text()
     exec("\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)), {})
+
+
+@pytest.mark.parametrize(
+    ("space", "expected"),
+    [
+        (spaces.Box(-100, 100, (1,), np.int8), [-100, -50, 0, 50, 100]),
+        (spaces.Box(-1, 1, (1,), np.int64), [-1, 0, 0, 0, 1]),
+        (spaces.Box(0, 3, (1,), np.int32), [0, 1, 2, 2, 3]),
+        (spaces.Box(-60000, 60000, (1,), np.float16), [-60000, -30000, 0, 30000, 60000]),
+    ],
+)
+def test_boxes_of_small_types_are_scaled_and_rounded(space, expected):
+    units = (-0.999, -0.5, 0.0, 0.5, 0.999)  # a tanh does not reach the ends
+    taken = [native_action(space, iter(()), iter([unit])) for unit in units]
+    assert all(action in space for action in taken)
+    np.testing.assert_allclose([action[0] for action in taken], expected, rtol=0.01)
+
+
+def test_wrappers_with_running_means_start_alike_with_the_same_seed():
+    def make():
+        return gymnasium.wrappers.NormalizeObservation(Walk())
+
+    starts = [GymnasiumEnv(make, moved, 2, seed=0).reset()["observation"] for _ in range(2)]
+    torch.testing.assert_close(*starts, rtol=0, atol=0)

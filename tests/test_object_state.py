@@ -106,3 +106,24 @@ def test_methods_are_not_taken_from_a_checkpoint():
 def test_what_all_copies_share_is_left_out():
     shared = {"space": spaces.Discrete(3), "rule": abs, "kind": int, "library": np}
     assert set(save_object(Dice(steps=1, **shared))) == {"steps"}
+
+
+def test_what_attributes_share_is_shared_again():
+    def make(position):
+        agent, bag = np.array([position]), {"gold": [1]}
+        return Dice(agent=agent, bodies=[agent, np.ones(1)], bag=bag, gold=bag["gold"], player=Dice(bag=bag))
+
+    env = make(0.0)
+    load_object(env, through_a_file(save_object(make(5.0))))
+    env.agent += 1.0
+    env.gold.append(2)
+    assert env.bodies[0] is env.agent
+    assert env.bodies[0].tolist() == [6.0]
+    assert env.player.bag is env.bag
+    assert env.bag == {"gold": [1, 2]}
+
+
+def test_a_view_of_another_array_is_refused():
+    state = np.zeros(4)
+    with pytest.raises(UnsavableError, match=r"Dice\.position is a view"):
+        save_object(Dice(state=state, position=state[:2]))

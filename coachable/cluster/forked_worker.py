@@ -4,13 +4,12 @@ import contextlib
 import ctypes
 import multiprocessing
 import os
+import pickle
 import signal
 import sys
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import recv_handle, send_handle
 from typing import Any
-
-import cloudpickle
 
 from coachable.cluster.worker import Batch, RolloutWorker, WorkerSettings
 
@@ -89,9 +88,9 @@ def _serve(connection: Connection) -> None:
 
 
 def _portable(error: Exception) -> Exception:
-    """Return an error that can be pickled."""
-    try:
-        cloudpickle.loads(cloudpickle.dumps(error))
-    except Exception:
-        return RuntimeError(f"{type(error).__name__}: {error}")
-    return error
+    """Return an error that the actor can unpickle, which may lack the modules and `__main__` of the environment."""
+    with contextlib.suppress(Exception):
+        if type(error).__module__.partition(".")[0] in ("builtins", "coachable"):
+            pickle.loads(pickle.dumps(error))
+            return error
+    return RuntimeError(f"{type(error).__name__}: {error}")

@@ -33,9 +33,11 @@ def read_metric(run: Path, x: str, y: str) -> tuple[np.ndarray, np.ndarray]:
         ValueError: If the file is damaged, there is no such column, or no row has both values.
     """
     pairs: list[tuple[float, float]] = []
+    start = 0.0
     for table in metrics_files(run):
-        start = pairs[-1][0] if pairs else 0.0
-        pairs += [(start + at, value) for at, value in _read(table, x, y)]
+        own, end = _read(table, x, y)
+        pairs += [(start + at, value) for at, value in own]
+        start += end
     if not pairs:
         raise ValueError(f"{run} has no row with both {x!r} and {y!r}")
     points = np.array(pairs)
@@ -49,7 +51,8 @@ def metrics_files(run: Path) -> list[Path]:
     return in_order or [file for file in (run / "metrics.csv",) if file.is_file()]
 
 
-def _read(table: Path, x: str, y: str) -> list[tuple[float, float]]:
+def _read(table: Path, x: str, y: str) -> tuple[list[tuple[float, float]], float]:
+    """Return the values of both columns from the rows that have both, and the last value of the first column."""
     try:
         with table.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
@@ -60,12 +63,13 @@ def _read(table: Path, x: str, y: str) -> list[tuple[float, float]]:
         if name not in columns:
             raise ValueError(f"{table.parent} has no metric {name!r}: expected one of {columns}")
     try:
+        positions = [float(row[x]) for row in rows if row[x]]
         pairs = [(float(row[x]), float(row[y])) for row in rows if row[x] and row[y]]
     except ValueError as error:
         raise ValueError(f"{table} is damaged: {error} in {x!r} or {y!r}, expected numbers") from error
-    if not all(math.isfinite(at) for at, _ in pairs):
+    if not all(map(math.isfinite, positions)):
         raise ValueError(f"{table} has values of {x!r} that are not finite: choose another x")
-    return pairs
+    return pairs, positions[-1] if positions else 0.0
 
 
 def summarise_runs(runs: Sequence[Path], x: str, y: str, smooth: int = 5) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -86,8 +86,10 @@ def draw_style_grid(grid: StyleGrid, domain: Domain, space: StyleSpace, path: Pa
     axis, lines = grid_lines(grid.cells, space)
     rows, formats = grid.rows(), published(domain, grid.episodes, grid.cells[0])
     columns = {measured_column(name, grid.cells[0]): name for name in grid.episodes}
-    names = [columns[column] for column in formats if column in columns and columns[column] not in space]
+    known = [columns[column] for column in formats if column in columns]
+    names = [name for name in known if name not in space]
     names = [name for name in ((axis,) if axis in grid.episodes else ()) + tuple(names) if name != f"{axis}_error"]
+    names = names or known or list(grid.episodes)
     wide = min(len(names), _PANELS_PER_ROW)
     high = -(-len(names) // wide)
     with drawing(path, high, wide, size=(4.2 * wide, 3.8 * high)) as axes:

@@ -59,8 +59,9 @@ def native_action(space: spaces.Space, choices: Iterator[int], axes: Iterator[fl
             return np.array([next(choices) for _ in range(int(np.prod(space.shape)))], np.int8).reshape(space.shape)
         case spaces.Box():
             unit = np.array([next(axes) for _ in range(space.low.size)]).reshape(space.shape)
-            scaled = space.low + (space.high - space.low) * 0.5 * (unit + 1.0)
-            return scaled.clip(space.low, space.high).astype(space.dtype)
+            low, high = np.float64(space.low), np.float64(space.high)  # small types cannot hold high - low
+            scaled = (low + (high - low) * 0.5 * (unit + 1.0)).clip(low, high)
+            return (scaled.round() if np.issubdtype(space.dtype, np.integer) else scaled).astype(space.dtype)
         case spaces.Tuple():
             return tuple(native_action(part, choices, axes) for part in space)
         case spaces.Dict():

@@ -62,7 +62,8 @@ class GymnasiumEnv(EnvBase):
         self.heads = ActionHeads(tuple(sizes), axes)
         self._observation = np.zeros((num_envs, spaces.flatdim(first.observation_space)), dtype=np.float32)
         self._finished = np.zeros(num_envs, dtype=bool)
-        first.reset()
+        first.reset(seed=seed)  # wrappers may remember this episode, for instance in running means
+        first.action_space.seed(seed)
         trial = first.action_space.sample()
         observation, _, _, _, info = first.step(trial)
         self._num_features = len(checked_features(features(observation, trial, info)))

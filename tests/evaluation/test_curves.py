@@ -73,3 +73,12 @@ def test_the_command(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(["curves", f"fp32={tmp_path}/fp32_*"])
     assert "no run with a metrics.csv matches" in capsys.readouterr().err
+
+
+def test_a_stage_begins_where_the_one_before_ended_also_if_its_last_rows_lack_the_metric(tmp_path):
+    for stage, rows in (("0_walk", "100,\n200,1\n300,"), ("1_run", "100,2\n200,3")):
+        (tmp_path / "stages" / stage).mkdir(parents=True)
+        (tmp_path / "stages" / stage / "metrics.csv").write_text(f"frames,episode/return\n{rows}\n")
+    at, values = read_metric(tmp_path, "frames", "episode/return")
+    assert at.tolist() == [200.0, 400.0, 500.0]
+    assert values.tolist() == [1.0, 2.0, 3.0]

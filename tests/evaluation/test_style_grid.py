@@ -166,3 +166,10 @@ def test_an_unknown_domain_is_refused_with_the_known_ones():
 def test_no_episodes_are_refused():
     with pytest.raises(ValueError, match="at least 1, got 0"):
         evaluate_grid(DOMAIN, POLICY, SPACE, episodes=0)
+
+
+def test_a_grid_too_small_for_a_line_is_drawn_although_only_the_request_is_published(tmp_path):
+    domain = replace(DOMAIN, grid={"speed": (0.5, 1.5)}, columns={"measured_speed": ".2f"})
+    agent = LoadedPolicy(POLICY, SPACE, {}, {})
+    evaluate_styles(domain, agent, tmp_path, EvaluationSettings(2, switch_episodes=0, progress=False))
+    assert (tmp_path / "grid.png").stat().st_size > 1000
