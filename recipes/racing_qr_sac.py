@@ -3,7 +3,7 @@
 python recipes/racing_qr_sac.py                                tyre and fuel saving, on a CPU or a GPU
 python recipes/racing_qr_sac.py preset=resources               the same, then overtaking and defending in traffic
 python recipes/racing_qr_sac.py preset=drift                   drifting on request
-python recipes/racing_qr_sac.py preset=aggressiveness          margins to two agents and two rivals, in four stages
+python recipes/racing_qr_sac.py preset=aggressiveness          margins to two agents and two rivals, in five stages
 python recipes/racing_qr_sac.py preset=paper                   the paper's settings
 python recipes/racing_qr_sac.py preset=smoke                   every part once, within a minute
 
