@@ -32,5 +32,6 @@ try {
 } catch (error) {
   console.error(error);
   at("loading-bar").hidden = true;
+  at("loading-text").setAttribute("role", "alert");
   at("loading-text").textContent = `The page could not start: ${error.message}`;
 }

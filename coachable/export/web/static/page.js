@@ -4,6 +4,7 @@ import { at, make, megabytes } from "./dom.js";
 
 export class Page {
   resting = "Play"; // what the button says while the page is paused
+  standing = ""; // what the banner says while there is nothing else to tell
 
   constructor(manifest) {
     this.manifest = manifest;
@@ -15,10 +16,17 @@ export class Page {
   }
 
   tell(text, milliseconds = 0) {
-    at("banner").textContent = text;
-    at("banner").hidden = !text;
+    at("banner").textContent = text || this.standing;
+    at("banner").hidden = !at("banner").textContent;
     clearTimeout(this.quiet);
     if (milliseconds) this.quiet = setTimeout(() => this.tell(""), milliseconds);
+  }
+
+  /** Say that there is no picture, as long as the page is open. */
+  cannotDraw(error) {
+    console.error(error);
+    this.standing = "This browser cannot draw in 3-D: the numbers go on.";
+    this.tell("");
   }
 
   /** List what the colours of the scene mean. */
@@ -86,6 +94,7 @@ export function download(names, sizes) {
       if (done) break;
       chunks.push(value);
       loaded += value.length;
+      if (at("loading-bar").hidden) continue; // the page could not start, and says why
       at("loading-bar").value = loaded / total;
       at("loading-text").textContent =
         loaded < total ? `Loading: ${megabytes(loaded)} of ${megabytes(total)}` : "Starting …";

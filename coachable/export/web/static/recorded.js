@@ -34,8 +34,7 @@ class RecordedPage extends Page {
     try {
       this.scene = new drawing.RecordedScene(at("scene"), at("labels"), manifest.viewpoint);
     } catch (error) {
-      console.error(error);
-      this.tell("This browser cannot draw in 3-D: the numbers go on.");
+      this.cannotDraw(error);
     }
     this.panel = new RecordedPanel(at("requests"), at("others"), manifest, (name, value) => this.ask(name, value));
     this.time = moment; // [s]
@@ -48,7 +47,7 @@ class RecordedPage extends Page {
       if (moment) this.seek(moment);
       this.select(number);
     });
-    addEventListener("resize", () => this.panel.select(this.number));
+    addEventListener("resize", () => this.panel.select(this.wanted));
     at("moment-row").hidden = false;
     at("moment").addEventListener("input", () => this.seek(Number(at("moment").value)));
     this.listen({ again: () => this.seek(0) });
@@ -70,8 +69,8 @@ class RecordedPage extends Page {
     this.wanted = number;
     this.panel.select(number);
     history.replaceState(null, "", fragmentOf(this.manifest, number));
-    const recording = await this.#read(number);
-    if (this.wanted !== number) return; // the visitor asked for something else meanwhile
+    const recording = await this.#read(number).catch((error) => this.#miss(number, error));
+    if (this.wanted !== number) return; // the visitor asked for something else meanwhile, or it is missing
     this.number = number;
     this.recording = recording;
     this.length = (recording.frames - 1) * this.manifest.control_step;
@@ -80,6 +79,19 @@ class RecordedPage extends Page {
     this.shown = null;
     this.seek(this.time);
     at("announcement").textContent = this.panel.sentences(number);
+  }
+
+  /** Go on with the recording that is shown, because another one could not be loaded. */
+  #miss(number, error) {
+    if (this.number === undefined) throw error; // there is none yet
+    console.error(error);
+    if (this.wanted !== number) return;
+    this.wanted = this.number;
+    this.panel.select(this.number);
+    history.replaceState(null, "", fragmentOf(this.manifest, this.number));
+    const words = "This recording could not be loaded: try again";
+    this.tell(words, 4000);
+    at("announcement").textContent = words;
   }
 
   /** Go to a moment [s]. */
@@ -142,14 +154,16 @@ class RecordedPage extends Page {
   #read(number) {
     if (!this.loaded.has(number)) {
       const { file } = this.manifest.recordings[number];
-      this.loaded.set(number, fetchBytes(file).then(decode));
+      const recording = fetchBytes(file).then(decode);
+      this.loaded.set(number, recording);
+      recording.catch(() => this.loaded.delete(number)); // so that it can be tried again
     }
     return this.loaded.get(number);
   }
 
   /** Load the other recordings one after the other, so that the sliders act at once. */
   async #prefetch() {
-    for (const number of this.manifest.recordings.keys()) await this.#read(number).catch(() => this.loaded.delete(number));
+    for (const number of this.manifest.recordings.keys()) await this.#read(number).catch(() => {});
   }
 }
 

@@ -46,11 +46,6 @@ export class SimulatedPage extends Page {
     }
   }
 
-  cannotDraw(error) {
-    console.error(error);
-    this.tell("This browser cannot draw in 3-D: the numbers go on.");
-  }
-
   /** What buttons and keys do. */
   get actions() {
     return { push: () => this.push(), again: () => this.again() };
@@ -87,7 +82,12 @@ export class SimulatedPage extends Page {
     this.panel.measured(this.readout);
     this.announceAt = this.time + ANNOUNCE;
     this.#steer(0);
-    history.replaceState(null, "", fragmentOf(this.entries, request));
+    clearTimeout(this.writing); // browsers refuse when the address changes too often
+    this.writing = setTimeout(() => history.replaceState(null, "", this.link), 200);
+  }
+
+  get link() {
+    return new URL(fragmentOf(this.entries, this.request), location.href).href;
   }
 
   /** Let the controls approach what is asked for during some time [s]. */
@@ -132,13 +132,14 @@ export class SimulatedPage extends Page {
     this.before = now;
     const { control_step: step } = this.manifest.physics;
     if (!this.paused && this.fell === null) {
-      this.pending += Math.min(elapsed, this.behind);
+      const caught = Math.min(elapsed, this.behind);
+      this.pending += caught;
       let steps = 0;
       for (; this.pending >= step && this.fell === null; steps++) {
         await this.advance();
         this.pending -= step;
       }
-      this.#pace(elapsed, steps * step);
+      this.#pace(elapsed, caught); // not the steps, which most pictures of a fast screen have none of
       if (steps) this.panel.measured(this.readout);
       this.scene?.draw(Math.min(this.pending / step, 1));
       at("clock").textContent = `${this.time.toFixed(1)} s`;
