@@ -207,8 +207,7 @@ class CoachSession:
             values = self._preset(style) if isinstance(style, str) else dict(style)
             theta = self.space.make(strict=self.strict, **(self.style | values))
             request = {name: value for name, value in self.space.describe(theta).items() if name in values}
-            step = round(min(seconds / self.domain.control_step, 1e18))
-            agenda.setdefault(step, {"style": {}})["style"] |= request
+            agenda.setdefault(round(min(seconds / self.domain.control_step, 1e18)), {"style": {}})["style"] |= request
         self._timeline.plan(agenda)
 
     @property
@@ -237,16 +236,11 @@ class CoachSession:
         self._influences.values |= self._influences.wanted
         start = Recording(self.domain.name, self.source, seed, self.style, self.controls, self._episodes.endless)
         self._timeline = Timeline(start)
-        self._steps_at_request, self._complied_at = 0, None
+        self._steps_at_request, self._complied_at, self.seed = 0, None, seed
         self._generator = torch.Generator().manual_seed(seed)
         self._episodes.seed(seed)
         self._influences.steer(self.base_env)
         self._begin_episode()
-
-    @property
-    def seed(self) -> int:
-        """Seed with which the session last started over."""
-        return self._timeline.seed
 
     @property
     def step_count(self) -> int:

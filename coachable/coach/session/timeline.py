@@ -34,11 +34,6 @@ class Timeline:
         self._expected: dict[int, int] = {}
         self._repeats = False  # whether the coming events are those of a recording
 
-    @property
-    def seed(self) -> int:
-        """Seed of the recording."""
-        return self._recording.seed
-
     def note(self, event: Event) -> None:
         """Record an event before the next step."""
         self._recording.events.append({"step": self.step, **event})
