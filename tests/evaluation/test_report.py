@@ -152,7 +152,6 @@ def test_what_a_domain_measures_itself_is_on_the_page(tmp_path):
     def evaluation(domain, agent, out, settings):
         assert replace(settings, sweeps=None) == EvaluationSettings(episodes=2, switch_episodes=4, progress=False)
         assert [sweep.weight for sweep in settings.sweeps] == ["bold"]
-        out.mkdir()
         (out / "every_step.csv").write_text("step\n" + "1\n" * 101)
         (out / "wins.csv").write_text("style,easy_machine\nred,0.5\n")
         (out / "wins.png").write_bytes((out.parent / "styles.png").read_bytes())
