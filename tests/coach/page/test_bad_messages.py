@@ -79,6 +79,7 @@ def test_bad_numbers_in_a_message(page):
         send(target, 7.0)
         wait_for(lambda: page.session.report().outside == {"target": 7.0})
         assert page.session.style["target"] == pytest.approx(0.8)
+        wait_for(lambda: page.widgets["target"].handle.value == pytest.approx(0.8))  # which replaces a new value, too
         send(target, 0.25)
         wait_for(lambda: page.session.style["target"] == pytest.approx(0.25))
 
