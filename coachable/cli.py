@@ -2,7 +2,6 @@
 
 import argparse
 import glob
-import json
 import runpy
 import sys
 import time
@@ -197,15 +196,6 @@ def _train_seeds(file: Path, arguments: list[str], seeds: str) -> int:
     folder = Path(folders[-1] if folders else f"runs/{file.stem}/seeds_{time.strftime('%Y-%m-%d_%H-%M-%S')}")
     arguments = [argument for argument in arguments if not argument.startswith("run_dir=")]
     chosen = parse_seeds(seeds.partition("=")[2])
-    record = folder / "arguments.json"
-    said = json.loads(record.read_text(encoding="utf-8")) if record.exists() else arguments
-    if said != arguments:
-        raise ValueError(
-            f"{folder} holds trainings with {' '.join(map(str, said)) or 'no settings'}: "
-            "expected the same settings, or another folder with run_dir=PATH"
-        )
-    folder.mkdir(parents=True, exist_ok=True)
-    record.write_text(json.dumps(arguments), encoding="utf-8")
     print(f"Writing to {folder}; run_dir={folder} continues what Ctrl-C interrupts", flush=True)
     failed = train_seeds(file, arguments, chosen, folder)
     print(seed_table(folder, chosen, failed), end="")

@@ -126,10 +126,10 @@ def make_loss(run: Run, actor: nn.Module, critics: list[nn.Module], env: EnvBase
         ValueError: If the loss does not serve the actions, or needs more critics.
     """
     settings = run.settings
-    if settings.loss._target_.endswith(".SACLoss") and len(critics) < 2:
+    is_sac = settings.loss._target_.endswith(".SACLoss")
+    if is_sac and len(critics) < 2:
         raise ValueError(f"network.num_critics is {len(critics)}: expected at least 2 with loss=sac")
-    buttons = settings.network.actor.get("heads", {}).get("categorical")
-    if settings.loss._target_.endswith(".SACLoss") and buttons:
+    if is_sac and settings.network.actor.get("heads", {}).get("categorical"):
         raise ValueError(f"loss=sac serves continuous actions only, {settings.domain} has buttons: expected cat_rac")
     loss = settings.loss.build(actor, critics, action_spec=env.action_spec, num_qvalue_nets=len(critics))
     loss.make_value_estimator(gamma=settings.gamma)

@@ -1,6 +1,7 @@
 """Training of one recipe with several seeds, side by side in processes of their own, and a table of the results."""
 
 import ctypes
+import json
 import math
 import os
 import signal
@@ -51,8 +52,19 @@ def train_seeds(script: Path, arguments: Sequence[str], seeds: Sequence[int], fo
 
     Returns:
         What is wrong with the trainings that did not end, by seed.
+
+    Raises:
+        ValueError: If the folder holds trainings with other arguments.
     """
+    record = folder / "arguments.json"
+    said = json.loads(record.read_text(encoding="utf-8")) if record.exists() else [*arguments]
+    if said != [*arguments]:
+        raise ValueError(
+            f"{folder} holds trainings with {' '.join(map(str, said)) or 'no settings'}: "
+            "expected the same settings, or another folder with run_dir=PATH"
+        )
     folder.mkdir(parents=True, exist_ok=True)
+    record.write_text(json.dumps(said), encoding="utf-8")
     hardware = detect()
     free = max(1, hardware.cores - round(hardware.busy))
     at_once = min(len(seeds), free)

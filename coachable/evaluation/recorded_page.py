@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,7 @@ from torchrl.envs import EnvBase
 
 from coachable.domain import Domain
 from coachable.evaluation.episode_records import record_episodes
-from coachable.evaluation.style_grid import published
+from coachable.evaluation.style_grid import published, without_nan
 from coachable.evaluation.wording import measures_by_parameter, readable, unit_of
 from coachable.export.web.pinned_files import provide
 from coachable.export.web.simulated_page import about, copy_page, finish_page
@@ -120,8 +119,7 @@ def export_recordings(
             places = {place: names.index(content) for place, content in recording.backdrops.items()}
             file = f"{_FOLDER}/{number}.bin"
             (folder / file).write_bytes(encode_frames(recording.frames, places))
-            found = {measure["name"]: recording.measured[measure["name"]] for measure in shown}
-            found = {name: value if math.isfinite(value) else None for name, value in found.items()}
+            found = without_nan({measure["name"]: recording.measured[measure["name"]] for measure in shown})
             played.append({"file": file, "style": request, "terminated": recording.terminated, "measured": found})
         for content, file in backdrops.items():
             (folder / file).write_bytes(content)

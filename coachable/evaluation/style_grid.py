@@ -169,17 +169,17 @@ def write_results(
     for name, rows in tables.items():
         if rows:
             write_csv(rows, out / f"{name}.csv")
-    (out / "summary.json").write_text(json.dumps(_without_nan(summary), indent=2) + "\n")
+    (out / "summary.json").write_text(json.dumps(without_nan(summary), indent=2) + "\n")
     (out / "report.md").write_text(report)
     return report
 
 
-def _without_nan(value: Any) -> Any:
+def without_nan(value: Any) -> Any:
     """Return nested dictionaries and lists with None instead of NaN and infinity, which JSON does not have."""
     if isinstance(value, Mapping):
-        return {name: _without_nan(part) for name, part in value.items()}
+        return {name: without_nan(part) for name, part in value.items()}
     if isinstance(value, list | tuple):
-        return [_without_nan(part) for part in value]
+        return [without_nan(part) for part in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -66,9 +66,7 @@ class RecordedPage extends Page {
 
   /** Show a recording from the present moment on. */
   async select(number) {
-    this.wanted = number;
-    this.panel.select(number);
-    history.replaceState(null, "", fragmentOf(this.manifest, number));
+    this.#choose(number);
     const recording = await this.#read(number).catch((error) => this.#miss(number, error));
     if (this.wanted !== number) return; // the visitor asked for something else meanwhile, or it is missing
     this.number = number;
@@ -81,14 +79,19 @@ class RecordedPage extends Page {
     at("announcement").textContent = this.panel.sentences(number);
   }
 
+  /** Say on the panel and in the address which recording is wanted. */
+  #choose(number) {
+    this.wanted = number;
+    this.panel.select(number);
+    history.replaceState(null, "", fragmentOf(this.manifest, number));
+  }
+
   /** Go on with the recording that is shown, because another one could not be loaded. */
   #miss(number, error) {
     if (this.number === undefined) throw error; // there is none yet
     console.error(error);
     if (this.wanted !== number) return;
-    this.wanted = this.number;
-    this.panel.select(this.number);
-    history.replaceState(null, "", fragmentOf(this.manifest, this.number));
+    this.#choose(this.number);
     const words = "This recording could not be loaded: try again";
     this.tell(words, 4000);
     at("announcement").textContent = words;
