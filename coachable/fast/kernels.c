@@ -92,13 +92,15 @@ void adam(const Parameter *parameters, int64_t count, float rate, float beta1, f
 
 /* Products of bfloat16 matrices with float32 sums, and the float32 products of a head, on one thread. The right factor
  * is packed first, into memory that stays in the cache from product to product: blocks of BLOCK columns, each
- * (inner / 2, BLOCK, 2). An odd inner dimension is filled up with zeros. ROWS x BLOCK sums stay in registers, which
- * leaves 8 of 32. */
+ * (pairs, BLOCK, 2). An inner dimension that does not fill its pairs is filled up with zeros. Sums are made for PANEL
+ * rows at once, in vector registers, or in tiles where the processor has them (AMX). */
 #ifdef __AVX512BF16__
 #include <immintrin.h>
 #include <stdlib.h>
+#include <sys/syscall.h>
+#include <unistd.h>
 
-#define ROWS 6
+#define ROWS 6 /* ROWS x BLOCK sums leave 8 of 32 vector registers */
 #define BLOCK 64
 #define EACH_ROW(DO) DO(0) DO(1) DO(2) DO(3) DO(4) DO(5)
 
@@ -141,10 +143,6 @@ static inline void rows_from(const uint16_t *matrix, int64_t stride, int64_t i, 
     for (int r = 0; r < ROWS; r++) left[r] = matrix + smaller(i + r, rows - 1) * stride;
 }
 
-static int64_t packed_size(int64_t inner, int64_t n) {
-    return (inner + 1) / 2 * 2 * ((n + BLOCK - 1) / BLOCK * BLOCK);
-}
-
 /* The thread's memory for packed factors. */
 static uint16_t *packing_memory(int64_t size) {
     static _Thread_local uint16_t *memory;
@@ -176,9 +174,141 @@ static inline void transpose(__m512i *m) {
     }
 }
 
+/* PANEL rows of a left factor, and their products with one block of a right factor. */
+#if defined(__AMX_BF16__) && defined(__linux__)
+#define PANEL 32
+
+typedef struct {
+    const uint16_t *first;
+    int64_t stride;
+} Panel;
+
+/* Pairs of an inner dimension: a tile holds 16. */
+static inline int64_t pairs_of(int64_t inner) { return (inner + 31) / 32 * 16; }
+
+/* Tiles have 16 rows of 64 bytes. Others on this thread may have settings of their own, which are put back. */
+typedef struct {
+    uint8_t palette, start, reserved[14];
+    uint16_t bytes[16];
+    uint8_t rows[16];
+} Tiles;
+
+/* Compilers do not know all memory that instructions on tiles read and write. */
+#define TOUCH(address) __asm__ volatile("" ::"r"(address) : "memory")
+
+static void load_tiles(Tiles wanted) {
+    TOUCH(&wanted);
+    _tile_loadconfig(&wanted);
+}
+
+static Tiles set_tiles(void) {
+    Tiles wanted = {.palette = 1}, before;
+    for (int i = 0; i < 8; i++) wanted.bytes[i] = 64, wanted.rows[i] = 16;
+    TOUCH(&before);
+    _tile_storeconfig(&before);
+    TOUCH(&before);
+    load_tiles(wanted);
+    return before;
+}
+
+static void reset_tiles(Tiles before) { load_tiles(before); }
+
+/* Whether the kernel lets this process use tiles. */
+int tiles_allowed(void) { return !syscall(SYS_arch_prctl, 0x1023 /* ARCH_REQ_XCOMP_PERM */, 18 /* their data */); }
+
+/* Rows from i of a row-major matrix (rows, inner); copied to `memory` if they do not fill the tiles. */
+static inline Panel panel_of(const uint16_t *matrix, int64_t stride, int64_t i, int64_t rows, int64_t inner,
+                             uint16_t *memory) {
+    const int64_t width = 2 * pairs_of(inner), count = smaller(PANEL, rows - i);
+    if (count == PANEL && width == inner) return (Panel){matrix + i * stride, stride};
+    memset(memory, 0, PANEL * width * sizeof *memory);
+    for (int64_t r = 0; r < count; r++)
+        memcpy(memory + r * width, matrix + (i + r) * stride, inner * sizeof *memory);
+    return (Panel){memory, width};
+}
+
+/* Columns from i of a matrix (inner, m) that is packed like a right factor, as rows. */
+static inline Panel panel_of_columns(const uint16_t *packed, int64_t i, int64_t m, int64_t pairs, uint16_t *memory) {
+    (void)m;
+    for (int64_t c = i; c < i + PANEL; c += 16)
+        for (int64_t k = 0; k < pairs; k += 16) {
+            const uint16_t *from = packed + (c / BLOCK * pairs + k) * 2 * BLOCK + c % BLOCK * 2;
+            __m512i t[16];
+            for (int64_t r = 0; r < 16; r++) t[r] = _mm512_loadu_si512(from + r * 2 * BLOCK);
+            transpose(t);
+            for (int64_t r = 0; r < 16; r++) _mm512_storeu_si512(memory + (c - i + r) * 2 * pairs + 2 * k, t[r]);
+        }
+    return (Panel){memory, 2 * pairs};
+}
+
+static inline void multiply(const Panel *left, const uint16_t *right, int64_t pairs, int64_t columns, float *sums) {
+    TOUCH(left->first);
+    for (int64_t c = 0; c < smaller(BLOCK, columns); c += 32) {
+        _tile_zero(0);
+        _tile_zero(1);
+        _tile_zero(2);
+        _tile_zero(3);
+        for (int64_t k = 0; k < pairs; k += 16) {
+            const uint16_t *x = left->first + 2 * k, *y = right + k * 2 * BLOCK + 2 * c;
+            _tile_loadd(4, x, 2 * left->stride);
+            _tile_loadd(6, y, 4 * BLOCK);
+            _tile_loadd(7, y + 32, 4 * BLOCK);
+            _tile_loadd(5, x + 16 * left->stride, 2 * left->stride);
+            _tile_dpbf16ps(0, 4, 6);
+            _tile_dpbf16ps(1, 4, 7);
+            _tile_dpbf16ps(2, 5, 6);
+            _tile_dpbf16ps(3, 5, 7);
+        }
+        _tile_stored(0, sums + c, 4 * BLOCK);
+        _tile_stored(1, sums + c + 16, 4 * BLOCK);
+        _tile_stored(2, sums + 16 * BLOCK + c, 4 * BLOCK);
+        _tile_stored(3, sums + 16 * BLOCK + c + 16, 4 * BLOCK);
+    }
+}
+#else
+#define PANEL ROWS
+
+typedef struct {
+    const uint16_t *row[ROWS];
+    int64_t step;
+} Panel;
+
+static inline int64_t pairs_of(int64_t inner) { return (inner + 1) / 2; }
+
+typedef int Tiles;
+static Tiles set_tiles(void) { return 0; }
+static void reset_tiles(Tiles before) { (void)before; }
+int tiles_allowed(void) { return 0; }
+
+static inline Panel panel_of(const uint16_t *matrix, int64_t stride, int64_t i, int64_t rows, int64_t inner,
+                             uint16_t *memory) {
+    (void)inner, (void)memory;
+    Panel panel = {.step = 2};
+    rows_from(matrix, stride, i, rows, panel.row);
+    return panel;
+}
+
+static inline Panel panel_of_columns(const uint16_t *packed, int64_t i, int64_t m, int64_t pairs, uint16_t *memory) {
+    (void)memory;
+    Panel panel = {.step = 2 * BLOCK};
+    for (int64_t r = 0; r < ROWS; r++) {
+        const int64_t column = smaller(i + r, m - 1);
+        panel.row[r] = packed + column / BLOCK * pairs * 2 * BLOCK + column % BLOCK * 2;
+    }
+    return panel;
+}
+
+static inline void multiply(const Panel *left, const uint16_t *right, int64_t pairs, int64_t columns, float *sums) {
+    (void)columns;
+    tile(left->row, left->step, right, pairs, 0, sums);
+}
+#endif
+
+static int64_t packed_size(int64_t inner, int64_t n) { return 2 * pairs_of(inner) * ((n + BLOCK - 1) / BLOCK * BLOCK); }
+
 /* Right factor from a matrix (n, inner) of which the transpose is wanted. */
 static void pack_transposed(const uint16_t *matrix, int64_t n, int64_t inner, uint16_t *packed) {
-    const int64_t pairs = (inner + 1) / 2;
+    const int64_t pairs = pairs_of(inner);
     for (int64_t j = 0; j < n; j += 16) {
         uint16_t *to = packed + j / BLOCK * pairs * 2 * BLOCK + j % BLOCK * 2;
         for (int64_t k = 0; k < inner; k += 32) {
@@ -198,8 +328,8 @@ static void pack_transposed(const uint16_t *matrix, int64_t n, int64_t inner, ui
 
 /* Right factor from a matrix (inner, n) with rows `stride` apart. */
 static void pack(const uint16_t *matrix, int64_t inner, int64_t n, int64_t stride, uint16_t *packed) {
-    const int64_t pairs = (inner + 1) / 2;
-    for (int64_t k = 0; k < inner; k += 2)
+    const int64_t pairs = pairs_of(inner);
+    for (int64_t k = 0; k < 2 * pairs; k += 2)
         for (int64_t j = 0; j < n; j += BLOCK) {
             const int64_t columns = smaller(BLOCK, n - j);
             const uint16_t *one = matrix + k * stride + j, *two = one + stride;
@@ -210,7 +340,7 @@ static void pack(const uint16_t *matrix, int64_t inner, int64_t n, int64_t strid
             }
             if (k + 1 < inner)
                 for (int64_t c = 0; c < columns; c++) pair[c] = one[c] | (uint32_t)two[c] << 16;
-            else
+            else if (k < inner)
                 for (int64_t c = 0; c < columns; c++) pair[c] = one[c];
             memcpy(packed + 2 * j * pairs + k * BLOCK, pair, sizeof pair);
         }
@@ -221,40 +351,41 @@ static void pack(const uint16_t *matrix, int64_t inner, int64_t n, int64_t strid
 void dense_forward(int64_t inner, const uint16_t *weight, uint16_t *z, const float *bias, const float *gamma,
                    const float *beta, const uint16_t *x, int64_t x_stride, int64_t from, int64_t to, int64_t width,
                    float eps, int64_t rows, int64_t n, uint16_t *out, float *mean, float *rstd, float *scratch) {
-    const int64_t pairs = (inner + 1) / 2;
-    uint16_t *packed = packing_memory(packed_size(inner, n));
-    const uint16_t *left[ROWS];
-    float sums[ROWS * BLOCK];
+    const int64_t pairs = pairs_of(inner), size = packed_size(inner, n);
+    uint16_t *packed = packing_memory(size + PANEL * 2 * pairs);
+    float sums[PANEL * BLOCK];
+    const Tiles before = set_tiles();
     pack_transposed(weight, n, inner, packed);
-    for (int64_t i = 0; i < rows; i += ROWS) {
-        const int64_t count = smaller(ROWS, rows - i);
-        rows_from(x, x_stride, i, rows, left);
+    for (int64_t i = 0; i < rows; i += PANEL) {
+        const int64_t count = smaller(PANEL, rows - i);
+        const Panel left = panel_of(x, x_stride, i, rows, inner, packed + size);
         for (int64_t j = 0; j < n; j += BLOCK) {
             const int64_t columns = smaller(BLOCK, n - j);
-            tile(left, 2, packed + j * 2 * pairs, pairs, 0, sums);
+            multiply(&left, packed + j * 2 * pairs, pairs, columns, sums);
             for (int64_t r = 0; r < count; r++)
                 for (int64_t c = 0; c < columns; c++) z[(i + r) * n + j + c] = narrow(sums[r * BLOCK + c]);
         }
         layer_forward_bf16(z + i * n, bias, gamma, beta, x + i * x_stride, x_stride, from, to, width, eps, count, n,
                            out + i * n, mean + i, rstd + i, scratch);
     }
+    reset_tiles(before);
 }
 
 /* Gradient of a layer's input: below (rows, n) = dz (rows, inner) times weight (inner, n; rows `stride` apart),
  * plus columns from `to` of grad (rows, inner) at columns from `from`, which may be negative; an even inner dimension. */
 void dense_backward(const uint16_t *dz, int64_t rows, int64_t inner, const uint16_t *weight, int64_t stride, int64_t n,
                     const uint16_t *restrict grad, int64_t from, int64_t to, int64_t width, uint16_t *restrict below) {
-    const int64_t pairs = inner / 2;
-    uint16_t *packed = packing_memory(packed_size(inner, n));
-    const uint16_t *left[ROWS];
-    float sums[ROWS * BLOCK];
+    const int64_t pairs = pairs_of(inner), size = packed_size(inner, n);
+    uint16_t *packed = packing_memory(size + PANEL * 2 * pairs);
+    float sums[PANEL * BLOCK];
+    const Tiles before = set_tiles();
     pack(weight, inner, n, stride, packed);
-    for (int64_t i = 0; i < rows; i += ROWS) {
-        rows_from(dz, inner, i, rows, left);
+    for (int64_t i = 0; i < rows; i += PANEL) {
+        const Panel left = panel_of(dz, inner, i, rows, inner, packed + size);
         for (int64_t j = 0; j < n; j += BLOCK) {
             const int64_t first = from > j ? from - j : 0, last = smaller(from + width, j + BLOCK) - j;
-            tile(left, 2, packed + j * 2 * pairs, pairs, 0, sums);
-            for (int64_t r = 0; r < smaller(ROWS, rows - i); r++) {
+            multiply(&left, packed + j * 2 * pairs, pairs, n - j, sums);
+            for (int64_t r = 0; r < smaller(PANEL, rows - i); r++) {
                 float *restrict s = sums + r * BLOCK;
                 const uint16_t *restrict g = grad + (i + r) * inner + to - from + j;
                 for (int64_t c = first; c < last; c++) s[c] += widen(g[c]);
@@ -262,38 +393,38 @@ void dense_backward(const uint16_t *dz, int64_t rows, int64_t inner, const uint1
             }
         }
     }
+    reset_tiles(before);
 }
 
 /* Gradient of a weight (m, n), added to what is there if `add`: the transpose of dz (rows, m) times x (rows, n). */
 void weight_gradient(const uint16_t *dz, int64_t m, const uint16_t *x, int64_t n, int64_t x_stride, int64_t rows,
                      int add, float *restrict grad) {
-    const int64_t pairs = (rows + 1) / 2, size = packed_size(rows, m);
-    uint16_t *dz_packed = packing_memory(size + packed_size(rows, n)), *x_packed = dz_packed + size;
-    const uint16_t *left[ROWS];
-    float sums[ROWS * BLOCK];
+    const int64_t pairs = pairs_of(rows), dz_size = packed_size(rows, m), x_size = packed_size(rows, n);
+    uint16_t *dz_packed = packing_memory(dz_size + x_size + PANEL * 2 * pairs), *x_packed = dz_packed + dz_size;
+    float sums[PANEL * BLOCK];
+    const Tiles before = set_tiles();
     pack(dz, rows, m, m, dz_packed);
     pack(x, rows, n, x_stride, x_packed);
-    for (int64_t i = 0; i < m; i += ROWS) {
-        for (int64_t r = 0; r < ROWS; r++) { /* a column of dz, which lies where it would in a right factor */
-            const int64_t row = smaller(i + r, m - 1);
-            left[r] = dz_packed + row / BLOCK * pairs * 2 * BLOCK + row % BLOCK * 2;
-        }
+    for (int64_t i = 0; i < m; i += PANEL) {
+        const Panel left = panel_of_columns(dz_packed, i, m, pairs, x_packed + x_size);
         for (int64_t j = 0; j < n; j += BLOCK) {
-            tile(left, 2 * BLOCK, x_packed + j * 2 * pairs, pairs, 0, sums);
-            for (int64_t r = 0; r < smaller(ROWS, m - i); r++)
+            multiply(&left, x_packed + j * 2 * pairs, pairs, n - j, sums);
+            for (int64_t r = 0; r < smaller(PANEL, m - i); r++)
                 for (int64_t c = 0; c < smaller(BLOCK, n - j); c++) {
                     float *to = grad + (i + r) * n + j + c;
                     *to = (add ? *to : 0.0f) + sums[r * BLOCK + c];
                 }
         }
     }
+    reset_tiles(before);
 }
 
 /* A linear head of many outputs, in float32: the same as head_forward below. */
 void wide_head_forward(const uint16_t *restrict x, const float *weight, const float *restrict bias, int64_t rows,
                        int64_t n, int64_t outputs, float *restrict y) {
-    uint16_t *packed = packing_memory(packed_size(2 * n, outputs) + ROWS * 2 * n);
-    float *some = (float *)(packed + packed_size(2 * n, outputs)), sums[ROWS * BLOCK];
+    const int64_t size = packed_size(2 * n, outputs), pairs = pairs_of(2 * n); /* each pair is a number here */
+    uint16_t *packed = packing_memory(size + ROWS * 2 * n);
+    float *some = (float *)(packed + size), sums[ROWS * BLOCK];
     const uint16_t *left[ROWS];
     pack_transposed((const uint16_t *)weight, outputs, 2 * n, packed);
     for (int64_t i = 0; i < rows; i += ROWS) {
@@ -301,7 +432,7 @@ void wide_head_forward(const uint16_t *restrict x, const float *weight, const fl
         for (int64_t k = 0; k < count * n; k++) some[k] = widen(x[i * n + k]);
         rows_from((uint16_t *)some, 2 * n, 0, count, left);
         for (int64_t j = 0; j < outputs; j += BLOCK) {
-            tile(left, 2, packed + j * 2 * n, n, 1, sums);
+            tile(left, 2, packed + j * 2 * pairs, n, 1, sums);
             for (int64_t r = 0; r < count; r++)
                 for (int64_t c = 0; c < smaller(BLOCK, outputs - j); c++)
                     y[(i + r) * outputs + j + c] = sums[r * BLOCK + c] + bias[j + c];

@@ -24,7 +24,7 @@ _TYPES = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int)
 _SOURCE = Path(__file__).with_name("sac.c")
 _INCLUDED = Path(__file__).with_name("kernels.c")
 _FLAGS = (
-    *("-O3", "-march=native", "-mprefer-vector-width=512", "-std=c11", "-shared", "-fPIC"),
+    *("-O3", "-march=native", "-mprefer-vector-width=512", "-std=gnu11", "-shared", "-fPIC"),
     # Sums in any order; infinities and NaN keep their meaning.
     *("-fno-math-errno", "-fno-trapping-math", "-fassociative-math", "-fno-signed-zeros", "-freciprocal-math"),
 )
@@ -139,9 +139,15 @@ def _only_ours(path: Path) -> bool:
 
 
 def _products(library: ctypes.CDLL) -> Products | None:
-    """Return the products where the processor has bfloat16 in vector registers; with AMX, torch's are faster."""
+    """Return the products where the processor has bfloat16 in vector registers.
+
+    Where it also has tiles (AMX) that the library does not use, because the compiler or the kernel does not know them,
+    torch's products are faster.
+    """
     capabilities = torch.cpu.get_capabilities()
-    if not capabilities.get("avx512_bf16") or capabilities.get("amx_bf16") or not hasattr(library, "dense_forward"):
+    if not capabilities.get("avx512_bf16") or not hasattr(library, "dense_forward"):
+        return None
+    if capabilities.get("amx_bf16") and not library.tiles_allowed():
         return None
     p, i, flag = _TYPES
     arguments = {
