@@ -221,9 +221,11 @@ static inline Panel panel_of(const uint16_t *matrix, int64_t stride, int64_t i, 
                              uint16_t *memory) {
     const int64_t width = 2 * pairs_of(inner), count = smaller(PANEL, rows - i);
     if (count == PANEL && width == inner) return (Panel){matrix + i * stride, stride};
-    memset(memory, 0, PANEL * width * sizeof *memory);
-    for (int64_t r = 0; r < count; r++)
+    for (int64_t r = 0; r < count; r++) {
         memcpy(memory + r * width, matrix + (i + r) * stride, inner * sizeof *memory);
+        memset(memory + r * width + inner, 0, (width - inner) * sizeof *memory);
+    }
+    memset(memory + count * width, 0, (PANEL - count) * width * sizeof *memory);
     return (Panel){memory, width};
 }
 

@@ -137,6 +137,18 @@ def test_product_of_the_forward_pass(rows, inner, n):
 
 
 @needs_products
+def test_products_leave_the_tiles_to_torch():
+    """Where the processor has tiles, torch's products configure them too, some only once per thread."""
+    rows, inner, n = 64, 128, 96
+    dz, x, grad = rounded(rows, n), rounded(rows, inner), normal(n, inner)
+    expected = dz.float().t() @ x.float()
+    before = torch.mm(dz.t(), x)
+    products.weight_gradient(dz.data_ptr(), n, x.data_ptr(), inner, inner, rows, 0, grad.data_ptr())
+    torch.testing.assert_close(grad, expected, rtol=1e-4, atol=1e-3)
+    assert torch.equal(torch.mm(dz.t(), x), before)
+
+
+@needs_products
 @pytest.mark.parametrize(
     ("rows", "inner", "n", "to"),
     [(1, 2, 1, 0), (7, 64, 71, 0), (13, 128, 109, 19), (64, 200, 128, 72), (3, 18, 17, 1), (257, 2, 255, 0)],
