@@ -25,6 +25,19 @@ static inline uint16_t narrow(float f) {
     return (uint16_t)((bits + 0x7fffu + ((bits >> 16) & 1u)) >> 16);
 }
 
+/* While this is in scope, floats below 1.2e-38 count as 0, with which some processors take over a hundred cycles each. The
+ * gradients of a distribution over many bins have them. */
+#ifdef __SSE2__
+#include <immintrin.h>
+
+static inline void set_mode(const unsigned *mode) { _mm_setcsr(*mode); }
+#define FLUSH_TINY                                                                        \
+    const unsigned mode __attribute__((cleanup(set_mode))) = _mm_getcsr(), flushing = mode | 0x8040; \
+    set_mode(&flushing);
+#else
+#define FLUSH_TINY
+#endif
+
 /* Sums run in LANES independent parts: one running sum would wait for its own last addition. */
 #define LANES 64
 
@@ -67,6 +80,7 @@ static inline __attribute__((always_inline)) void adam_on(
  * are any, then move by tau, and the rounded copies, if any, are renewed. */
 void adam(const Parameter *parameters, int64_t count, float rate, float beta1, float beta2, float root, float eps,
           float tau) {
+    FLUSH_TINY
     for (int64_t i = 0; i < count; i++) {
         const Parameter p = parameters[i];
 #define ADAM(rounds, follows)                                                                                     \
@@ -95,7 +109,6 @@ void adam(const Parameter *parameters, int64_t count, float rate, float beta1, f
  * (pairs, BLOCK, 2). An inner dimension that does not fill its pairs is filled up with zeros. Sums are made for PANEL
  * rows at once, in vector registers, or in tiles where the processor has them (AMX). */
 #ifdef __AVX512BF16__
-#include <immintrin.h>
 #include <stdlib.h>
 #include <sys/syscall.h>
 #include <unistd.h>
@@ -353,6 +366,7 @@ static void pack(const uint16_t *matrix, int64_t inner, int64_t n, int64_t strid
 void dense_forward(int64_t inner, const uint16_t *weight, uint16_t *z, const float *bias, const float *gamma,
                    const float *beta, const uint16_t *x, int64_t x_stride, int64_t from, int64_t to, int64_t width,
                    float eps, int64_t rows, int64_t n, uint16_t *out, float *mean, float *rstd, float *scratch) {
+    FLUSH_TINY
     const int64_t pairs = pairs_of(inner), size = packed_size(inner, n);
     uint16_t *packed = packing_memory(size + PANEL * 2 * pairs);
     float sums[PANEL * BLOCK];
@@ -377,6 +391,7 @@ void dense_forward(int64_t inner, const uint16_t *weight, uint16_t *z, const flo
  * plus columns from `to` of grad (rows, inner) at columns from `from`, which may be negative; an even inner dimension. */
 void dense_backward(const uint16_t *dz, int64_t rows, int64_t inner, const uint16_t *weight, int64_t stride, int64_t n,
                     const uint16_t *restrict grad, int64_t from, int64_t to, int64_t width, uint16_t *restrict below) {
+    FLUSH_TINY
     const int64_t pairs = pairs_of(inner), size = packed_size(inner, n);
     uint16_t *packed = packing_memory(size + PANEL * 2 * pairs);
     float sums[PANEL * BLOCK];
@@ -401,6 +416,7 @@ void dense_backward(const uint16_t *dz, int64_t rows, int64_t inner, const uint1
 /* Gradient of a weight (m, n), added to what is there if `add`: the transpose of dz (rows, m) times x (rows, n). */
 void weight_gradient(const uint16_t *dz, int64_t m, const uint16_t *x, int64_t n, int64_t x_stride, int64_t rows,
                      int add, float *restrict grad) {
+    FLUSH_TINY
     const int64_t pairs = pairs_of(rows), dz_size = packed_size(rows, m), x_size = packed_size(rows, n);
     uint16_t *dz_packed = packing_memory(dz_size + x_size + PANEL * 2 * pairs), *x_packed = dz_packed + dz_size;
     float sums[PANEL * BLOCK];
@@ -424,6 +440,7 @@ void weight_gradient(const uint16_t *dz, int64_t m, const uint16_t *x, int64_t n
 /* A linear head of many outputs, in float32: the same as head_forward below. */
 void wide_head_forward(const uint16_t *restrict x, const float *weight, const float *restrict bias, int64_t rows,
                        int64_t n, int64_t outputs, float *restrict y) {
+    FLUSH_TINY
     const int64_t size = packed_size(2 * n, outputs), pairs = pairs_of(2 * n); /* each pair is a number here */
     uint16_t *packed = packing_memory(size + ROWS * 2 * n);
     float *some = (float *)(packed + size), sums[ROWS * BLOCK];
@@ -446,6 +463,7 @@ void wide_head_forward(const uint16_t *restrict x, const float *weight, const fl
 void wide_head_backward(const float *grad, const uint16_t *restrict x, const float *restrict weight, int64_t count,
                         int64_t n, int64_t outputs, int trained, int add, uint16_t *restrict dx,
                         float *restrict dweight, float *restrict dbias) {
+    FLUSH_TINY
     float *packed = (float *)packing_memory(packed_size(2 * (count < outputs ? outputs : count), BLOCK));
     float sums[ROWS * BLOCK];
     const uint16_t *left[ROWS];
@@ -491,6 +509,7 @@ void NAME(layer_forward)(const ELEMENT *restrict z, const float *restrict bias, 
                    const float *restrict beta, const ELEMENT *restrict skip, int64_t skip_stride, int64_t from,
                    int64_t to, int64_t width, float eps, int64_t rows, int64_t n, ELEMENT *restrict out,
                    float *restrict mean, float *restrict rstd, float *restrict scratch) {
+    FLUSH_TINY
     const int64_t even = n - n % LANES;
     for (int64_t r = 0; r < rows; r++) {
         const ELEMENT *restrict zr = z + r * n, *restrict x = skip + r * skip_stride + from;
@@ -577,6 +596,7 @@ static inline __attribute__((always_inline)) void NAME(backward)(
 void NAME(layer_backward)(const ELEMENT *grad, const ELEMENT *z, const float *bias, const float *gamma, const float *beta,
                     const float *mean, const float *rstd, const int64_t *index, int64_t count, int trained, int add,
                     int64_t n, ELEMENT *dz, float *dgamma, float *dbeta, float *dbias, float *scratch) {
+    FLUSH_TINY
     if (trained && !add) {
         memset(dgamma, 0, n * sizeof(float));
         memset(dbeta, 0, n * sizeof(float));
@@ -592,6 +612,7 @@ void NAME(layer_backward)(const ELEMENT *grad, const ELEMENT *z, const float *bi
 /* A linear head of few outputs: y (rows, outputs) from x (rows, n). */
 void NAME(head_forward)(const ELEMENT *restrict x, const float *restrict weight, const float *restrict bias, int64_t rows,
                         int64_t n, int64_t outputs, float *restrict y) {
+    FLUSH_TINY
     const int64_t even = n - n % LANES;
     for (int64_t r = 0; r < rows; r++, x += n)
         for (int64_t o = 0; o < outputs; o++) {
@@ -609,6 +630,7 @@ void NAME(head_forward)(const ELEMENT *restrict x, const float *restrict weight,
 void NAME(head_backward)(const float *restrict grad, const ELEMENT *restrict x, const float *restrict weight,
                          int64_t count, int64_t n, int64_t outputs, int trained, int add, ELEMENT *restrict dx,
                          float *restrict dweight, float *restrict dbias, float *restrict scratch) {
+    FLUSH_TINY
     if (trained && !add) {
         memset(dweight, 0, outputs * n * sizeof(float));
         memset(dbias, 0, outputs * sizeof(float));

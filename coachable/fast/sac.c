@@ -354,6 +354,7 @@ static void policy_gradients(const Job *job, int64_t start, int64_t rows) {
 
 /* Set the gradients of the critics, the policy or both for rows from `start`, and the results for these rows. */
 void sac_gradients(const Job *job, int64_t start, int64_t rows, int critics, int policy) {
+    FLUSH_TINY
     const Mark before = mark();
     if (critics) critic_gradients(job, start, rows);
     if (policy) policy_gradients(job, start, rows);
