@@ -137,6 +137,17 @@ def test_product_of_the_forward_pass(rows, inner, n):
 
 
 @needs_products
+def test_denormal_numbers_count_as_zero():
+    """They take some processors over a hundred times as long as others."""
+    x, weight, grad = rounded(8, 64), normal(40, 64), slanted(torch.full((8, 40), 1e-39))
+    dx, dweight, dbias = rounded(8, 64), normal(40, 64), normal(40)
+    last = [t.data_ptr() for t in (dx, dweight, dbias)]
+    products.wide_head_backward(*[t.data_ptr() for t in (grad, x, weight)], 8, 64, 40, 1, 0, *last)
+    assert not any(t.any() for t in (dx, dweight, dbias))
+    assert (torch.tensor(1e-39) + 0) > 0, "the processor's mode is as before"
+
+
+@needs_products
 def test_products_leave_the_tiles_to_torch():
     """Where the processor has tiles, torch's products configure them too, some only once per thread."""
     rows, inner, n = 64, 128, 96
