@@ -14,6 +14,7 @@ from coachable.ranges import NOT_NEGATIVE, Range
 from coachable.replay.n_step import NStep
 from coachable.replay.replay_files import read_replay, write_replay
 from coachable.replay.routing import EventPredicate, KeyRoute, Route
+from coachable.replay.row_storage import RowStorage
 from coachable.replay.stratified import StratifiedSampler, allot
 from coachable.replay.table_settings import checked_horizon, checked_proportions, make_regions
 from coachable.replay.table_writer import TableWriter
@@ -94,7 +95,7 @@ class EventTableBuffer(TensorDictReplayBuffer):
         prioritized: bool = False,
         priority_alpha: float = 0.6,
         priority_beta: float = 0.4,
-        storage: Callable[[int], LazyTensorStorage] = LazyTensorStorage,
+        storage: Callable[[int], LazyTensorStorage] = RowStorage,
         **kwargs: Any,
     ) -> None:
         regions = make_regions(table_capacities, route, events)
