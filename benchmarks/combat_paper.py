@@ -30,7 +30,14 @@ from request_odds import odds_rows
 
 from coachable.domain import Domain
 from coachable.domains.combat.coached_fight import SOURCES, STATES, draw_timeline
-from coachable.domains.combat.fights import PAIRS, PARTS, composed_styles, style_label
+from coachable.domains.combat.fights import (
+    COMPOSED_ELEMENTS,
+    COMPOSED_WEAPON,
+    PAIRS,
+    PARTS,
+    composed_styles,
+    style_label,
+)
 from coachable.domains.combat.styles import single_styles
 from coachable.envs.combat.tables import MACHINES, UNSEEN_MACHINES
 from coachable.evaluation.statistics import rank_correlation
@@ -47,7 +54,7 @@ PAIRED = (
     ("carjas_bane", "corrosive_blastsling"),
 )  # all presets have these weapons
 SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)  # of the first weapon's largest weight; the second gets the rest of its own
-COMPOSED = [("corrosive_blastsling", element) for element in ("acid", "plasma", "adhesive")]
+COMPOSED = [(COMPOSED_WEAPON, element) for element in COMPOSED_ELEMENTS]
 
 Agents = Mapping[str, LoadedPolicy]
 Rows = list[dict[str, Any]]

@@ -1,7 +1,7 @@
 """Padded residual network of the paper's policies and critics.
 
 Every layer is `block(x) = ReLU(LayerNorm(W x + b)) + fit(x)`. `fit` has no parameters. It pads the input with zeros, or
-cuts it, to the width of the layer. Heads are linear. Source: the paper, network appendix (arXiv 2607.00642).
+cuts it, to the width of the layer. Heads are linear. Source: the paper, Appendix C, Models (arXiv 2607.00642).
 
 Dropout, as in the racing policies of Wurman et al. 2022, is applied only while gradients are enabled. A policy that
 collects, is evaluated or computes the actions of a target therefore has no dropout, even if it is not in evaluation

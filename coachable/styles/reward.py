@@ -12,7 +12,7 @@ __all__ = ["StyleReward"]
 
 
 class StyleReward(nn.Module):
-    """Sum of scaled style terms, `sum_k scale_k * term_k(features, theta)` (paper: `sum_i w_i g_i(s, a, s'; xi_i)`).
+    """Sum of scaled style terms, `sum_k scale_k * term_k(features, theta)` (paper: `sum_i w_i g_i(s, a; xi_i)`).
 
     The same code runs in the environment transform and in relabelling, so that both give the same bits.
 

@@ -15,6 +15,7 @@ from coachable.domains.racing.families import racing_family
 from coachable.envs.racing.race.observation import COURSE_POINTS
 from coachable.replay import KeyEvents
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
+from coachable.training.collection import simulation_env
 from coachable.training.trainer import REPLAY_KEYS
 from coachable.training.weights import load_policy
 from coachable.transforms import TaskImpersonation
@@ -88,6 +89,8 @@ def test_the_papers_racing_learns_with_dropout_and_acts_without(tmp_path):
     train = import_module("racing_qr_sac").build(
         compose_config("racing_qr_sac", [*TINY[1:], *tiny, f"run_dir={tmp_path}"])
     )
+    races = simulation_env(train.collector.env)
+    assert races.garage.pooled and races.garage.pool.shape[1] == 530 and len(races.starter.conditions.compounds) == 9
     policy = train.collector.policy
     dropped = []
     for module in policy.modules():

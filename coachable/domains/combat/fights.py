@@ -33,19 +33,19 @@ if TYPE_CHECKING:
     from coachable.training.weights import LoadedPolicy
 
 PARTS = STYLES[8:11]
-_COMPOSED_WEAPON = "corrosive_blastsling"  # its ammunition has several elements
+COMPOSED_WEAPON, COMPOSED_ELEMENTS = "corrosive_blastsling", ("acid", "adhesive", "purgewater")  # those of its bombs
 PAIRS = ("Apex Thunderjaw", "Slaughterspine")  # two of these at once are out of distribution
 OUTCOMES = ("won", "died", "out_of_bounds", "timeout")
 
 
 def composed_styles(space: StyleSpace) -> list[dict[str, float]]:
-    """Return the blastsling together with each of acid, plasma and adhesive, as far as the space has them (paper)."""
-    if _COMPOSED_WEAPON not in space.names:
+    """Return the blastsling together with the element of each of its bombs, as far as the space has them (paper)."""
+    if COMPOSED_WEAPON not in space.names:
         return []
     high = dict(zip(space.names, space.high.tolist(), strict=True))
-    elements = [name for name in ("acid", "plasma", "adhesive") if name in space.names]
+    elements = [name for name in COMPOSED_ELEMENTS if name in space.names]
     neutral = dict.fromkeys(space.names, 0.0)
-    return [neutral | {name: high[name] for name in (_COMPOSED_WEAPON, element)} for element in elements]
+    return [neutral | {name: high[name] for name in (COMPOSED_WEAPON, element)} for element in elements]
 
 
 def style_label(cell: Mapping[str, float]) -> str:

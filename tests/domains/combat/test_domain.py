@@ -8,8 +8,8 @@ import torch
 
 from coachable.domain import load_domain
 from coachable.domains.combat.domain import DOMAIN
-from coachable.domains.combat.fights import evaluate_fights, style_label
-from coachable.envs.combat.tables import STYLES
+from coachable.domains.combat.fights import composed_styles, evaluate_fights, style_label
+from coachable.envs.combat.tables import ELEMENTS, STYLES, load_table
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.transforms import coachable_env
 
@@ -61,6 +61,14 @@ def test_the_domain_is_as_it_was_trained():
     env = domain.make_env(num_envs=3, seed=0)
     assert (env.observation, env.episode_steps, env.batch_size) == ("small", 20, (3,))
     assert sum(group.width for group in domain.observation_groups) == env.reset()["observation"].shape[-1]
+
+
+def test_composed_requests_are_the_blastsling_with_the_elements_of_its_bombs():
+    table = load_table("weapons")
+    bombs = [name for name in table.rows if table.rows[name]["weapon"] == "Corrosive Blastsling"]
+    elements = [table.words(name, "element", ELEMENTS)[0] for name in bombs]
+    labels = [style_label(cell) for cell in composed_styles(DOMAIN.make_space())]
+    assert labels == [f"corrosive_blastsling + {element}" for element in elements]
 
 
 class _Idle:
