@@ -53,7 +53,9 @@ def require_finite_action(action: Tensor) -> None:
     missing = action.isnan()
     if missing.any():
         row = missing.flatten(1).any(1).nonzero()[0].item()
-        raise NonFiniteError(f"action contains NaN in environment {row}: the policy has diverged.")
+        raise NonFiniteError(
+            f"action contains NaN in environment {row}: the policy has diverged, or its observation is not finite."
+        )
 
 
 def _bad(value: Tensor) -> bool:

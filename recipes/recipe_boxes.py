@@ -130,7 +130,7 @@ def make_loss(run: Run, actor: nn.Module, critics: list[nn.Module], env: EnvBase
     if is_sac and len(critics) < 2:
         raise ValueError(f"network.num_critics is {len(critics)}: expected at least 2 with loss=sac")
     if is_sac and settings.network.actor.get("heads", {}).get("categorical"):
-        raise ValueError(f"loss=sac serves continuous actions only, {settings.domain} has buttons: expected cat_rac")
+        raise ValueError("loss=sac serves continuous actions only, network.actor has buttons: expected cat_rac")
     loss = settings.loss.build(actor, critics, action_spec=env.action_spec, num_qvalue_nets=len(critics))
     loss.make_value_estimator(gamma=settings.gamma)
     return loss.to(run.device)
@@ -219,7 +219,7 @@ def make_evaluation(run: Run, make_env: Callable[..., EnvBase], actor: nn.Module
 
 
 def open_run_dir(run: Run, env: EnvBase, replay: ReplayBuffer) -> None:
-    """Make the run's folder and write the configuration into it.
+    """Make the run's folder, and check that the run can be written into it.
 
     Args:
         run: The training.
@@ -238,7 +238,6 @@ def open_run_dir(run: Run, env: EnvBase, replay: ReplayBuffer) -> None:
         size = replay_bytes(replay, env, stored_keys(run, env, replay))
         kept = sum(file.stat().st_size for file in run_dir.glob("checkpoints/*/replay/*"))
         check_writable(run_dir, required_bytes=max(0, 2 * size - kept))
-    (run_dir / "config.json").write_text(json.dumps(run.config, indent=1) + "\n", encoding="utf-8")
 
 
 def stored_keys(run: Run, env: EnvBase, replay: ReplayBuffer) -> tuple[NestedKey, ...]:
@@ -262,6 +261,8 @@ def make_trainer(
     evaluate: Callable[[], dict[str, float]],
 ) -> Trainer:
     """Make the training loop, with its log and its checkpoints in the run's folder; resume the run of `resume`.
+
+    The configuration is written into the folder at the end, so that a refused resumption leaves that of the run.
 
     Args:
         run: The training.
@@ -304,4 +305,5 @@ def make_trainer(
     torch.set_num_threads(settings.threads.learner)
     if settings.resume:
         trainer.resume(settings.resume)
+    (run_dir / "config.json").write_text(json.dumps(run.config, indent=1) + "\n", encoding="utf-8")
     return trainer

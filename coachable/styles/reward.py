@@ -5,10 +5,20 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from coachable.styles.parameters import Choice
 from coachable.styles.space import StyleSpace
-from coachable.styles.terms import ChoiceTolerance, Features, StyleTerm, WeightedFeature, WeightedSum
+from coachable.styles.terms import (
+    ChoiceTolerance,
+    Features,
+    SetpointTolerance,
+    StyleTerm,
+    WeightedFeature,
+    WeightedSum,
+)
 
 __all__ = ["StyleReward"]
+
+_OF_NUMBERS = (SetpointTolerance, WeightedFeature, WeightedSum)
 
 
 class StyleReward(nn.Module):
@@ -111,6 +121,8 @@ def _check_terms(space: StyleSpace, terms: Mapping[str, Any], scales: Mapping[st
         unknown = [p for p in parameters if p not in space]
         if unknown:
             problems.append(f"term {name!r} reads {unknown}, which the space lacks")
+        elif isinstance(term, _OF_NUMBERS) and any(isinstance(space[p], Choice) for p in parameters):
+            problems.append(f"term {name!r} is a {type(term).__name__} of a choice: expected ChoiceTolerance or Term")
         elif isinstance(term, ChoiceTolerance) and term.num_options != space[parameters[0]].width:
             options = space[parameters[0]].width
             problems.append(f"term {name!r} has bounds for {term.num_options} options, {parameters[0]} has {options}")

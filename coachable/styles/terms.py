@@ -81,10 +81,13 @@ def feature(features: Features, key: FeatureKey) -> Tensor:
         The feature `(...,)` for an index, columns `(..., k)` for a slice, and otherwise the entry in its own shape.
 
     Raises:
-        KeyError: If the features are a tensor and the key is a name, or the tensordict has no such key.
+        KeyError: If there is no such column or key, or the features are a tensor and the key is a name.
     """
     if isinstance(key, int | slice):
-        return features[..., key]
+        try:
+            return features[..., key]
+        except IndexError:
+            raise KeyError(_no_such_feature(features, key)) from None
     name, column = key, None
     if isinstance(key, tuple) and isinstance(key[-1], int | slice):
         name, column = key[:-1], key[-1]
@@ -227,7 +230,7 @@ class ChoiceTolerance:
 
     Args:
         parameter: Name of the `Choice`.
-        key: Key of the features `(..., k)`, see `feature`.
+        key: Key of the features `(..., k)`, see `feature`; a slice also if k is 1.
         lower: Lower bounds `(n_options, k)`, in the unit of the features.
         upper: Upper bounds `(n_options, k)`.
         margin: Distance at which the value is `value_at_margin`, in the same unit.
@@ -235,7 +238,8 @@ class ChoiceTolerance:
         value_at_margin: See `tolerance`.
 
     Raises:
-        ValueError: If the bounds are not two matrices of one shape, or a lower bound exceeds its upper bound.
+        ValueError: If the bounds are not two matrices of one shape, a lower bound exceeds its upper bound, or the key
+            is an index.
     """
 
     def __init__(
@@ -254,6 +258,11 @@ class ChoiceTolerance:
                 f"ChoiceTolerance for {parameter!r} has bounds of shapes {tuple(lower.shape)}, {tuple(upper.shape)}: "
                 "expected two (n_options, k) matrices with lower <= upper."
             )
+        if isinstance(key[-1] if isinstance(key, tuple) else key, int):
+            raise ValueError(
+                f"ChoiceTolerance for {parameter!r} has the key {key}, an index: expected a slice or a name, such as "
+                "slice(0, 1) for the first feature."
+            )
         self.parameters, self.num_options = (parameter,), len(lower)
         self.key, self.margin, self.sigmoid, self.value_at_margin = key, margin, sigmoid, value_at_margin
         # Both bounds are in one table (n_options, 2k), so that a step needs one look-up instead of two.
@@ -262,10 +271,15 @@ class ChoiceTolerance:
 
     def __call__(self, features: Features, style: Style) -> Tensor:
         """Return the reward `(...,)`."""
-        option = style[self.parameters[0]].argmax(-1)
+        measured, option = feature(features, self.key), style[self.parameters[0]].argmax(-1)
         table, mean = _on(self._bounds, option.device), _on(self._mean, option.device)
         lower, upper = nn.functional.embedding(option, table).chunk(2, dim=-1)  # (..., k) each
-        value = tolerance(feature(features, self.key), lower, upper, self.margin, self.sigmoid, self.value_at_margin)
+        if measured.shape[-1:] != mean.shape:
+            raise ValueError(
+                f"ChoiceTolerance for {self.parameters[0]!r} reads {measured.shape[-1]} features by key {self.key}: "
+                f"expected {len(mean)}, one for each column of its bounds."
+            )
+        value = tolerance(measured, lower, upper, self.margin, self.sigmoid, self.value_at_margin)
         return weighted_sum(mean, value)
 
 

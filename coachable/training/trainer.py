@@ -82,6 +82,9 @@ class Trainer:
         evaluate: Returns metrics of an evaluation. It must leave the global random number generators unchanged.
         style_terms: Maps style features `(B, F)` and theta `(B, d)` to named, unscaled terms `(B,)` for the log.
         replay_keys: Keys of the stored entries, see the function `replay_keys`.
+
+    Raises:
+        ValueError: If a batch is larger than the replay buffer, so that there would be no update.
     """
 
     def __init__(
@@ -99,6 +102,11 @@ class Trainer:
         style_terms: Callable[[Any, torch.Tensor], Mapping[str, torch.Tensor]] | None = None,
         replay_keys: tuple[NestedKey, ...] = REPLAY_KEYS,
     ) -> None:
+        if settings.batch_size > replay.storage.max_size:
+            raise ValueError(
+                f"batch_size={settings.batch_size}: expected at most {replay.storage.max_size}, the capacity of the "
+                "replay buffer, because otherwise no update would be made"
+            )
         self.collector = collector
         self.replay = replay
         self.learner = learner

@@ -7,7 +7,7 @@ import pytest
 import torch
 from recipe_config import compose_config
 
-from coachable.training.checkpoint import CheckpointStore, find_checkpoint, read_state
+from coachable.training.checkpoint import CheckpointError, CheckpointStore, find_checkpoint, read_state
 from tests.random_kills import RECIPES, differences
 
 TINY = ["preset=smoke", "env.num_envs=2", "threads.simulator=1", "threads.learner=1", "train.eval_interval=16"]
@@ -53,3 +53,12 @@ def test_the_number_of_threads_is_the_one_that_was_asked_for(tmp_path, monkeypat
     assert torch.get_num_threads() == 1
     train.collector.shutdown()
     torch.set_num_threads(1)
+
+
+def test_a_refused_resumption_leaves_the_configuration_of_the_run(tmp_path):
+    build = import_module("rare_targets").build
+    build(compose_config("rare_targets", [*TINY, "train.total_frames=4", f"run_dir={tmp_path}"])).run()
+    before = (tmp_path / "config.json").read_bytes()
+    with pytest.raises(CheckpointError, match="was trained on another style space"):
+        build(compose_config("rare_targets", [f"resume={tmp_path}", "sampler=one_hot", "train.total_frames=8"]))
+    assert (tmp_path / "config.json").read_bytes() == before

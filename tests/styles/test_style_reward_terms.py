@@ -127,8 +127,9 @@ def test_features_by_index_name_and_path():
     assert feature(nested, ("speed", 0)).shape == (2,)
     with pytest.raises(KeyError, match=r"no style feature named sped: .* emits gait\.arms, gait\.length, speed\."):
         feature(nested, "sped")
-    with pytest.raises(KeyError, match="one tensor of 3 columns"):
-        feature(tensor, "speed")
+    for missing in ("speed", 3):
+        with pytest.raises(KeyError, match=f"no style feature named {missing}: .* one tensor of 3 columns"):
+            feature(tensor, missing)
 
 
 def test_terms_closed_form():
@@ -162,8 +163,16 @@ def test_choice_tolerance_uses_the_bounds_of_the_option():
     torch.testing.assert_close(term(features, style), torch.tensor([(1 + 0.55) / 2, 0.0, 1.0]))
     with pytest.raises(ValueError, match="lower <= upper"):
         ChoiceTolerance("pose", 0, lower=[[1.0]], upper=[[0.0]], margin=1.0)
+    for index in (0, ("arms", 0)):
+        with pytest.raises(ValueError, match=r"'pose' has the key .*, an index: expected a slice or a name"):
+            ChoiceTolerance("pose", index, lower=[[0.0]], upper=[[1.0]], margin=1.0)
+    with pytest.raises(ValueError, match=r"'pose' reads 1 features by key slice\(0, 2, None\): expected 2"):
+        term(features[:, :1], style)
+    poses = StyleSpace([Choice("pose", ("a", "b", "c"))])
     with pytest.raises(ValueError, match="term 'pose' has bounds for 2 options, pose has 3"):
-        StyleReward(StyleSpace([Choice("pose", ("a", "b", "c"))]), {"pose": term})
+        StyleReward(poses, {"pose": term})
+    with pytest.raises(ValueError, match="term 'pose' is a WeightedFeature of a choice: expected ChoiceTolerance"):
+        StyleReward(poses, {"pose": WeightedFeature("pose", 0)})
 
 
 def combat_reward() -> StyleReward:

@@ -159,7 +159,7 @@ def test_what_a_gymnasium_environment_returns(training, fault):
 
 def test_an_environment_that_refuses_nan_actions_names_its_row(training):
     train = spoil_weights(training(make_env=make_faulty_env("none")), RANDOM)
-    message = r"action contains NaN in environment 0: the policy has diverged\. .* stopped at env-step 40,"
+    message = r"action contains NaN in environment 0: the policy has diverged, .* stopped at env-step 40,"
     with pytest.raises(NonFiniteError, match=message):
         train.run()
 

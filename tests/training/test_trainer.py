@@ -66,6 +66,12 @@ def test_resume_of_a_finished_training_changes_no_row(make_train, tmp_path):
     assert (tmp_path / "run" / "metrics.csv").read_text() == before
 
 
+def test_batches_larger_than_the_replay_buffer_are_refused_at_the_start(make_train):
+    make_train(batch_size=300)
+    with pytest.raises(ValueError, match="batch_size=301: expected at most 300, the capacity of the replay buffer"):
+        make_train(batch_size=301)
+
+
 def test_a_training_killed_before_its_first_checkpoint_leaves_no_row_to_the_next(make_train, tmp_path):
     train = make_train(total_frames=80, log_interval=0.0)
     train.run()
