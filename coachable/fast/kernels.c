@@ -31,7 +31,7 @@ static inline uint16_t narrow(float f) {
 #include <immintrin.h>
 
 static inline void set_mode(const unsigned *mode) { _mm_setcsr(*mode); }
-#define FLUSH_TINY                                                                        \
+#define FLUSH_TINY                                                                                   \
     const unsigned mode __attribute__((cleanup(set_mode))) = _mm_getcsr(), flushing = mode | 0x8040; \
     set_mode(&flushing);
 #else
@@ -199,7 +199,6 @@ typedef struct {
 /* Pairs of an inner dimension: a tile holds 16. */
 static inline int64_t pairs_of(int64_t inner) { return (inner + 31) / 32 * 16; }
 
-/* Tiles have 16 rows of 64 bytes. Others on this thread may have settings of their own, which are put back. */
 typedef struct {
     uint8_t palette, start, reserved[14];
     uint16_t bytes[16];
@@ -209,22 +208,24 @@ typedef struct {
 /* Compilers do not know all memory that instructions on tiles read and write. */
 #define TOUCH(address) __asm__ volatile("" ::"r"(address) : "memory")
 
-static void load_tiles(Tiles wanted) {
-    TOUCH(&wanted);
-    _tile_loadconfig(&wanted);
+static void load_tiles(const Tiles *wanted) {
+    TOUCH(wanted);
+    _tile_loadconfig(wanted);
 }
 
+/* Set tiles of 16 rows of 64 bytes, and return the settings before. */
 static Tiles set_tiles(void) {
     Tiles wanted = {.palette = 1}, before;
     for (int i = 0; i < 8; i++) wanted.bytes[i] = 64, wanted.rows[i] = 16;
     TOUCH(&before);
     _tile_storeconfig(&before);
     TOUCH(&before);
-    load_tiles(wanted);
+    load_tiles(&wanted);
     return before;
 }
 
-static void reset_tiles(Tiles before) { load_tiles(before); }
+/* While this is in scope, the tiles are ours. Others on this thread may have settings of their own, which are put back. */
+#define USE_TILES const Tiles before __attribute__((cleanup(load_tiles))) = set_tiles();
 
 /* Whether the kernel lets this process use tiles. */
 int tiles_allowed(void) { return !syscall(SYS_arch_prctl, 0x1023 /* ARCH_REQ_XCOMP_PERM */, 18 /* their data */); }
@@ -290,9 +291,7 @@ typedef struct {
 
 static inline int64_t pairs_of(int64_t inner) { return (inner + 1) / 2; }
 
-typedef int Tiles;
-static Tiles set_tiles(void) { return 0; }
-static void reset_tiles(Tiles before) { (void)before; }
+#define USE_TILES
 int tiles_allowed(void) { return 0; }
 
 static inline Panel panel_of(const uint16_t *matrix, int64_t stride, int64_t i, int64_t rows, int64_t inner,
@@ -367,10 +366,10 @@ void dense_forward(int64_t inner, const uint16_t *weight, uint16_t *z, const flo
                    const float *beta, const uint16_t *x, int64_t x_stride, int64_t from, int64_t to, int64_t width,
                    float eps, int64_t rows, int64_t n, uint16_t *out, float *mean, float *rstd, float *scratch) {
     FLUSH_TINY
+    USE_TILES
     const int64_t pairs = pairs_of(inner), size = packed_size(inner, n);
     uint16_t *packed = packing_memory(size + PANEL * 2 * pairs);
     float sums[PANEL * BLOCK];
-    const Tiles before = set_tiles();
     pack_transposed(weight, n, inner, packed);
     for (int64_t i = 0; i < rows; i += PANEL) {
         const int64_t count = smaller(PANEL, rows - i);
@@ -384,7 +383,6 @@ void dense_forward(int64_t inner, const uint16_t *weight, uint16_t *z, const flo
         layer_forward_bf16(z + i * n, bias, gamma, beta, x + i * x_stride, x_stride, from, to, width, eps, count, n,
                            out + i * n, mean + i, rstd + i, scratch);
     }
-    reset_tiles(before);
 }
 
 /* Gradient of a layer's input: below (rows, n) = dz (rows, inner) times weight (inner, n; rows `stride` apart),
@@ -392,10 +390,10 @@ void dense_forward(int64_t inner, const uint16_t *weight, uint16_t *z, const flo
 void dense_backward(const uint16_t *dz, int64_t rows, int64_t inner, const uint16_t *weight, int64_t stride, int64_t n,
                     const uint16_t *restrict grad, int64_t from, int64_t to, int64_t width, uint16_t *restrict below) {
     FLUSH_TINY
+    USE_TILES
     const int64_t pairs = pairs_of(inner), size = packed_size(inner, n);
     uint16_t *packed = packing_memory(size + PANEL * 2 * pairs);
     float sums[PANEL * BLOCK];
-    const Tiles before = set_tiles();
     pack(weight, inner, n, stride, packed);
     for (int64_t i = 0; i < rows; i += PANEL) {
         const Panel left = panel_of(dz, inner, i, rows, inner, packed + size);
@@ -410,17 +408,16 @@ void dense_backward(const uint16_t *dz, int64_t rows, int64_t inner, const uint1
             }
         }
     }
-    reset_tiles(before);
 }
 
 /* Gradient of a weight (m, n), added to what is there if `add`: the transpose of dz (rows, m) times x (rows, n). */
 void weight_gradient(const uint16_t *dz, int64_t m, const uint16_t *x, int64_t n, int64_t x_stride, int64_t rows,
                      int add, float *restrict grad) {
     FLUSH_TINY
+    USE_TILES
     const int64_t pairs = pairs_of(rows), dz_size = packed_size(rows, m), x_size = packed_size(rows, n);
     uint16_t *dz_packed = packing_memory(dz_size + x_size + PANEL * 2 * pairs), *x_packed = dz_packed + dz_size;
     float sums[PANEL * BLOCK];
-    const Tiles before = set_tiles();
     pack(dz, rows, m, m, dz_packed);
     pack(x, rows, n, x_stride, x_packed);
     for (int64_t i = 0; i < m; i += PANEL) {
@@ -434,7 +431,6 @@ void weight_gradient(const uint16_t *dz, int64_t m, const uint16_t *x, int64_t n
                 }
         }
     }
-    reset_tiles(before);
 }
 
 /* A linear head of many outputs, in float32: the same as head_forward below. */
