@@ -3,7 +3,8 @@
     python benchmarks/cluster_fleet.py                                  100 workers, half an hour per environment
     python benchmarks/cluster_fleet.py --workers 25 --minutes 3 --only pendulum
 
-Each worker is held to 5 env-steps/s, as a game console is, and the learner updates all the time. Measured are the
+Each worker is held to 5 env-steps/s, as a game console is, and the learner updates all the time, on a core of its own
+if there are several: in the paper it has a machine of its own. The workers share the other cores. Measured are the
 humanoid, a fight and Gymnasium's pendulum, from when all workers work. What was measured is written to `--out`; an
 environment that has been measured to its end is not measured again, so that the same command continues after an
 interruption.
@@ -69,6 +70,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=ENVIRONMENTS, default=list(ENVIRONMENTS))
     parser.add_argument("--out", type=Path, default=Path("runs/fleet"))
     options = parser.parse_args()
+    options.cores = os.sched_getaffinity(0)
     options.out.mkdir(parents=True, exist_ok=True)
     warnings.filterwarnings("ignore", "a Ray worker was lost")
     asked = options.workers * options.rate
@@ -91,14 +93,18 @@ class Fleet:
 
     def __init__(self, name: str, options: argparse.Namespace) -> None:
         recipe, arguments = ENVIRONMENTS[name]
-        share = min(1.0, (os.cpu_count() or 1) / (2 * options.workers))
+        learner = {min(options.cores)}
+        others = options.cores - learner or options.cores
+        share = min(1.0, len(others) / (2 * options.workers))
         arguments = [*arguments, *QUICK, *SLOW, "collector=ray", f"collector.num_collectors={options.workers}"]
         arguments += [f"collector.group_size={options.group}", f"collector.worker_throttle={options.rate}"]
         arguments += [f"collector.cpus_per_worker={share}", "collector.steps_per_batch=8"]
         arguments += [f"train.throttle={2 * options.rate * options.workers}"]  # more than the workers give
         arguments += [f"run_dir={options.out / f'{name}_{time.time():.0f}'}"]
         self.options = options
+        os.sched_setaffinity(0, others)  # Ray starts in here, and its processes inherit it
         self.train = import_module(recipe).build(compose_config(recipe, arguments))
+        os.sched_setaffinity(0, learner)
         self.workers = self.train.collector.workers
         self.rows: list[Row] = []
         self.began = self.next_kill = 0.0
@@ -144,8 +150,8 @@ class Fleet:
         if not self.began:
             self.began, self.next_kill = now, now + 60.0 / self.options.kills
             self.cpu = {slot.pid: cpu_seconds(slot.pid) for slot in self.workers.slots}
-        wanted = ("frames", "updates", "seconds/update")
-        kept = {key: value for key, value in row.items() if key in wanted or key.startswith("workers/")}
+        kept = {"frames": self.train.frames, "updates": self.train.learner.updates}
+        kept |= {key: value for key, value in row.items() if key == "seconds/update" or key.startswith("workers/")}
         self.rows.append({"time": now - self.began, **kept, "killed": self.killed, "load": os.getloadavg()[0]})
         while now >= self.next_kill:
             self.next_kill += 60.0 / self.options.kills
