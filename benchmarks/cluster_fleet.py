@@ -109,7 +109,7 @@ class Fleet:
         self.rows: list[Row] = []
         self.began = self.next_kill = 0.0
         self.killed = 0
-        self.cpu: dict[int, float] = {}
+        self.seen: dict[int, tuple[float, float]] = {}  # time and processor time of a worker when it was first seen [s]
         self.dies = random.Random(0)
         self._write = self.train._write
         self.train._write = self._observe
@@ -149,7 +149,9 @@ class Fleet:
             return
         if not self.began:
             self.began, self.next_kill = now, now + 60.0 / self.options.kills
-            self.cpu = {slot.pid: cpu_seconds(slot.pid) for slot in self.workers.slots}
+        for slot in self.workers.slots:
+            if slot.is_ready and slot.pid not in self.seen:
+                self.seen[slot.pid] = now, cpu_seconds(slot.pid)
         kept = {"frames": self.train.frames, "updates": self.train.learner.updates}
         kept |= {key: value for key, value in row.items() if key == "seconds/update" or key.startswith("workers/")}
         self.rows.append({"time": now - self.began, **kept, "killed": self.killed, "load": os.getloadavg()[0]})
@@ -157,7 +159,7 @@ class Fleet:
             self.next_kill += 60.0 / self.options.kills
             self._kill_one()
         if now - self.began > self.options.minutes * 60.0:
-            self.rows[-1] |= {**self._memory(), "cores": self._cores(now - self.began), "done": 1.0}
+            self.rows[-1] |= {**self._memory(), "cores": self._cores(now), "done": 1.0}
             self._end()
 
     def _end(self) -> None:
@@ -176,11 +178,11 @@ class Fleet:
         private = statistics.mean(part["Private_Clean"] + part["Private_Dirty"] for part in own if part["Pss"])
         return {"megabytes": everything / self.options.workers / 1e6, "private megabytes": private / 1e6}
 
-    def _cores(self, seconds: float) -> float:
-        """Returns the number of cores that the workers use, from those that were never killed."""
-        left = [slot.pid for slot in self.workers.slots if slot.is_ready and slot.pid in self.cpu]
-        used = statistics.mean(cpu_seconds(pid) - self.cpu[pid] for pid in left) if left else 0.0
-        return used / seconds * self.options.workers
+    def _cores(self, now: float) -> float:
+        """Return the number of cores that as many workers use as are asked for, from those that are alive."""
+        spans = [(self.seen[slot.pid], cpu_seconds(slot.pid)) for slot in self.workers.slots if slot.pid in self.seen]
+        used = sum(cpu - began for (_, began), cpu in spans)
+        return used / sum(now - since for (since, _), _ in spans) * self.options.workers
 
 
 def memory_left() -> float:
