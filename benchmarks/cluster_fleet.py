@@ -155,12 +155,12 @@ class Fleet:
         kept = {"frames": self.train.frames, "updates": self.train.learner.updates}
         kept |= {key: value for key, value in row.items() if key == "seconds/update" or key.startswith("workers/")}
         self.rows.append({"time": now - self.began, **kept, "killed": self.killed, "load": os.getloadavg()[0]})
-        while now >= self.next_kill:
-            self.next_kill += 60.0 / self.options.kills
-            self._kill_one()
         if now - self.began > self.options.minutes * 60.0:
             self.rows[-1] |= {**self._memory(), "cores": self._cores(now), "done": 1.0}
             self._end()
+        while now >= self.next_kill:
+            self.next_kill += 60.0 / self.options.kills
+            self._kill_one()
 
     def _end(self) -> None:
         self.train.settings = type(self.train.settings)(total_frames=1)
@@ -180,7 +180,8 @@ class Fleet:
 
     def _cores(self, now: float) -> float:
         """Return the number of cores that as many workers use as are asked for, from those that are alive."""
-        spans = [(self.seen[slot.pid], cpu_seconds(slot.pid)) for slot in self.workers.slots if slot.pid in self.seen]
+        alive = [slot.pid for slot in self.workers.slots if slot.is_ready and slot.pid in self.seen]
+        spans = [(self.seen[pid], cpu_seconds(pid)) for pid in alive]
         used = sum(cpu - began for (_, began), cpu in spans)
         return used / sum(now - since for (since, _), _ in spans) * self.options.workers
 

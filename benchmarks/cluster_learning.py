@@ -1,6 +1,7 @@
-"""What a fight learns with workers on Ray, and with weights of a certain age, beside the training in one process.
+"""What an agent learns with workers on Ray, and with weights of a certain age, beside the training in one process.
 
-    python benchmarks/cluster_learning.py                                         preset small, seeds 0 to 2: hours
+    python benchmarks/cluster_learning.py                                  combat, preset small, seeds 0 to 2: hours
+    python benchmarks/cluster_learning.py --env humanoid --only local workers            its preset cpu
     python benchmarks/cluster_learning.py --frames 20_000 --seeds 0 --only local workers      to try it out
 
 All trainings have the same env-steps and the same updates per env-step. `workers` are 8 on Ray with 16 environments
@@ -10,6 +11,8 @@ printed, and learning curves with their range over the seeds are drawn in `--out
 """
 
 import argparse
+import csv
+import math
 import statistics
 import sys
 from pathlib import Path
@@ -20,10 +23,14 @@ matplotlib.use("Agg")
 import numpy as np
 from matplotlib import pyplot as plt
 
-from coachable.evaluation.curves import read_metric
+from coachable.evaluation.curves import metrics_files, read_metric
 from coachable.evaluation.many_seeds import train_seeds
 
-RECIPE = Path(__file__).resolve().parent.parent / "recipes" / "combat_cat_rac.py"
+RECIPES = Path(__file__).resolve().parent.parent / "recipes"
+ENVIRONMENTS = {  # recipe, preset, and what is measured of the style
+    "combat": ("combat_cat_rac.py", "small", "eval/style_score"),
+    "humanoid": ("humanoid_sac.py", "cpu", "eval/step_length_error"),
+}
 WORKERS = ["collector=ray", "collector.num_collectors=8", "collector.group_size=8", "env.num_envs=16"]
 WORKERS += ["collector.cpus_per_worker=0.1"]
 VARIANTS = {
@@ -36,24 +43,27 @@ HEADINGS = (
     "seeds",
     "return",
     "std",
-    "style score",
+    "style",
+    "std",
     "staleness [updates]",
     "env-steps",
     "updates",
     "minutes",
 )
-MEASURES = ("eval/return", "eval/style_score", "frames", "updates", "minutes")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--env", choices=ENVIRONMENTS, default="combat", help="(%(default)s)")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="(%(default)s)")
     parser.add_argument("--only", nargs="+", choices=VARIANTS, default=list(VARIANTS))
     parser.add_argument("--frames", type=int, help="env-steps of each training; those of the preset")
     parser.add_argument("--out", type=Path, default=Path("runs/cluster_learning"))
     options = parser.parse_args()
+    recipe, preset, style = ENVIRONMENTS[options.env]
+    options.out /= options.env
     common = [
-        "preset=small",
+        f"preset={preset}",
         "wandb.mode=off",
         "threads.learner=1",
         "threads.simulator=1",
@@ -65,25 +75,32 @@ def main() -> None:
     print("| " + " | ".join(HEADINGS) + " |\n|" + "-|" * len(HEADINGS))
     for name in options.only:
         folder = options.out / name
-        if failed := train_seeds(RECIPE, [*common, *VARIANTS[name]], options.seeds, folder):
+        if failed := train_seeds(RECIPES / recipe, [*common, *VARIANTS[name]], options.seeds, folder):
             sys.exit(f"{name}: {failed}")
         runs = [folder / f"seed_{seed}" for seed in options.seeds]
-        print("| " + " | ".join([name, f"{len(runs)}", *cells(runs, VARIANTS[name])]) + " |", flush=True)
+        print("| " + " | ".join([name, f"{len(runs)}", *cells(runs, VARIANTS[name], style)]) + " |", flush=True)
         draw([name for name in options.only if (options.out / name).exists()], options)
 
 
-def cells(runs: list[Path], arguments: list[str]) -> list[str]:
-    last = {measure: [read_metric(run, "frames", measure)[1][-1] for run in runs] for measure in MEASURES}
-    returns = last["eval/return"]
+def cells(runs: list[Path], arguments: list[str], style: str) -> list[str]:
+    measures = {name: [read_metric(run, "frames", name)[1][-1] for run in runs] for name in ("eval/return", style)}
     stale = [read_metric(run, "frames", "workers/staleness")[1].mean() for run in runs] if arguments else [0.0]
+    totals = {name: [total(run, name) for run in runs] for name in ("frames", "updates", "minutes")}
     return [
-        f"{statistics.mean(returns):.1f}",
-        f"{statistics.stdev(returns):.1f}" if len(returns) > 1 else "",
-        f"{statistics.mean(last['eval/style_score']):.2f}",
+        *(f"{of(values):.3g}" for values in measures.values() for of in (statistics.mean, spread)),
         f"{statistics.mean(stale):.0f}",
-        *(f"{statistics.mean(last[measure]):.0f}" for measure in ("frames", "updates")),
-        f"{statistics.mean(last['minutes']):.1f}",
+        *(f"{statistics.mean(totals[name]):.0f}" for name in ("frames", "updates")),
+        f"{statistics.mean(totals['minutes']):.1f}",
     ]
+
+
+def spread(values: list[float]) -> float:
+    return statistics.stdev(values) if len(values) > 1 else math.nan
+
+
+def total(run: Path, name: str) -> float:
+    """Returns the last value of a metric that counts from the start of each stage, summed over the stages."""
+    return sum(float(list(csv.DictReader(file.open()))[-1][name]) for file in metrics_files(run))
 
 
 def draw(names: list[str], options: argparse.Namespace) -> None:

@@ -2,6 +2,7 @@
 
 import platform
 import zlib
+from functools import cache
 from pathlib import Path
 
 from coachable import __version__
@@ -14,9 +15,14 @@ RECIPES = str(next(p for p in (_PACKAGE / "recipes", _PACKAGE.parent / "recipes"
 
 
 def code_version() -> str:
-    """Return the versions of Python and coachable, with a checksum of coachable's source, in words."""
+    """Return the versions of Python and coachable, with a checksum of coachable's source at the first call, in words."""
+    return f"Python {platform.python_version()} and coachable {__version__} ({_checksum():08x})"
+
+
+@cache
+def _checksum() -> int:
     checksum = 0
     for path in sorted(_PACKAGE.rglob("*.py")):
         if "recipes" not in path.relative_to(_PACKAGE).parts:
             checksum = zlib.crc32(path.read_bytes(), checksum)
-    return f"Python {platform.python_version()} and coachable {__version__} ({checksum:08x})"
+    return checksum

@@ -54,6 +54,8 @@ class Connection:
         self.ray: Any = ray
         self._folder: str | None = None
         self._is_ours = not ray.is_initialized()
+        if self._is_ours:  # what a lost worker raises is told as a warning; Ray would print its traceback as well
+            os.environ.setdefault("RAY_IGNORE_UNHANDLED_ERRORS", "1")
         address = address or os.environ.get("RAY_ADDRESS")
         try:
             if self._is_ours and address:

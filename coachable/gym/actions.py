@@ -15,12 +15,13 @@ def action_components(space: spaces.Space) -> tuple[list[int], int]:
     """Return the sizes of an action space's categorical components and its number of continuous entries.
 
     Raises:
-        ValueError: If the space has a component of another kind, or a `Box` without finite bounds.
+        ValueError: If the space has a component of another kind, one with a single choice, or a `Box` without finite
+            bounds.
     """
     match space:
-        case spaces.Discrete():
+        case spaces.Discrete() if space.n > 1:
             return [int(space.n)], 0
-        case spaces.MultiDiscrete():
+        case spaces.MultiDiscrete() if (space.nvec > 1).all():
             return space.nvec.reshape(-1).tolist(), 0
         case spaces.MultiBinary():
             return [2] * int(np.prod(space.shape)), 0
@@ -30,8 +31,8 @@ def action_components(space: spaces.Space) -> tuple[list[int], int]:
             parts = [action_components(part) for part in (space.values() if isinstance(space, spaces.Dict) else space)]
             return [size for sizes, _ in parts for size in sizes], sum(axes for _, axes in parts)
     raise ValueError(
-        f"the action space {space} is not supported: expected Box with finite bounds, Discrete, MultiDiscrete, "
-        "MultiBinary, or a Tuple or Dict of these"
+        f"the action space {space} is not supported: expected Box with finite bounds, Discrete or MultiDiscrete with "
+        "two choices or more, MultiBinary, or a Tuple or Dict of these"
     )
 
 

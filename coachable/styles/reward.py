@@ -5,20 +5,10 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from coachable.styles.parameters import Choice
 from coachable.styles.space import StyleSpace
-from coachable.styles.terms import (
-    ChoiceTolerance,
-    Features,
-    SetpointTolerance,
-    StyleTerm,
-    WeightedFeature,
-    WeightedSum,
-)
+from coachable.styles.terms import Features, StyleTerm
 
 __all__ = ["StyleReward"]
-
-_OF_NUMBERS = (SetpointTolerance, WeightedFeature, WeightedSum)
 
 
 class StyleReward(nn.Module):
@@ -38,7 +28,7 @@ class StyleReward(nn.Module):
 
     Examples:
         >>> import torch
-        >>> from coachable.styles import Weight
+        >>> from coachable.styles import Weight, WeightedFeature
         >>> space = StyleSpace([Weight("fuel", -3, 105)])
         >>> reward = StyleReward(space, {"fuel": WeightedFeature("fuel", 0)}, {"fuel": -1.0})
         >>> reward(torch.tensor([[0.5]]), torch.tensor([[10.0]]))
@@ -60,7 +50,7 @@ class StyleReward(nn.Module):
     @property
     def is_linear(self) -> bool:
         """Whether the reward is known to be linear in the features, so that features of several steps may be summed."""
-        return all(isinstance(term, WeightedFeature | WeightedSum) for term in self.terms.values())
+        return all(getattr(term, "is_linear", False) for term in self.terms.values())
 
     def forward(self, features: Features, theta: Tensor) -> Tensor:
         """Return the style part of the reward.
@@ -121,11 +111,8 @@ def _check_terms(space: StyleSpace, terms: Mapping[str, Any], scales: Mapping[st
         unknown = [p for p in parameters if p not in space]
         if unknown:
             problems.append(f"term {name!r} reads {unknown}, which the space lacks")
-        elif isinstance(term, _OF_NUMBERS) and any(isinstance(space[p], Choice) for p in parameters):
-            problems.append(f"term {name!r} is a {type(term).__name__} of a choice: expected ChoiceTolerance or Term")
-        elif isinstance(term, ChoiceTolerance) and term.num_options != space[parameters[0]].width:
-            options = space[parameters[0]].width
-            problems.append(f"term {name!r} has bounds for {term.num_options} options, {parameters[0]} has {options}")
+        elif hasattr(term, "mismatch") and (mismatch := term.mismatch(space)):
+            problems.append(f"term {name!r} {mismatch}")
         read.update(parameters)
     unread = [p for p in space.names if p not in read]
     if unread:

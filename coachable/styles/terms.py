@@ -13,16 +13,19 @@ import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 
+from coachable.styles.parameters import Choice
 from coachable.styles.tolerance import tolerance
 from coachable.styles.view import StyleView
 
 if TYPE_CHECKING:  # this package also runs without tensordict
     from tensordict import TensorDictBase
+
+    from coachable.styles.space import StyleSpace
 
 Features: TypeAlias = "Tensor | TensorDictBase"
 Style: TypeAlias = Mapping[str, Tensor]
@@ -31,7 +34,11 @@ FeatureKey: TypeAlias = int | slice | str | tuple[Any, ...]
 
 @runtime_checkable
 class StyleTerm(Protocol):
-    """Callable `(features, style) -> (...,)` with the names of the parameters that it reads."""
+    """Callable `(features, style) -> (...,)` with the names of the parameters that it reads.
+
+    A term may also have `is_linear`, which is true if its reward is linear in the features, and `mismatch(space)`, which
+    returns what is wrong with the parameters that it reads, or None.
+    """
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -136,8 +143,19 @@ def weighted_sum(weights: Tensor, values: Tensor) -> Tensor:
     return reduce(operator.add, (weights * values).unbind(-1))
 
 
+class _OfNumbers:
+    """Base of terms that read weights or set-points."""
+
+    def mismatch(self, space: "StyleSpace") -> str | None:
+        """Return what is wrong if a parameter of the term is a choice."""
+        parameters: tuple[str, ...] = self.parameters  # pyright: ignore[reportAttributeAccessIssue]
+        if not any(isinstance(space[name], Choice) for name in parameters):
+            return None
+        return f"is a {type(self).__name__} of a choice: expected ChoiceTolerance or Term"
+
+
 @dataclass(frozen=True)
-class WeightedFeature:
+class WeightedFeature(_OfNumbers):
     """Term `w * g` of one weight and one feature.
 
     Args:
@@ -147,6 +165,7 @@ class WeightedFeature:
 
     parameter: str
     key: FeatureKey
+    is_linear: ClassVar[bool] = True
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -159,7 +178,7 @@ class WeightedFeature:
         return weight * scalar_feature(features, self.key, weight)
 
 
-class WeightedSum:
+class WeightedSum(_OfNumbers):
     """Term `sum_i w_i g_i` of many weights, where `features[..., i]` belongs to `parameters[i]` (paper, combat).
 
     With 18 weights, one such term is much faster than 18 of `WeightedFeature`.
@@ -168,6 +187,8 @@ class WeightedSum:
         parameters: Names of the weights, in the order of the features.
         key: Key of the features `(..., len(parameters))`, see `feature`; None for all.
     """
+
+    is_linear = True
 
     def __init__(self, parameters: Sequence[str], key: FeatureKey | None = None) -> None:
         self.parameters = tuple(parameters)
@@ -189,7 +210,7 @@ class WeightedSum:
 
 
 @dataclass(frozen=True)
-class SetpointTolerance:
+class SetpointTolerance(_OfNumbers):
     """Term that is the `tolerance` of a feature around a set-point: 1 within `half_width` of the requested value.
 
     Args:
@@ -268,6 +289,12 @@ class ChoiceTolerance:
         # Both bounds are in one table (n_options, 2k), so that a step needs one look-up instead of two.
         self._bounds = {lower.device: torch.cat([lower, upper], dim=-1)}
         self._mean = {lower.device: torch.full((lower.shape[1],), 1.0 / lower.shape[1], device=lower.device)}
+
+    def mismatch(self, space: "StyleSpace") -> str | None:
+        """Return what is wrong if the parameter has another number of options than the bounds."""
+        [name] = self.parameters
+        width = space[name].width
+        return f"has bounds for {self.num_options} options, {name} has {width}" if width != self.num_options else None
 
     def __call__(self, features: Features, style: Style) -> Tensor:
         """Return the reward `(...,)`."""
