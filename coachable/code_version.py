@@ -15,7 +15,7 @@ RECIPES = str(next(p for p in (_PACKAGE / "recipes", _PACKAGE.parent / "recipes"
 
 
 def code_version() -> str:
-    """Return the versions of Python and coachable, with a checksum of coachable's source at the first call, in words."""
+    """Return in words the versions of Python and coachable, and a checksum of coachable's source at the first call."""
     return f"Python {platform.python_version()} and coachable {__version__} ({_checksum():08x})"
 
 

@@ -36,8 +36,8 @@ FeatureKey: TypeAlias = int | slice | str | tuple[Any, ...]
 class StyleTerm(Protocol):
     """Callable `(features, style) -> (...,)` with the names of the parameters that it reads.
 
-    A term may also have `is_linear`, which is true if its reward is linear in the features, and `mismatch(space)`, which
-    returns what is wrong with the parameters that it reads, or None.
+    A term may also have `is_linear`, which is true if its reward is linear in the features, and `mismatch(space)`,
+    which returns what is wrong with the parameters that it reads, or None.
     """
 
     @property

@@ -120,7 +120,8 @@ class Watch:
                 assert owners.setdefault(number, (worker, restart)) == (worker, restart)
         replay = self.train.replay
         arrived = sum(data.numel() for data in self.batches)
-        held = len(replay._writer.n_step)
+        waiting = replay._writer.n_step._data  # for the rest of their sum
+        held = 0 if waiting is None else len(waiting)
         assert arrived == self.train.frames == replay.write_count + held
         assert held <= (N_STEPS - 1) * NUM_ENVS * len(self.train.collector.workers.slots), (
             "steps of the lost are written"
