@@ -299,7 +299,9 @@ def test_every_component_of_an_action_space():
     np.testing.assert_array_equal(action["switch"], [1, 0])
 
 
-@pytest.mark.parametrize("space", [spaces.Box(-np.inf, np.inf, (2,)), spaces.Text(3)])
+@pytest.mark.parametrize(
+    "space", [spaces.Box(-np.inf, np.inf, (2,)), spaces.Text(3), spaces.Discrete(1), spaces.MultiDiscrete([2, 1])]
+)
 def test_other_action_spaces_are_refused(space):
     class Odd(Walk):
         action_space = space

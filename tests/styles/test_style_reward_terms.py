@@ -331,6 +331,30 @@ def test_reward_must_fit_its_space(terms, scales, message):
         StyleReward(SPACE, terms, scales)
 
 
+class Lift:
+    """A term of one's own that says what it is like."""
+
+    parameters = ("gap",)
+    is_linear = True
+
+    def mismatch(self, space):
+        return None if space["gap"].high > 100 else f"lifts to 100 {space['gap'].unit}, gap ends at {space['gap'].high}"
+
+    def __call__(self, features, style):
+        return style["gap"] * features[..., 2]
+
+
+def test_an_own_term_tells_which_parameters_suit_it():
+    with pytest.raises(ValueError, match=r"term 'lift' lifts to 100 .*, gap ends at"):
+        StyleReward(SPACE, {"costs": FUEL_AND_TIRE, "lift": Lift()})
+
+
+def test_an_own_term_may_be_linear():
+    space = StyleSpace([Setpoint("gap", 0.0, 200.0, unit="m")])
+    assert StyleReward(space, {"lift": Lift()}).is_linear
+    assert not StyleReward(space, {"lift": Term(Lift(), ("gap",))}).is_linear
+
+
 def test_all_problems_are_told_at_once():
     with pytest.raises(ValueError, match=r"'gap' declares no parameters.*no term reads.*'tire', 'gap'.*scales"):
         StyleReward(SPACE, {"fuel": WeightedFeature("fuel", 0), "gap": len}, {"gaap": 1.0})
