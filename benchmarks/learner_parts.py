@@ -28,6 +28,7 @@ from unittest.mock import patch
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "recipes"))
 
 import humanoid_sac
+import numpy as np
 import torch
 from contest import processor
 from recipe_config import compose_config
@@ -46,7 +47,7 @@ from coachable.training.weights import load_policy
 COMMON = ["preset=cpu", "threads.learner=1", "threads.simulator=1", "train.eval_interval=0", "wandb.mode=off"]
 COMMON += ["checkpoint.replay=false"]
 SCALE = 1 / 70  # of rewards, so that values are at most about 5
-COLUMNS = ("without a fall", "step error [m]", "arms in pose", "speed [m/s]", "minutes", "updates")
+COLUMNS = ("without a fall", "step error [m]", "arms in pose", "clearance [m]", "minutes", "updates")
 
 
 class HeldNoise(TensorDictModuleBase):
@@ -239,7 +240,7 @@ def measure(run_dir: Path) -> dict[str, float]:
     agent = load_policy(str(run_dir))
     domain = load_domain("humanoid", agent.config)
     episodes = evaluate_grid(domain, agent.actor, agent.space, episodes=5, num_threads=1, progress=False).episodes
-    means = (float(episodes[key].mean()) for key in ("survived", "step_length_error", "pose_held", "speed"))
+    means = (float(np.nanmean(episodes[key])) for key in ("survived", "step_length_error", "pose_held", "clearance"))
     return dict(zip(COLUMNS, means, strict=False))
 
 
