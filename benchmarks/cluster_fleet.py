@@ -179,7 +179,7 @@ class Fleet:
         return {"megabytes": everything / self.options.workers / 1e6, "private megabytes": private / 1e6}
 
     def _cores(self, now: float) -> float:
-        """Return the number of cores that as many workers use as are asked for, from those that are alive."""
+        """Returns the number of cores that as many workers use as are asked for, from those that are alive."""
         alive = [slot.pid for slot in self.workers.slots if slot.is_ready and slot.pid in self.seen]
         spans = [(self.seen[pid], cpu_seconds(pid)) for pid in alive]
         used = sum(cpu - began for (_, began), cpu in spans)

@@ -11,7 +11,6 @@ printed, and learning curves with their range over the seeds are drawn in `--out
 """
 
 import argparse
-import csv
 import math
 import statistics
 import sys
@@ -23,7 +22,7 @@ matplotlib.use("Agg")
 import numpy as np
 from matplotlib import pyplot as plt
 
-from coachable.evaluation.curves import metrics_files, read_metric
+from coachable.evaluation.curves import read_metric
 from coachable.evaluation.many_seeds import train_seeds
 
 RECIPES = Path(__file__).resolve().parent.parent / "recipes"
@@ -85,7 +84,8 @@ def main() -> None:
 def cells(runs: list[Path], arguments: list[str], style: str) -> list[str]:
     measures = {name: [read_metric(run, "frames", name)[1][-1] for run in runs] for name in ("eval/return", style)}
     stale = [read_metric(run, "frames", "workers/staleness")[1].mean() for run in runs] if arguments else [0.0]
-    totals = {name: [total(run, name) for run in runs] for name in ("frames", "updates", "minutes")}
+    counted = ("frames", "updates", "minutes")  # from the start of each stage; the first column sums them
+    totals = {name: [read_metric(run, name, name)[0][-1] for run in runs] for name in counted}
     return [
         *(f"{of(values):.3g}" for values in measures.values() for of in (statistics.mean, spread)),
         f"{statistics.mean(stale):.0f}",
@@ -96,11 +96,6 @@ def cells(runs: list[Path], arguments: list[str], style: str) -> list[str]:
 
 def spread(values: list[float]) -> float:
     return statistics.stdev(values) if len(values) > 1 else math.nan
-
-
-def total(run: Path, name: str) -> float:
-    """Returns the last value of a metric that counts from the start of each stage, summed over the stages."""
-    return sum(float(list(csv.DictReader(file.open()))[-1][name]) for file in metrics_files(run))
 
 
 def draw(names: list[str], options: argparse.Namespace) -> None:

@@ -11,7 +11,6 @@ among them.
 """
 
 import argparse
-import csv
 import functools
 import json
 import math
@@ -38,6 +37,7 @@ from torch import Tensor, nn
 from torchrl.envs import Transform
 
 from coachable.domain import load_domain
+from coachable.evaluation.curves import read_metric
 from coachable.evaluation.style_grid import evaluate_grid
 from coachable.training.curriculum import Curriculum
 from coachable.training.learner import Learner
@@ -67,9 +67,9 @@ class HeldNoise(TensorDictModuleBase):
         if self.noise.shape != loc.shape:
             self.noise, self.left = torch.zeros_like(loc), torch.zeros(loc.shape[:-1])
         ends = self.left <= 0
-        self.noise[ends] = torch.randn_like(loc)[ends]
-        self.left[ends] = 1.0 + torch.multinomial(self.spans, int(ends.sum()) or 1, True)[: int(ends.sum())]
-        self.left -= 1
+        spans = 1.0 + torch.multinomial(self.spans, ends.numel(), replacement=True)
+        self.left = torch.where(ends, spans, self.left) - 1
+        self.noise = torch.where(ends[:, None], torch.randn_like(loc), self.noise)
         return out.set("action", torch.tanh(loc + scale * self.noise).clamp(-1 + 1e-6, 1 - 1e-6))
 
 
@@ -231,7 +231,7 @@ def train_and_measure(name: str, seed: int, run_dir: Path, frames: int) -> dict[
     if curriculum.train.stopped:
         sys.exit("the training was interrupted: the same command starts it again")
     minutes = (time.perf_counter() - began) / 60
-    row = measure(run_dir) | {"minutes": minutes, "updates": updates(run_dir)}
+    row = measure(run_dir) | {"minutes": minutes, "updates": read_metric(run_dir, "updates", "updates")[0][-1]}
     shutil.rmtree(run_dir)
     return row
 
@@ -242,11 +242,6 @@ def measure(run_dir: Path) -> dict[str, float]:
     episodes = evaluate_grid(domain, agent.actor, agent.space, episodes=5, num_threads=1, progress=False).episodes
     means = (float(np.nanmean(episodes[key])) for key in ("survived", "step_length_error", "pose_held", "clearance"))
     return dict(zip(COLUMNS, means, strict=False))
-
-
-def updates(run_dir: Path) -> float:
-    files = run_dir.glob("stages/*/metrics.csv")
-    return sum(float(list(csv.DictReader(file.open()))[-1]["updates"]) for file in files)
 
 
 if __name__ == "__main__":

@@ -146,10 +146,11 @@ def weighted_sum(weights: Tensor, values: Tensor) -> Tensor:
 class _OfNumbers:
     """Base of terms that read weights or set-points."""
 
+    parameters: tuple[str, ...]
+
     def mismatch(self, space: "StyleSpace") -> str | None:
         """Return what is wrong if a parameter of the term is a choice."""
-        parameters: tuple[str, ...] = self.parameters  # pyright: ignore[reportAttributeAccessIssue]
-        if not any(isinstance(space[name], Choice) for name in parameters):
+        if not any(isinstance(space[name], Choice) for name in self.parameters):
             return None
         return f"is a {type(self).__name__} of a choice: expected ChoiceTolerance or Term"
 
