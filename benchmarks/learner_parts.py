@@ -1,4 +1,4 @@
-"""Parts of other learners and settings, tried one by one on the humanoid's preset `cpu` with a shortened second stage.
+"""Parts of other learners and settings, tried one by one on the first two stages of the humanoid's preset `cpu`.
 
     python benchmarks/learner_parts.py                                   all parts, two seeds: half a day on one core
     python benchmarks/learner_parts.py --only none held_noise --seeds 0 --core 1     several may run side by side
@@ -175,7 +175,6 @@ PARTS = {
     "three_steps": Part(("n_steps=3",)),
     "lr_6e-4": Part(("learner.actor_lr=6e-4", "learner.critic_lr=6e-4")),
     "alpha_02": Part(("alpha=0.02",)),
-    "no_pushes": Part(("env.push_force=0",)),
     "double_utd": Part(("train.utd_ratio=0.125",)),
 }
 
@@ -214,6 +213,7 @@ def train_and_measure(name: str, seed: int, run_dir: Path, frames: int) -> dict[
     part = PARTS[name]
     shutil.rmtree(run_dir, ignore_errors=True)
     config = compose_config("humanoid_sac", [*COMMON, *part.arguments, f"seed={seed}", f"run_dir={run_dir}"])
+    del config["stages"][2:]
     config["stages"][1]["train"]["total_frames"] = frames
     make_collector = humanoid_sac.boxes.make_collector
 
