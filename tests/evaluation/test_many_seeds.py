@@ -81,5 +81,5 @@ def test_the_same_command_continues_what_was_interrupted(tmp_path, number):
     said, _ = process.communicate()
     assert process.returncode == 0
     assert re.search(rf"^\| frames \| {total} \| {total} \| {total} \|", said, re.MULTILINE)
-    assert "resumed" in (tmp_path / "seed_3.log").read_text()
+    assert "Resumed " in (tmp_path / "seed_3.log").read_text()
     assert {read_state(find_checkpoint(tmp_path / f"seed_{s}"))["config"]["seed"] for s in (3, 5)} == {3, 5}
