@@ -76,6 +76,12 @@ def test_a_stage_starts_from_the_weights_of_the_one_before(tmp_path):
         start(*TINY, STAGES, f"run_dir={tmp_path}")
 
 
+def test_a_stage_that_is_started_alone_ends_like_the_one_of_the_whole_training(whole, tmp_path):
+    first, second = whole / "stages" / "1_first", whole / "stages" / "2_second"
+    start(*TINY, STAGES, "stage=second", f"init_from={first}", f"run_dir={tmp_path / 'alone'}").run()
+    assert differences(tmp_path / "alone", second) == []
+
+
 def test_a_signal_at_the_end_of_a_stage_ends_the_training(whole, tmp_path, monkeypatch):
     run, evaluate = tmp_path / "run", Trainer._evaluate
 
