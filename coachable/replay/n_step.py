@@ -157,7 +157,8 @@ class NStep:
         self.clear()
         if state:
             self._steps = Steps.from_state_dict(state["steps"])
-            self._data = TensorDict(state["data"], batch_size=[len(self._steps)], device=device).clone()
+            data = TensorDict(state["data"], batch_size=[len(self._steps)], device=device)
+            self._data = data.apply(torch.clone)  # TensorDict.clone adds 0, which turns -0.0 into 0.0
 
 
 def _add(total: Any, value: Any, factor: float, where: torch.Tensor) -> None:

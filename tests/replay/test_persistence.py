@@ -160,6 +160,17 @@ def test_a_buffer_whose_steps_are_all_held_back_round_trips(way, tmp_path):
 
 
 @pytest.mark.parametrize("way", [by_state_dict, by_dumps])
+def test_zeros_of_steps_that_are_held_back_keep_their_sign(way, tmp_path):
+    saved, fresh = make(n_steps=4), make(n_steps=4)
+    first = batch(0, time=2)
+    first["next", "done"].zero_(), first["next", "terminated"].zero_()
+    first["next", "style_features"].fill_(-0.0)
+    saved.extend(first)
+    way(saved, fresh, tmp_path)
+    assert fresh._writer.n_step._data["next", "style_features"].signbit().all()
+
+
+@pytest.mark.parametrize("way", [by_state_dict, by_dumps])
 def test_an_empty_buffer_round_trips(way, tmp_path):
     saved, fresh = make(n_steps=3, relabel=True), make(n_steps=3, relabel=True)
     way(saved, fresh, tmp_path)

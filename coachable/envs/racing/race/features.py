@@ -103,8 +103,7 @@ def inward_angle(angle: Tensor, curvature: Tensor) -> Tensor:
         curvature: Curvature of the track, positive to the left (N,) [1/m].
     """
     inwards = -angle * torch.sign(curvature)
-    # Adding 0 turns -0.0, whose sign clamp keeps or drops depending on the memory's alignment, into 0.0.
-    return torch.minimum(inwards, 0.5 * math.pi - inwards).clamp(min=0.0) + 0.0
+    return torch.minimum(inwards, 0.5 * math.pi - inwards).clamp(min=0.0)
 
 
 def pack_style_features(
