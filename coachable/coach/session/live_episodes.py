@@ -7,10 +7,11 @@ from collections import Counter
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 
 from coachable.domain import Domain
 from coachable.styles import StyleSpace
+from coachable.training.collection import simulation_env
 from coachable.training.rollout import Rollout
 
 TIME_IS_UP = "time is up"
@@ -43,10 +44,7 @@ class LiveEpisodes(Rollout):
     @property
     def base_env(self) -> EnvBase:
         """The domain's environment without the transforms around it."""
-        env = self.env
-        while isinstance(env, TransformedEnv):
-            env = env.base_env
-        return env
+        return simulation_env(self.env)
 
     def seed(self, seed: int) -> None:
         """Seed the environment and the actions, and count episodes from 1 again; call `begin` afterwards."""

@@ -20,6 +20,7 @@ from coachable.scene import palette
 from coachable.scene.frame import Backdrop, Frame, Gauge, Label, Viewpoint
 from coachable.scene.palette import Colour
 from coachable.scene.parts import SHAPES, Batch, Parts, about_z, above
+from coachable.training.collection import simulation_env
 
 ELEMENT_COLOURS: dict[str, Colour] = {
     "acid": palette.GREEN,
@@ -67,11 +68,11 @@ class CombatStage:
 
     def backdrop(self, env: EnvBase, row: int = 0) -> Backdrop:
         """Return what does not move; see `Stage.backdrop`."""
-        return arena(int(_combat(env).state.site[row]))
+        return arena(int(cast(CombatEnv, simulation_env(env)).state.site[row]))
 
     def frame(self, env: EnvBase, row: int = 0, asked: Mapping[str, float | str] | None = None) -> Frame:
         """Return what is visible now; see `Stage.frame`."""
-        env = _combat(env)
+        env = cast(CombatEnv, simulation_env(env))
         s = {name: value[..., row].cpu().numpy() for name, value in env.state.tensors().items()}
         steps, machines = float(s["steps"]), tuple(s["machine"].tolist())
         if steps < self._steps or machines != self._key:
@@ -182,12 +183,6 @@ class CombatStage:
                 target = s["shot_point"][:, slot, enemy]
                 glows.cylinder((*target, 0.08), (2 * c.SHOT_RADIUS, 2 * c.SHOT_RADIUS, 0.08), palette.VERMILION)
                 glows.rod(above(ground, radius), (*target, 0.3), 0.05, palette.VERMILION)
-
-
-def _combat(env: EnvBase) -> CombatEnv:
-    while not isinstance(env, CombatEnv):
-        env = cast(EnvBase, env.base_env)
-    return env
 
 
 def _nearest(s: Mapping[str, np.ndarray]) -> int:

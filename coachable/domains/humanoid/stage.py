@@ -19,6 +19,7 @@ from coachable.scene import palette
 from coachable.scene.frame import Backdrop, Frame, Gauge, Label, Viewpoint
 from coachable.scene.palette import Colour, css
 from coachable.scene.parts import BALL, CYLINDER, Batch, Parts, about_z, above, plain, towards
+from coachable.training.collection import simulation_env
 
 _HALF = 30.0  # [m], of the ground around the walker
 _MARK = 0.5  # [m], between lines on the ground
@@ -73,8 +74,7 @@ class HumanoidStage:
 
     def frame(self, env: EnvBase, row: int = 0, asked: Mapping[str, float | str] | None = None) -> Frame:
         """Return what is visible now; see `Stage.frame`."""
-        while not isinstance(env, HumanoidEnv):
-            env = cast(EnvBase, env.base_env)
+        env = cast(HumanoidEnv, simulation_env(env))
         self._data.qpos[:] = env.simulation.positions[row]
         mujoco.mj_kinematics(self._model, self._data)
         course = float(env.course[row])
@@ -184,10 +184,8 @@ class HumanoidStage:
     def _gauges(self) -> Sequence[Gauge]:
         speed = Gauge("speed", f"{self._speed:.2f} m/s", self._speed / _FASTEST, palette.MEASURED)
         lengths = " ".join(f"{length:.2f}" for length, _ in self._lengths)
-        return speed, Gauge("last steps", f"{lengths} m" if lengths else "none yet"), Gauge("time", self._time())
-
-    def _time(self) -> str:
-        return f"{self._steps * CONTROL_STEP:.1f} s"
+        time = f"{self._steps * CONTROL_STEP:.1f} s"
+        return speed, Gauge("last steps", f"{lengths} m" if lengths else "none yet"), Gauge("time", time)
 
 
 def web_scene() -> WebScene:

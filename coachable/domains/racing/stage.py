@@ -29,6 +29,7 @@ from coachable.scene import palette
 from coachable.scene.frame import Backdrop, Frame, Map, Viewpoint
 from coachable.scene.palette import Colour
 from coachable.scene.parts import Parts, about_z
+from coachable.training.collection import simulation_env
 
 CARS: tuple[Colour, ...] = (palette.ORANGE, palette.SKY, palette.PURPLE, palette.GREEN, palette.YELLOW)
 SKID: Colour = (52, 54, 58)
@@ -56,11 +57,11 @@ class RacingStage:
 
     def backdrop(self, env: EnvBase, row: int = 0) -> Backdrop:
         """Return what does not move; see `Stage.backdrop`."""
-        return circuit(_track(_racing(env), row))
+        return circuit(_track(cast(RacingEnv, simulation_env(env)), row))
 
     def frame(self, env: EnvBase, row: int = 0, asked: Mapping[str, float | str] | None = None) -> Frame:
         """Return what is visible now; see `Stage.frame`."""
-        env = _racing(env)
+        env = cast(RacingEnv, simulation_env(env))
         state = env.state.cpu().numpy()
         columns, track = mates(env, row), _track(env, row)
         key = (int(env.episode[row % env.races]), tuple(columns))
@@ -130,9 +131,3 @@ def mates(env: RacingEnv, row: int) -> list[int]:
 def _track(env: RacingEnv, row: int) -> Track:
     """Return the circuit that the car of a row is on."""
     return env.tracks[int(env.circuit[row % env.races])]
-
-
-def _racing(env: EnvBase) -> RacingEnv:
-    while not isinstance(env, RacingEnv):
-        env = cast(EnvBase, env.base_env)
-    return env
