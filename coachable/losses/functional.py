@@ -59,20 +59,6 @@ def pessimistic_quantiles(quantiles: Tensor) -> Tensor:
     return best
 
 
-def quantile_midpoints(num_quantiles: int, like: Tensor) -> Tensor:
-    """Return the quantile fractions `(2i - 1) / (2M)`, i = 1..M, with the device and dtype of `like`.
-
-    Args:
-        num_quantiles: M.
-        like: Tensor with the wanted device and dtype.
-
-    Returns:
-        Quantile fractions `(M,)`.
-    """
-    index = torch.arange(num_quantiles, device=like.device, dtype=like.dtype)
-    return (index + 0.5) / num_quantiles
-
-
 def quantile_huber_loss(prediction: Tensor, target: Tensor, *, kappa: float = 1.0) -> Tensor:
     """Return the quantile Huber loss of every prediction against every target (QR-DQN, IQN).
 
@@ -97,8 +83,9 @@ def quantile_huber_loss(prediction: Tensor, target: Tensor, *, kappa: float = 1.
     """
     if kappa < 0:
         raise ValueError(f"kappa must not be negative, got {kappa}")
-    fractions = quantile_midpoints(prediction.shape[-1], prediction)
-    scale = 1.0 / target.shape[-1] / prediction.shape[-1] / (kappa or 1.0)
+    count = prediction.shape[-1]
+    fractions = (torch.arange(count, device=prediction.device, dtype=prediction.dtype) + 0.5) / count
+    scale = 1.0 / target.shape[-1] / count / (kappa or 1.0)
     needs_gradient = torch.is_grad_enabled() and prediction.requires_grad
     return _QuantileHuber.apply(prediction, target.detach(), fractions, float(kappa), scale, needs_gradient)
 
