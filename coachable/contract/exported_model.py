@@ -38,7 +38,7 @@ class OnnxRun:
     def __init__(self, content: bytes, contract: Contract) -> None:
         import onnxruntime
 
-        self._heads = heads_of(contract)
+        self._heads = ActionHeads(contract.choice_sizes, contract.widths[1] - sum(contract.choice_sizes))
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 4  # errors are raised, and need not be printed, too
@@ -119,11 +119,6 @@ class OnnxPolicy(TensorDictModuleBase):
         observation, style = (tensordict.get(key).cpu().numpy() for key in ("observation", STYLE))
         action = self._run.act(observation, style, sample)
         return tensordict.set("action", torch.from_numpy(action))
-
-
-def heads_of(contract: Contract) -> ActionHeads:
-    """Return the components of the action that a contract describes."""
-    return ActionHeads(contract.choice_sizes, contract.widths[1] - sum(contract.choice_sizes))
 
 
 def read_model(file: Path | str) -> tuple[Contract, OnnxRun]:
