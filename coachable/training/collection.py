@@ -18,11 +18,10 @@ from coachable.keys import TASK_REWARD
 from coachable.training.async_collector import AsyncCollector
 from coachable.training.rng import preserved_rng
 from coachable.training.rollout import Rollout
-from coachable.training.simulators import ResumableEnv, UnsavableError, load_simulator, save_simulator
+from coachable.training.simulators import UnsavableError, load_simulator, save_simulator
 from coachable.training.worker_errors import ReportingCollector
 
 __all__ = [
-    "ResumableEnv",
     "SelfPlayEnv",
     "collector_state",
     "evaluate_policy",
