@@ -105,11 +105,7 @@ def _fence(table: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """Return corners (2 n, 3) and triangles of a wall, which is seen from both sides."""
     foot = _side(table, offset)
     corners = np.concatenate([np.insert(foot, 2, z, axis=1) for z in (_LEVELS["grass"], _WALL_HEIGHT)])
-    count = len(table)
-    here = np.arange(count)
-    there = (here + 1) % count
-    faces = [[here, there, there + count], [here, there + count, here + count]]
-    one = np.concatenate([np.stack(face, axis=1) for face in faces])
+    _, one = _band(table, offset, offset)  # the triangles between two rings of as many corners
     return corners, np.concatenate([one, one[:, ::-1]])
 
 
