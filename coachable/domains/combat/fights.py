@@ -23,7 +23,7 @@ from coachable.evaluation.episode_records import record_episodes
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import drawing
 from coachable.evaluation.statistics import rank_correlation
-from coachable.evaluation.style_grid import markdown_table, policy_sentence, write_results
+from coachable.evaluation.style_grid import markdown_table, policy_sentence, rows_where, write_results
 from coachable.evaluation.sweep import WeightSweep, sweep_weights
 from coachable.evaluation.wording import readable
 from coachable.styles import StyleSpace
@@ -206,10 +206,9 @@ def _sweep_rows(sweeps: Sequence[WeightSweep]) -> list[dict[str, Any]]:
 
 
 def _correlations(sweep: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-
     found = {}
     for name in dict.fromkeys(row["style"] for row in sweep):
-        points = [row for row in sweep if row["style"] == name]
+        points = rows_where(sweep, style=name)
         weights, scores = (np.array([row[key] for row in points]) for key in ("weight", "style_score"))
         found[name] = rank_correlation(weights, scores)
     return found
@@ -251,7 +250,7 @@ def draw_sweep(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     size = (2.6 * columns, 2.4 * count)
     with drawing(path, count, columns, size=size) as grid:
         for panel, name in zip(grid.flat, names, strict=False):
-            points = [row for row in rows if row["style"] == name]
+            points = rows_where(rows, style=name)
             weights, scores, won = ([point[key] for point in points] for key in ("weight", "style_score", "won"))
             panel.plot(weights, scores, marker="o", ms=4, label="score")
             panel.plot(weights, won, ls="--", marker="x", ms=4, label="won")

@@ -12,7 +12,7 @@ from coachable.domains.humanoid.metrics import LENGTH_TOLERANCE, SPEED_TOLERANCE
 from coachable.evaluation.evaluate import evaluate_styles
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import drawing
-from coachable.evaluation.style_grid import StyleGrid, markdown_table, mean_of, write_csv
+from coachable.evaluation.style_grid import StyleGrid, markdown_table, mean_of, rows_where, write_csv
 from coachable.evaluation.wording import readable
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def draw_plane(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         for line, (name, (label, form, (low, high))) in zip(panels, _PANELS.items(), strict=True):
             for panel, pose in zip(line, poses, strict=True):
                 values = np.full((len(speeds), len(lengths)), np.nan)
-                for row in (row for row in rows if row["pose"] == pose):
+                for row in rows_where(rows, pose=pose):
                     y, x = speeds.index(row["speed"]), lengths.index(row["step_length"])
                     values[y, x] = value = row[name]
                     walked = row["walked"] == "yes"
@@ -102,7 +102,7 @@ def draw_plane(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def _section(rows: Sequence[Mapping[str, Any]]) -> str:
-    missed = [row for row in rows if row["walked"] == "no"]
+    missed = rows_where(rows, walked="no")
     text = "\n## Plane of speed and step length\n\n![speed and step length](plane.png)\n\n"
     text += f"Walked: {len(rows) - len(missed)} of {len(rows)} styles, with at most {1 - LEAST_SURVIVAL:.0%} falls, "
     text += f"a speed within {SPEED_TOLERANCE:g} m/s and a step length within {LENGTH_TOLERANCE:g} m of the request.\n"
