@@ -267,13 +267,14 @@ def _ratio(part: np.ndarray, whole: np.ndarray, fights: np.ndarray, axis: int = 
 def _resampled(grids: Grids, index: int, kinds: Sequence[str]) -> np.ndarray:
     """Return bootstrap means of measures under a request, (resamples, kinds).
 
-    Several seeds are drawn again as a whole, the fights of a single seed within each opponent.
+    Several seeds are drawn again as a whole, the same ones under every request, because requests share what a seed has
+    learned. The fights of a single seed are drawn again within each opponent.
     """
     if len(grids) > 1:
         units = np.array([[[grid[kind][index].mean() for kind in kinds] for grid in grids]])
     else:
         units = np.stack([grids[0][kind][index] for kind in kinds], -1)
     opponents, count = units.shape[:2]
-    random = np.random.default_rng(index)
+    random = np.random.default_rng(index if len(grids) == 1 else 0)
     weights = random.multinomial(count, np.full(count, 1.0 / count), (_RESAMPLES, opponents))
     return np.tensordot(weights, units, 2) / (opponents * count)

@@ -198,6 +198,6 @@ def _report(
     formats = {name: ".0%" if domain.columns.get(name, "").endswith("%") else ".3f" for name in switching.metrics}
     text += markdown_table([switching.metrics], formats, units_of(domain, agent.space, formats))
     if not switching.switches:
-        return text + "\nThe episodes are too short for a switch.\n"
+        return text + "\nThere was no switch after which compliance could be judged.\n"
     text += f"\nComplied before the next switch: {switching.complied:.0%} of {switching.switches} switches; "
     return text + f"median time to comply {median}.\n"

@@ -209,7 +209,7 @@ class _Sections:
         """Add how fast the agent complies after switches, in `episodes` episodes per run, if there are any."""
         tests = [run.switching for run in self.runs]
         switches = sum(test.switches for test in tests)
-        if not switches:  # the episodes are shorter than the time between two switches
+        if not switches:  # the episodes are too short for one, or compliance cannot be judged
             return
         period = SWITCH_PERIOD * self.domain.control_step
         draw_switches(self.runs, period, self.out / "switches.png")

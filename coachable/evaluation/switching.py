@@ -22,7 +22,7 @@ class SwitchReport:
         metrics: Mean over episodes of survival and of the domain's measures.
         comply_seconds: Time from a switch until the agent complied (S,) [s], for the switches after which it did.
         complied: Share of the switches after which the agent complied before the next one.
-        switches: Number of switches in episodes that had not ended.
+        switches: Number of switches in episodes that had not ended; 0 if no step shows whether the agent complied.
     """
 
     metrics: dict[str, float]
@@ -41,6 +41,9 @@ def evaluate_switching(
     **options: Unpack[RolloutOptions],
 ) -> SwitchReport:
     """Evaluate a policy with a new style from the training distribution every `period` steps.
+
+    No switch counts if the measures have a method `judged`, as in `MeasuredWindow`, that is false in every step. Then
+    compliance cannot be judged, such as savings of fuel without a comparison.
 
     Args:
         domain: Domain in which the policy acts.
@@ -63,8 +66,10 @@ def evaluate_switching(
     summary = {"survived": record.survived.float(), **domain.measures.summarise(record.measures, record.alive)}
     metrics = {name: value.nanmean().item() for name, value in summary.items()}
     complies = domain.measures.complies(record.measures) & record.alive
+    judge = getattr(domain.measures, "judged", None)
+    is_known = judge is None or bool((judge(record.measures) & record.alive).any())
     waits, switches = [], 0
-    for start in range(period, len(complies), period):
+    for start in range(period, len(complies) if is_known else 0, period):
         running = record.alive[start]
         done, first = complies[start : start + period].max(0)
         switches += int(running.sum())

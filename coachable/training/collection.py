@@ -168,7 +168,7 @@ def load_collector_state(collector: BaseCollector | AsyncCollector, state: dict[
         counts.update_policy_weights_()  # before the first step
         raise UnsavableError(_ELSEWHERE)
     env = collector.env
-    if isinstance(env, TransformedEnv):
+    if isinstance(env, TransformedEnv) and "transforms" in state:  # collectors with workers do not save them
         env.load_state_dict(state["transforms"])
     if not state.get("simulation"):
         raise UnsavableError(state.get("not_saved", "the checkpoint does not hold their state"))

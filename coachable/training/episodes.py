@@ -59,11 +59,11 @@ class Means:
         self._sums: dict[str, Tensor] = {}
         self._counts: dict[str, int] = {}
 
-    def add(self, values: Mapping[str, Tensor]) -> None:
-        """Add one value of one element per name."""
+    def add(self, values: Mapping[str, Tensor], count: int = 1) -> None:
+        """Add one value of one element per name, which is the sum of `count` numbers."""
         for name, value in values.items():
             self._sums[name] = self._sums[name] + value if name in self._sums else value.clone()
-            self._counts[name] = self._counts.get(name, 0) + 1
+            self._counts[name] = self._counts.get(name, 0) + count
 
     def flush(self) -> dict[str, float]:
         """Return the means since the last call, and reset them."""
@@ -94,12 +94,12 @@ class EpisodeStatistics:
             self._ended.append(sums[done])
             self._terminated.append(after.get("terminated").reshape(-1)[done])
         rewards = {name: after.get(name, None) for name in (TASK_REWARD, STYLE_REWARD)}
-        per_step = {f"step/{name}": value.mean() for name, value in rewards.items() if value is not None}
+        per_step = {f"step/{name}": value.sum() for name, value in rewards.items() if value is not None}
         features = after.get(STYLE_FEATURES, None)
         if self.style_terms is not None and features is not None:
             terms = self.style_terms(features, data.get(STYLE))
-            per_step |= {f"step/style_{name}": value.mean() for name, value in terms.items()}
-        self._steps.add(per_step)
+            per_step |= {f"step/style_{name}": value.sum() for name, value in terms.items()}
+        self._steps.add(per_step, len(done))  # batches of asynchronous workers differ in size
 
     def flush(self) -> dict[str, float]:
         """Return the statistics since the last call, and reset them.

@@ -85,6 +85,17 @@ def test_recorded_styles_follow_the_schedule():
     assert record.style.shape == (6, 2, 3)
 
 
+def test_switches_do_not_count_where_compliance_cannot_be_judged():
+    class Unjudged(ToyMeasures):
+        def judged(self, record):
+            return torch.zeros_like(record["error"], dtype=torch.bool)
+
+    domain = replace(DOMAIN, measures=Unjudged())
+    report = evaluate_switching(domain, POLICY, SPACE, episodes=20, period=2, steps=4, progress=False)
+    assert (report.switches, len(report.comply_seconds)) == (0, 0) and np.isnan(report.complied)
+    assert report.metrics["survived"] == 1.0
+
+
 def test_switching_counts_compliance_per_switch():
     report = evaluate_switching(DOMAIN, POLICY, SPACE, episodes=200, period=2, steps=4, progress=False)
     # One switch; the half of the styles with a red hat is obeyed at once, i.e. after one step of 0.1 s.

@@ -47,3 +47,10 @@ def test_style_terms_are_averaged_where_there_are_features():
     plain = EpisodeStatistics()
     plain.add(transitions([False], [False], features=torch.ones(1, 1)))
     assert not [name for name in plain.flush() if name.startswith("step/style_reach")]
+
+
+def test_steps_of_a_long_batch_count_as_much_as_those_of_a_short_one():
+    statistics = EpisodeStatistics()
+    statistics.add(transitions([False], [False]))  # task reward 0
+    statistics.add(transitions([False] * 3, [False] * 3))  # 0, 1, 2
+    assert statistics.flush()["step/task_reward"] == pytest.approx(3.0 / 4.0)

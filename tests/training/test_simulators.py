@@ -92,3 +92,12 @@ def test_workers_in_other_processes_get_the_weights_and_the_count_of_frames():
     with pytest.raises(UnsavableError, match=r"environments in other processes cannot be saved \(collector=direct"):
         load_collector_state(after, collector_state(before))
     assert (after._frames, after._iter, after.told) == (480, 12, 1)
+
+
+def test_a_run_with_workers_is_resumed_in_one_process(make_train):
+    workers, direct = Workers(), make_train().collector
+    workers._frames = 480
+    with pytest.raises(UnsavableError, match="the checkpoint does not hold their state"):
+        load_collector_state(direct, collector_state(workers))
+    assert direct._frames == 480
+    direct.shutdown()

@@ -32,25 +32,29 @@ class CombatMeasures:
         self._high = combat_style_space(self.styles, reward_scale).high
         self._rows = torch.tensor([STYLES.index(name) for name in self.styles])
         self._counts = style_counts(STYLES)  # (18, 44)
+        self._is_damage = torch.tensor([not name.startswith("part_") for name in STYLES])
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
         """Return the measures of a step; see `StyleMeasures.step`.
 
-        They are the damage [HP], or units of parts, that counts for each of the 18 styles, all damage, the damage that
-        counts for the style with the largest weight ("requested"), and the outcome.
+        They are the damage [HP], or units of parts, that counts for each of the 18 styles, all damage, what counts for
+        the style with the largest weight ("requested"), the same only if it is damage ("requested_damage"), and the
+        outcome.
         """
         components = transition.get(("next", COMPONENTS_KEY))
         counted = components @ self._counts.T.to(components.device)  # (N, 18)
         wanted = transition.get(STYLE) / self._high.to(components.device)
         strongest, index = wanted.max(-1)
         damage = components[:, COMPONENT_SLICES["damage"]][:, 0]
-        asked = counted.gather(-1, self._rows.to(index.device)[index].unsqueeze(-1))[:, 0]
+        row = self._rows.to(index.device)[index]
+        asked = torch.where(strongest > 0, counted.gather(-1, row.unsqueeze(-1))[:, 0], torch.nan)
         death, outside = (components[:, COMPONENT_SLICES[name]][:, 0] for name in ("death", "out_of_bounds"))
         terminated = transition.get(("next", "terminated"))[:, 0].float()
         return {
             "damage": damage,
             **dict(zip(STYLES, counted.unbind(-1), strict=True)),
-            "requested": torch.where(strongest > 0, asked, torch.nan),
+            "requested": asked,
+            "requested_damage": torch.where(self._is_damage.to(row.device)[row], asked, torch.nan),
             "died": death,
             "out_of_bounds": outside,
             "won": terminated * (death + outside == 0),
@@ -59,8 +63,8 @@ class CombatMeasures:
     def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
         """Return sums over the steps that count, and the style score; see `StyleMeasures.summarise`.
 
-        The score is the share of the damage that counts for the style with the largest weight. It may exceed 1 for part
-        styles, for which removals count.
+        The score is the share of the damage that counts for the style with the largest weight, over the steps in which
+        such a style is requested. It is not defined for part styles, for which removals count.
 
         Args:
             record: Outputs of `step` (T, N), by name.
@@ -69,9 +73,12 @@ class CombatMeasures:
         Returns:
             Values (N,) by name.
         """
+        record = dict(record)
+        asked = record.pop("requested_damage")
         sums = {name: torch.where(alive, values, 0.0).sum(0) for name, values in record.items()}
-        score = sums["requested"] / sums["damage"].clamp(min=1e-6)
-        return {**sums, "style_score": torch.where(sums["damage"] > 0, score, torch.nan)}
+        scored = alive & ~asked.isnan()
+        counted, damage = (torch.where(scored, values, 0.0).sum(0) for values in (asked, record["damage"]))
+        return {**sums, "style_score": torch.where(damage > 0, counted / damage.clamp(min=1e-6), torch.nan)}
 
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
         """Return the steps (T, N) bool in which damage counts for the requested style; see `StyleMeasures.complies`."""

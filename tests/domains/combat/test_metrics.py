@@ -86,11 +86,25 @@ def test_a_fight_ends_in_one_way(terminated, amounts, outcome):
 def test_the_score_is_the_share_of_the_damage_in_the_steps_that_count():
     measures = CombatMeasures(("melee",))
     record = {"requested": torch.tensor([[2.0, 0.0], [3.0, 0.0], [9.0, 0.0]])}
-    record["damage"] = torch.tensor([[4.0, 0.0], [6.0, 0.0], [9.0, 0.0]])
+    record |= {"requested_damage": record["requested"], "damage": torch.tensor([[4.0, 0.0], [6.0, 0.0], [9.0, 0.0]])}
     alive = torch.tensor([[True, True], [True, True], [False, True]])
     sums = measures.summarise(record, alive)
     assert sums["requested"].tolist() == [5.0, 0.0] and sums["damage"].tolist() == [10.0, 0.0]
     assert sums["style_score"][0] == 0.5 and sums["style_score"][1].isnan()
+
+
+def test_a_request_for_parts_has_no_score_and_does_not_count_where_the_request_changes():
+    measures = CombatMeasures(("melee", "part_shield"))
+    melee, parts = torch.tensor([1.0, 0.0]), torch.tensor([0.0, 1.0])
+    hits = [
+        measures.step(transition(theta, damage=8.0, melee_damage=2.0, removals=1.0)) for theta in (melee, parts, parts)
+    ]
+    assert measures.complies(hits[1]).all()
+    record = {name: torch.stack([hit[name] for hit in hits]) for name in hits[0]}
+    alive = torch.ones_like(record["damage"], dtype=torch.bool)
+    assert measures.summarise(record, alive)["style_score"].tolist() == [0.25]
+    only_parts = measures.summarise({name: values[1:] for name, values in record.items()}, alive[1:])
+    assert only_parts["style_score"].isnan().all() and only_parts["part_shield"].tolist() == [2.0]
 
 
 def test_fights_are_judged_by_damage_under_a_style():

@@ -132,6 +132,16 @@ def test_what_is_there_anyway_does_not_count_as_obeying():
     assert implied["plasma"] == {"icestorm_boltblaster"} and not implied["carjas_bane"]
 
 
+def test_intervals_over_seeds_draw_the_same_seeds_under_every_request():
+    # One agent removes three units whatever is asked, the other none.
+    seeds = [grids(part_shield=[units] * 6, melee=[units] * 6) for units in (3, 0)]
+    (parts,) = paper_tables.part_rows(seeds, LABELS)
+    assert (parts["others"], parts["others_low"], parts["others_high"]) == (1.5, 0.0, 3.0)
+    assert parts["ratio_high"] == pytest.approx(1.0)
+    (melee, *_) = paper_tables.obedience_rows(seeds, LABELS)
+    assert melee["over_requests_high"] == pytest.approx(1.0)
+
+
 def test_rows_of_the_tables(tmp_path):
     grid = grids(frost=[40, 0, 90, 60, 0, 0], part_shield=[1, 1, 1, 1, 3, 9])
     grid["won"][:, 0] = 1.0
