@@ -310,6 +310,15 @@ def test_other_action_spaces_are_refused(space):
         GymnasiumEnv(Odd, moved)
 
 
+def test_copies_that_are_not_separate_environments_are_refused():
+    walk = Walk()
+    with pytest.raises(ValueError, match="make returned the same Walk twice: expected a new environment at each call"):
+        GymnasiumEnv(lambda: gymnasium.wrappers.TimeLimit(walk, 3), moved, num_envs=2)
+    assert GymnasiumEnv(lambda: walk, moved, num_envs=1).envs == [walk]
+    with pytest.raises(ValueError, match="make returned a SyncVectorEnv, which holds several environments"):
+        GymnasiumEnv(lambda: gymnasium.vector.SyncVectorEnv([Walk, Walk]), moved)
+
+
 def test_a_diverged_policy_is_named():
     env = GymnasiumEnv(Walk, moved, num_envs=1)
     with pytest.raises(ValueError, match="NaN"):

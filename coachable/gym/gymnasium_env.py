@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium
@@ -32,7 +32,7 @@ class GymnasiumEnv(EnvBase):
     processes.
 
     Args:
-        make: Name of a registered environment, or a function that makes one.
+        make: Name of a registered environment, or a function that makes a new one at each call.
         features: Function that computes `style_features`, see `Features`.
         num_envs: Number of copies N.
         seed: Seed of the first resets.
@@ -41,7 +41,8 @@ class GymnasiumEnv(EnvBase):
     `done`, `terminated`, `truncated` (N, 1).
 
     Raises:
-        ValueError: If the action space has a component of another kind, or a `Box` without finite bounds.
+        ValueError: If the action space has a component of another kind, or a `Box` without finite bounds, or `make`
+            returns the same environment twice or a vectorised one.
 
     Example:
         >>> env = GymnasiumEnv("Pendulum-v1", lambda obs, action, info: obs[2:], num_envs=2, seed=0)
@@ -57,6 +58,7 @@ class GymnasiumEnv(EnvBase):
         super().__init__(device="cpu", batch_size=torch.Size((num_envs,)))
         self.features = features
         self.envs = [gymnasium.make(make) if isinstance(make, str) else make() for _ in range(num_envs)]
+        _require_separate(self.envs)
         first = self.envs[0]
         sizes, axes = action_components(first.action_space)
         self.heads = ActionHeads(tuple(sizes), axes)
@@ -160,3 +162,18 @@ class GymnasiumEnv(EnvBase):
             for env in self.envs:
                 env.close()
         super().close(raise_if_closed=raise_if_closed)
+
+
+def _require_separate(envs: Sequence[gymnasium.Env]) -> None:
+    """Raise a `ValueError` unless each environment is a single one with a state of its own."""
+    for env in envs:
+        if isinstance(env, gymnasium.vector.VectorEnv):
+            raise ValueError(
+                f"make returned a {type(env).__name__}, which holds several environments: expected a single one, of "
+                "which num_envs copies are made"
+            )
+    if len({id(env.unwrapped) for env in envs}) < len(envs):
+        raise ValueError(
+            f"make returned the same {type(envs[0].unwrapped).__name__} twice: expected a new environment at each "
+            "call, because every copy has a state of its own"
+        )
