@@ -42,7 +42,8 @@ class GymnasiumEnv(EnvBase):
 
     Raises:
         ValueError: If the action space has a component of another kind, or a `Box` without finite bounds, or `make`
-            returns the same environment twice or a vectorised one.
+            returns the same environment twice or a vectorised one. At a step or reset, if the number of features
+            changes, or an observation does not have the size of its space.
 
     Example:
         >>> env = GymnasiumEnv("Pendulum-v1", lambda obs, action, info: obs[2:], num_envs=2, seed=0)
@@ -103,8 +104,11 @@ class GymnasiumEnv(EnvBase):
             action = native_action(env.action_space, iter(choices[row]), iter(axes[row]))
             observation, reward, terminated[row], truncated[row], info = env.step(action)
             rewards[row] = float(reward)
-            features[row] = checked_features(self.features(observation, action, info))
-            self._observation[row] = flat_observation(env.observation_space, observation)
+            found = checked_features(self.features(observation, action, info))
+            if len(found) != self._num_features:  # NumPy would repeat a single number
+                raise ValueError(f"features returned {len(found)} numbers: expected {self._num_features}, as at first")
+            features[row] = found
+            self._observe(row, observation)
         self._finished = terminated | truncated
         return self._package(rewards, features, terminated, truncated)
 
@@ -113,7 +117,13 @@ class GymnasiumEnv(EnvBase):
         observation, _ = env.reset(seed=self._seeds[row])
         self._seeds[row] = None
         self._finished[row] = False
-        self._observation[row] = flat_observation(env.observation_space, observation)
+        self._observe(row, observation)
+
+    def _observe(self, row: int, observation: Any) -> None:
+        flat, width = flat_observation(self.envs[row].observation_space, observation), self._observation.shape[1]
+        if flat.shape != (width,):  # NumPy would repeat a single number
+            raise ValueError(f"an observation has {flat.size} numbers: expected {width}, as its space has")
+        self._observation[row] = flat
 
     def _package(
         self, rewards: np.ndarray, features: np.ndarray, terminated: np.ndarray, truncated: np.ndarray
