@@ -214,3 +214,13 @@ def test_a_training_that_is_stopped_by_a_number_ends_with_one_sentence(monkeypat
     with pytest.raises(SystemExit) as refused:
         recipe_config.run_recipe("rare_targets", lambda config: Stopped())
     assert refused.value.code == "error: gamma=1.5: expected a number in [0, 1]"
+
+
+def test_an_argument_that_the_configuration_leaves_out_can_be_added():
+    for argument in ("style_reward.in_corners=true", "env.cars=3"):
+        with pytest.raises(SystemExit, match=rf"does not exist: .*; \+{argument.partition('=')[0]}=VALUE adds"):
+            compose_config("racing_qr_sac", ["preset=smoke", "family=drift", argument])
+        compose_config("racing_qr_sac", ["preset=smoke", "family=drift", f"+{argument}"])
+    with pytest.raises(SystemExit) as refused:
+        compose_config("racing_qr_sac", ["preset=smoke", "train.batchsize=3"])  # no argument can be added there
+    assert "+train" not in refused.value.code
