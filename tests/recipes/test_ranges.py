@@ -224,3 +224,14 @@ def test_an_argument_that_the_configuration_leaves_out_can_be_added():
     with pytest.raises(SystemExit) as refused:
         compose_config("racing_qr_sac", ["preset=smoke", "train.batchsize=3"])  # no argument can be added there
     assert "+train" not in refused.value.code
+
+
+def test_ctrl_c_outside_of_the_loop_ends_with_one_sentence(monkeypatch, tmp_path, capsys):
+    def interrupted(config):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys, "argv", ["rare_targets.py", "preset=smoke", f"run_dir={tmp_path}"])
+    with pytest.raises(SystemExit) as stopped:
+        recipe_config.run_recipe("rare_targets", interrupted)
+    assert stopped.value.code == 130
+    assert capsys.readouterr().err.endswith("interrupted: complete checkpoints are kept\n")
