@@ -31,7 +31,13 @@ class Target(dict[str, Any]):
                 raise ValueError(f"{self['_target_']} takes no {name!r}.{choices(name, valid)}")
             if name in known and known[name].annotation in (bool, "bool") and not isinstance(value, bool):
                 raise ValueError(f"{name}={value} of {self['_target_']}: expected true or false")
-        return made(*args, **arguments)
+        try:
+            return made(*args, **arguments)
+        except TypeError as error:  # of a function to which the target passes its further arguments on
+            for name in made.keywords:
+                if f"unexpected keyword argument {name!r}" in str(error):
+                    raise ValueError(f"{self['_target_']} takes no {name!r}: {error}") from error
+            raise
 
 
 def choices(given: str, valid: Iterable[str]) -> str:
