@@ -188,6 +188,11 @@ def test_whole_numbers_may_be_written_with_an_exponent():
         ("rare_targets", ["+loss.alhpa=2"], r"SACLoss takes no 'alhpa'"),
         ("racing_qr_sac", ["+env.num_car=3"], r"family_env takes no 'num_car'.*Valid: .*cars, .*track"),
         ("racing_qr_sac", ["env.compiled=maybe"], r"compiled=maybe of .*family_env: expected true or false"),
+        (
+            "rare_targets",
+            ["loss._target_=coachable.losses.Odd"],
+            r"_target_=.*losses.Odd or .* cannot be used: Error load",
+        ),
         ("rare_targets", ["+network.actor.droput=0.1"], r"make_gaussian_actor takes no 'droput': ResidualMLP"),
         ("racing_qr_sac", ["+loss.kapa=2"], r"QRSACLoss takes no 'kapa'. Did you mean kappa"),
         ("humanoid_sac", ["+train.batchsize=2"], r"train.batchsize does not exist: .*Did you mean batch_size"),
