@@ -40,7 +40,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return run(options)
     except KeyboardInterrupt:
-        print(f"coachable {options.command}: interrupted, nothing was written", file=sys.stderr)
+        left = "complete checkpoints are kept" if options.command == "train" else "nothing was written"
+        print(f"coachable {options.command}: interrupted, {left}", file=sys.stderr)
         return 130
     except (ValueError, ImportError, OSError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and not isinstance(error, RenderingError):

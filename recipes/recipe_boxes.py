@@ -20,6 +20,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 
+from coachable.distributions.action_heads import MixedActionSpec
 from coachable.domain import domain_names, load_domain
 from coachable.keys import STYLE_FEATURES
 from coachable.replay import EventTableBuffer
@@ -131,6 +132,10 @@ def make_loss(run: Run, actor: nn.Module, critics: list[nn.Module], env: EnvBase
         raise ValueError(f"network.num_critics is {len(critics)}: expected at least 2 with loss=sac")
     if is_sac and settings.network.actor.get("heads", {}).get("categorical"):
         raise ValueError("loss=sac serves continuous actions only, network.actor has buttons: expected cat_rac")
+    if is_sac and isinstance(env.action_spec, MixedActionSpec):  # it would take the one-hots for axes
+        raise ValueError(
+            f"loss=sac serves continuous actions only, {settings.domain} has buttons: expected cat_rac, network=gamepad"
+        )
     loss = settings.loss.build(actor, critics, action_spec=env.action_spec, num_qvalue_nets=len(critics))
     loss.make_value_estimator(gamma=settings.gamma)
     return loss.to(run.device)

@@ -23,7 +23,10 @@ def mistake_in(error: OmegaConfBaseException) -> str:
     parent = error.parent_node
     if isinstance(error, ConfigAttributeError | ConfigKeyError) and isinstance(parent, DictConfig):
         names = [str(name) for name in parent if name != "hydra" and not str(name).startswith("_")]
-        return f"{key} does not exist: {where or 'the configuration'} has no {part!r}.{choices(part, names)}"
+        message = f"{key} does not exist: {where or 'the configuration'} has no {part!r}.{choices(part, names)}"
+        group = declared(where.split(".")[0])
+        takes_more = isinstance(group, Field) and (group.type is Target or group.name == "style_reward")
+        return f"{message}; +{key}=VALUE adds an argument that is not among them" if takes_more else message
     entry = declared(*key.split("."))
     if isinstance(error, ValidationError) and isinstance(entry, Field):
         return f"{key}={error.value}: expected {_in_words(entry)}".replace("None", "null")

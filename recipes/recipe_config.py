@@ -111,7 +111,11 @@ def run_recipe(config_name: str, build: Callable[[dict[str, Any]], Trainer]) -> 
         except (NonFiniteError, CheckpointError, WorkerError) as error:
             raise SystemExit(f"error: {error}") from None
 
-    main()
+    try:
+        main()
+    except KeyboardInterrupt:  # while a stage starts, or for the second time; the loop itself saves a checkpoint
+        print("interrupted: complete checkpoints are kept", file=sys.stderr)
+        raise SystemExit(130) from None
 
 
 def compose_config(config_name: str, arguments: list[str]) -> dict[str, Any]:

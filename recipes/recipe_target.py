@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable
 from inspect import Parameter, isclass, signature
 from typing import Any
 
+from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 
 
@@ -21,9 +22,14 @@ class Target(dict[str, Any]):
         """Call the function or class with the arguments of the configuration, and with further ones.
 
         Raises:
-            ValueError: If it takes no such argument, or an argument is `true` or `false` and the value is not.
+            ValueError: If it cannot be imported or takes no such argument, or an argument is `true` or `false` and the
+                value is not.
         """
-        made = instantiate(self, _convert_="all", _partial_=True)
+        try:
+            made = instantiate(self, _convert_="all", _partial_=True)
+        except InstantiationException as error:
+            why = " ".join(str(error.__cause__ or error).splitlines())
+            raise ValueError(f"_target_={self['_target_']} or one inside it cannot be used: {why}") from error
         known = _arguments_of(made.func)
         for name, value in made.keywords.items():
             if name not in known and not any(argument.kind is Parameter.VAR_KEYWORD for argument in known.values()):
@@ -31,7 +37,13 @@ class Target(dict[str, Any]):
                 raise ValueError(f"{self['_target_']} takes no {name!r}.{choices(name, valid)}")
             if name in known and known[name].annotation in (bool, "bool") and not isinstance(value, bool):
                 raise ValueError(f"{name}={value} of {self['_target_']}: expected true or false")
-        return made(*args, **arguments)
+        try:
+            return made(*args, **arguments)
+        except TypeError as error:  # of a function to which the target passes its further arguments on
+            for name in made.keywords:
+                if f"unexpected keyword argument {name!r}" in str(error):
+                    raise ValueError(f"{self['_target_']} takes no {name!r}: {error}") from error
+            raise
 
 
 def choices(given: str, valid: Iterable[str]) -> str:

@@ -164,6 +164,15 @@ def test_an_interrupted_report_leaves_nothing_behind(capsys, monkeypatch, tmp_pa
     assert list(tmp_path.iterdir()) == []
 
 
+def test_interrupted_trainings_of_several_seeds_keep_their_checkpoints(capsys, monkeypatch, tmp_path):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("coachable.evaluation.many_seeds.train_seeds", interrupted)
+    assert main(["train", "rare_targets", "seeds=0,1", f"run_dir={tmp_path}"]) == 130
+    assert capsys.readouterr().err == "coachable train: interrupted, complete checkpoints are kept\n"
+
+
 def test_a_machine_that_cannot_draw_is_told_what_to_install(capsys, monkeypatch, tmp_path):
     monkeypatch.setenv("MUJOCO_GL", "disable")
     assert main(["render", "humanoid", "--seconds", "0.1", "--out", str(tmp_path / "film.gif")]) == 2

@@ -310,6 +310,31 @@ def test_other_action_spaces_are_refused(space):
         GymnasiumEnv(Odd, moved)
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_features_of_a_changing_number_are_refused(count):
+    env = GymnasiumEnv(Walk, lambda o, a, i: [1.0] * (2 if o[1] == 1 / STEPS else count), num_envs=2)
+    with pytest.raises(ValueError, match=f"features returned {count} numbers: expected 2, as at first"):
+        env.rollout(2)
+
+
+def test_an_observation_of_another_size_than_its_space_is_refused():
+    class Short(Walk):
+        def _observation(self):
+            return super()._observation()[:1]
+
+    with pytest.raises(ValueError, match="an observation has 1 numbers: expected 2, as its space has"):
+        GymnasiumEnv(Short, moved).reset()
+
+
+def test_copies_that_are_not_separate_environments_are_refused():
+    walk = Walk()
+    with pytest.raises(ValueError, match="make returned the same Walk twice: expected a new environment at each call"):
+        GymnasiumEnv(lambda: gymnasium.wrappers.TimeLimit(walk, 3), moved, num_envs=2)
+    assert GymnasiumEnv(lambda: walk, moved, num_envs=1).envs == [walk]
+    with pytest.raises(ValueError, match="make returned a SyncVectorEnv, which holds several environments"):
+        GymnasiumEnv(lambda: gymnasium.vector.SyncVectorEnv([Walk, Walk]), moved)
+
+
 def test_a_diverged_policy_is_named():
     env = GymnasiumEnv(Walk, moved, num_envs=1)
     with pytest.raises(ValueError, match="NaN"):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium
@@ -32,7 +32,7 @@ class GymnasiumEnv(EnvBase):
     processes.
 
     Args:
-        make: Name of a registered environment, or a function that makes one.
+        make: Name of a registered environment, or a function that makes a new one at each call.
         features: Function that computes `style_features`, see `Features`.
         num_envs: Number of copies N.
         seed: Seed of the first resets.
@@ -41,7 +41,9 @@ class GymnasiumEnv(EnvBase):
     `done`, `terminated`, `truncated` (N, 1).
 
     Raises:
-        ValueError: If the action space has a component of another kind, or a `Box` without finite bounds.
+        ValueError: If the action space has a component of another kind, or a `Box` without finite bounds, or `make`
+            returns the same environment twice or a vectorised one. At a step or reset, if the number of features
+            changes, or an observation does not have the size of its space.
 
     Example:
         >>> env = GymnasiumEnv("Pendulum-v1", lambda obs, action, info: obs[2:], num_envs=2, seed=0)
@@ -57,6 +59,7 @@ class GymnasiumEnv(EnvBase):
         super().__init__(device="cpu", batch_size=torch.Size((num_envs,)))
         self.features = features
         self.envs = [gymnasium.make(make) if isinstance(make, str) else make() for _ in range(num_envs)]
+        _require_separate(self.envs)
         first = self.envs[0]
         sizes, axes = action_components(first.action_space)
         self.heads = ActionHeads(tuple(sizes), axes)
@@ -101,8 +104,11 @@ class GymnasiumEnv(EnvBase):
             action = native_action(env.action_space, iter(choices[row]), iter(axes[row]))
             observation, reward, terminated[row], truncated[row], info = env.step(action)
             rewards[row] = float(reward)
-            features[row] = checked_features(self.features(observation, action, info))
-            self._observation[row] = flat_observation(env.observation_space, observation)
+            found = checked_features(self.features(observation, action, info))
+            if len(found) != self._num_features:  # NumPy would repeat a single number
+                raise ValueError(f"features returned {len(found)} numbers: expected {self._num_features}, as at first")
+            features[row] = found
+            self._observe(row, observation)
         self._finished = terminated | truncated
         return self._package(rewards, features, terminated, truncated)
 
@@ -111,7 +117,13 @@ class GymnasiumEnv(EnvBase):
         observation, _ = env.reset(seed=self._seeds[row])
         self._seeds[row] = None
         self._finished[row] = False
-        self._observation[row] = flat_observation(env.observation_space, observation)
+        self._observe(row, observation)
+
+    def _observe(self, row: int, observation: Any) -> None:
+        flat, width = flat_observation(self.envs[row].observation_space, observation), self._observation.shape[1]
+        if flat.shape != (width,):  # NumPy would repeat a single number
+            raise ValueError(f"an observation has {flat.size} numbers: expected {width}, as its space has")
+        self._observation[row] = flat
 
     def _package(
         self, rewards: np.ndarray, features: np.ndarray, terminated: np.ndarray, truncated: np.ndarray
@@ -160,3 +172,18 @@ class GymnasiumEnv(EnvBase):
             for env in self.envs:
                 env.close()
         super().close(raise_if_closed=raise_if_closed)
+
+
+def _require_separate(envs: Sequence[gymnasium.Env]) -> None:
+    """Raise a `ValueError` unless each environment is a single one with a state of its own."""
+    for env in envs:
+        if isinstance(env, gymnasium.vector.VectorEnv):
+            raise ValueError(
+                f"make returned a {type(env).__name__}, which holds several environments: expected a single one, of "
+                "which num_envs copies are made"
+            )
+    if len({id(env.unwrapped) for env in envs}) < len(envs):
+        raise ValueError(
+            f"make returned the same {type(envs[0].unwrapped).__name__} twice: expected a new environment at each "
+            "call, because every copy has a state of its own"
+        )

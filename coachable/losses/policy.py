@@ -94,7 +94,11 @@ def _check_spec(spec: TensorSpec | None, loss_name: str, heads: ActionHeads | No
     categorical = heads.categorical if heads is not None else ()
     if isinstance(spec, MixedActionSpec):
         if spec.heads != heads:
-            raise ValueError(f"{loss_name}: the environment's action is {spec.heads}, the actor's is {heads}")
+            raise ValueError(
+                f"{loss_name}: the environment's action is {spec.heads}, the actor's is "
+                f"{heads or 'tanh-Gaussian axes alone'}: expected make_mixed_actor with the environment's heads (in a "
+                "recipe network=gamepad with network.actor.heads)"
+            )
     elif not spec.dtype.is_floating_point or categorical:
         raise ValueError(
             f"{loss_name} cannot serve the action spec {type(spec).__name__}(shape={tuple(spec.shape)}, "

@@ -10,6 +10,11 @@ from torchrl.envs import Transform
 from coachable.keys import STYLE, STYLE_FEATURES, STYLE_REWARD, TASK_REWARD
 from coachable.styles.reward import StyleReward
 
+_EXPECTED = (
+    f"StyleRewardTransform expects {TASK_REWARD} and {STYLE_FEATURES}; add them (coachable.transforms.StyleFeatures), "
+    "or rename yours (torchrl.envs.RenameTransform)."
+)
+
 
 class StyleRewardTransform(Transform):
     """Environment transform that writes `reward = task_reward + style_reward(style_features, theta)`.
@@ -19,6 +24,10 @@ class StyleRewardTransform(Transform):
 
     Args:
         style_reward: Style reward of the domain.
+
+    Raises:
+        KeyError: If the environment declares no `task_reward`, or a step emits no `task_reward`, `style_features` or
+            style.
     """
 
     def __init__(self, style_reward: StyleReward) -> None:
@@ -36,24 +45,29 @@ class StyleRewardTransform(Transform):
         return next_tensordict.set("reward", task_reward + value)
 
     def _what_is_missing(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> str:
-        def listed(keys: Iterable[NestedKey]) -> str:
-            return ", ".join(sorted(map(str, keys)))
-
         if STYLE not in tensordict.keys(True):
             return (
-                f"step got no {STYLE}, only {listed(tensordict.keys())}: "
+                f"step got no {STYLE}, only {_listed(tensordict.keys())}: "
                 "put a StyleSampler before StyleRewardTransform, and keep its key in the tensordict."
             )
-        return (
-            f"after a step the environment emitted {listed(next_tensordict.keys())}: StyleRewardTransform expects "
-            f"{TASK_REWARD} and {STYLE_FEATURES}; rename yours (torchrl.envs.RenameTransform)."
-        )
+        return f"after a step the environment emitted {_listed(next_tensordict.keys())}: {_EXPECTED}"
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         task_reward = tensordict_reset.get(TASK_REWARD, None)
         if task_reward is not None:  # then both are observations, and the style reward is 0 at reset
             tensordict_reset.set(STYLE_REWARD, torch.zeros_like(task_reward))
         return tensordict_reset
+
+    def transform_output_spec(self, output_spec: Composite) -> Composite:
+        """Add the style reward beside the task reward.
+
+        Raises:
+            KeyError: If the environment declares no task reward.
+        """
+        declared = [*output_spec["full_observation_spec"].keys(), *output_spec["full_reward_spec"].keys()]
+        if TASK_REWARD not in declared:
+            raise KeyError(f"the specs of the environment declare {_listed(declared)}: {_EXPECTED}")
+        return super().transform_output_spec(output_spec)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the style reward if the task reward is declared as an observation."""
@@ -70,3 +84,7 @@ class StyleRewardTransform(Transform):
             task = spec[TASK_REWARD]
             spec[STYLE_REWARD] = Unbounded(shape=task.shape, dtype=torch.float32, device=task.device)
         return spec
+
+
+def _listed(keys: Iterable[NestedKey]) -> str:
+    return ", ".join(sorted(map(str, keys)))

@@ -280,6 +280,7 @@ def test_runs_with_tables_resume_bit_for_bit(loss, replay, tmp_path):
         ("combat_cat_rac", ["env.machines=[Thunderclaw]"], r"Thunderclaw"),
         ("combat_cat_rac", ["loss=sac"], r"continuous actions only"),
         ("combat_cat_rac", ["loss=qr_sac"], r"continuous actions only"),
+        ("combat_cat_rac", ["loss=sac", "network=residual"], r"continuous actions only, combat has buttons: .*gamepad"),
         ("rare_targets", ["network=gamepad"], r"continuous actions only, network.actor has buttons"),
         ("cheetah_speed", ["mirror=0.5"], r"cheetah has no mirror images, expected mirror=0"),
         ("racing_qr_sac", ["mirror=0.5", "env.curvature=false"], r"mirror images need env.curvature=true"),

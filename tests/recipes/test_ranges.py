@@ -186,6 +186,14 @@ def test_whole_numbers_may_be_written_with_an_exponent():
         ),
         ("rare_targets", ["replay.prioritized=2"], r"prioritized=2 of .*for_events: expected true or false"),
         ("rare_targets", ["+loss.alhpa=2"], r"SACLoss takes no 'alhpa'"),
+        ("racing_qr_sac", ["+env.num_car=3"], r"family_env takes no 'num_car'.*Valid: .*cars, .*track"),
+        ("racing_qr_sac", ["env.compiled=maybe"], r"compiled=maybe of .*family_env: expected true or false"),
+        (
+            "rare_targets",
+            ["loss._target_=coachable.losses.Odd"],
+            r"_target_=.*losses.Odd or .* cannot be used: Error load",
+        ),
+        ("rare_targets", ["+network.actor.droput=0.1"], r"make_gaussian_actor takes no 'droput': ResidualMLP"),
         ("racing_qr_sac", ["+loss.kapa=2"], r"QRSACLoss takes no 'kapa'. Did you mean kappa"),
         ("humanoid_sac", ["+train.batchsize=2"], r"train.batchsize does not exist: .*Did you mean batch_size"),
     ],
@@ -214,3 +222,24 @@ def test_a_training_that_is_stopped_by_a_number_ends_with_one_sentence(monkeypat
     with pytest.raises(SystemExit) as refused:
         recipe_config.run_recipe("rare_targets", lambda config: Stopped())
     assert refused.value.code == "error: gamma=1.5: expected a number in [0, 1]"
+
+
+def test_an_argument_that_the_configuration_leaves_out_can_be_added():
+    for argument in ("style_reward.in_corners=true", "env.cars=3"):
+        with pytest.raises(SystemExit, match=rf"does not exist: .*; \+{argument.partition('=')[0]}=VALUE adds"):
+            compose_config("racing_qr_sac", ["preset=smoke", "family=drift", argument])
+        compose_config("racing_qr_sac", ["preset=smoke", "family=drift", f"+{argument}"])
+    with pytest.raises(SystemExit) as refused:
+        compose_config("racing_qr_sac", ["preset=smoke", "train.batchsize=3"])  # no argument can be added there
+    assert "+train" not in refused.value.code
+
+
+def test_ctrl_c_outside_of_the_loop_ends_with_one_sentence(monkeypatch, tmp_path, capsys):
+    def interrupted(config):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys, "argv", ["rare_targets.py", "preset=smoke", f"run_dir={tmp_path}"])
+    with pytest.raises(SystemExit) as stopped:
+        recipe_config.run_recipe("rare_targets", interrupted)
+    assert stopped.value.code == 130
+    assert capsys.readouterr().err.endswith("interrupted: complete checkpoints are kept\n")

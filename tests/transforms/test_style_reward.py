@@ -4,7 +4,16 @@ import pytest
 import torch
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer, Unbounded
-from torchrl.envs import Compose, RenameTransform, RewardSum, SerialEnv, TransformedEnv, check_env_specs, step_mdp
+from torchrl.envs import (
+    Compose,
+    ExcludeTransform,
+    RenameTransform,
+    RewardSum,
+    SerialEnv,
+    TransformedEnv,
+    check_env_specs,
+    step_mdp,
+)
 
 from coachable.transforms import StyleRewardTransform, StyleSampler, coachable_env
 
@@ -116,3 +125,9 @@ def test_what_is_missing_is_named(space, make_style_reward, make_base_env):
     wrong = TransformedEnv(base, Compose(rename, StyleSampler(space), StyleRewardTransform(reward)))
     with pytest.raises(KeyError, match=r"emitted .*features.* expects task_reward and style_features"):
         wrong.step(wrong.rand_action(wrong.reset()))
+
+
+def test_an_environment_without_task_reward_is_told_how_to_add_it(space, make_style_reward, make_base_env):
+    base = TransformedEnv(make_base_env(), ExcludeTransform("task_reward", "style_features"))
+    with pytest.raises(KeyError, match=r"declare observation, reward, style: .* expects task_reward and .*; add"):
+        coachable_env(base, space, make_style_reward(space)).rollout(2)

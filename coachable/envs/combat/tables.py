@@ -247,5 +247,5 @@ def check_styles(styles: Sequence[str] | None) -> tuple[str, ...]:
     chosen = STYLES if styles is None else tuple(styles)
     unknown = [name for name in chosen if name not in STYLES]
     if unknown or not chosen or len(set(chosen)) < len(chosen):
-        raise ValueError(f"styles are {list(chosen)}: expected distinct ones of {list(STYLES)}")
+        raise ValueError(f"styles are {styles!r}: expected a list of distinct ones of {list(STYLES)}")
     return chosen

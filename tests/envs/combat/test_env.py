@@ -171,6 +171,7 @@ def test_scenarios_can_be_assigned():
         ({"machines": []}, "expected a list of at least one"),
         ({"sites": ["Moon"]}, "sites are .*Moon"),
         ({"styles": ["lazy"]}, "styles are .*lazy"),
+        ({"styles": "melee"}, "styles are 'melee': expected a list of distinct ones"),
         ({"observation": "pixels"}, "observation is 'pixels'"),
         ({"reward_scale": "huge"}, "reward_scale is 'huge'"),
         ({"assist": "max"}, "assist is 'max'"),
