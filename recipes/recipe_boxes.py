@@ -23,6 +23,7 @@ from torchrl.objectives import LossModule
 from coachable.distributions.action_heads import MixedActionSpec
 from coachable.domain import domain_names, load_domain
 from coachable.keys import STYLE_FEATURES
+from coachable.losses.actor_critic import ActorCriticLoss
 from coachable.replay import EventTableBuffer
 from coachable.replay.replay_files import replay_bytes
 from coachable.styles import Sampler, StyleReward, StyleSpace
@@ -124,7 +125,7 @@ def make_loss(run: Run, actor: nn.Module, critics: list[nn.Module], env: EnvBase
         env: Its action specification bounds the policy.
 
     Raises:
-        ValueError: If the loss does not serve the actions, or needs more critics.
+        ValueError: If the loss does not serve the actions, or needs more critics or other outputs of them.
     """
     settings = run.settings
     is_sac = settings.loss._target_.endswith(".SACLoss")
@@ -137,6 +138,14 @@ def make_loss(run: Run, actor: nn.Module, critics: list[nn.Module], env: EnvBase
             f"loss=sac serves continuous actions only, {settings.domain} has buttons: expected cat_rac, network=gamepad"
         )
     loss = settings.loss.build(actor, critics, action_spec=env.action_spec, num_qvalue_nets=len(critics))
+    if is_sac or isinstance(loss, ActorCriticLoss):
+        with torch.no_grad(), torch.random.fork_rng(devices=[]):  # critics may have dropout
+            outputs = critics[0](env.fake_tensordict())["state_action_value"].shape[-1]
+        expected = 1 if is_sac else loss.critic_outputs()
+        if outputs != expected:
+            raise ValueError(
+                f"network.critic makes critics with {outputs} outputs: {type(loss).__name__} expects {expected}"
+            )
     loss.make_value_estimator(gamma=settings.gamma)
     return loss.to(run.device)
 

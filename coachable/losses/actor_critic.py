@@ -242,7 +242,7 @@ class ActorCriticLoss(SACLoss):
             inputs.set(self.tensor_keys.action, action)
         critics = cast(Callable[..., TensorDictBase], self._vmap_qnetworkN0)
         output = critics(inputs, params).get(self.tensor_keys.state_action_value)
-        expected = self._critic_width()
+        expected = self.critic_outputs()
         if output.shape[1:-1] != tensordict.batch_size or output.shape[-1] != expected:
             raise RuntimeError(
                 f"{type(self).__name__} expects critics with {expected} output(s) per sample, "
@@ -255,7 +255,7 @@ class ActorCriticLoss(SACLoss):
     def _gamma(self) -> Tensor:
         return cast(Tensor, self.value_estimator.gamma)
 
-    def _critic_width(self) -> int:
+    def critic_outputs(self) -> int:
         """Return the number of outputs of one critic."""
         return 1
 

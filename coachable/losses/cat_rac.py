@@ -49,7 +49,7 @@ class CatRACLoss(RACLoss):
         self.bins = HLGauss(v_min, v_max, num_atoms, sigma_ratio)
         super().__init__(actor_network, qvalue_network, **options)
 
-    def _critic_width(self) -> int:
+    def critic_outputs(self) -> int:
         return self.bins.num_atoms
 
     def _values(self, output: Tensor) -> Tensor:

@@ -50,7 +50,7 @@ class QRSACLoss(ActorCriticLoss):
         self.kappa = float(kappa)
         super().__init__(actor_network, qvalue_network, **options)
 
-    def _critic_width(self) -> int:
+    def critic_outputs(self) -> int:
         return self.num_quantiles
 
     def _values(self, output: Tensor) -> Tensor:

@@ -18,6 +18,9 @@ class StyleFeatures(Transform):
         features: Maps the tensordict after a step, of batch shape `(...)`, to features `(..., size)`.
         size: Number of features.
 
+    Raises:
+        ValueError: At a step, if the features have another shape.
+
     Example:
         >>> from torchrl.envs import PendulumEnv, TransformedEnv
         >>> env = TransformedEnv(PendulumEnv(), StyleFeatures(lambda after: after["th"].unsqueeze(-1), 1))
@@ -31,7 +34,11 @@ class StyleFeatures(Transform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         next_tensordict[TASK_REWARD] = next_tensordict["reward"].float()
-        next_tensordict[STYLE_FEATURES] = self.features(next_tensordict).float()
+        features = self.features(next_tensordict).float()
+        expected = (*next_tensordict.batch_size, self.size)
+        if features.shape != expected:
+            raise ValueError(f"the style features have the shape {tuple(features.shape)}: expected {expected}")
+        next_tensordict[STYLE_FEATURES] = features
         return next_tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:

@@ -277,6 +277,8 @@ def test_runs_with_tables_resume_bit_for_bit(loss, replay, tmp_path):
             r"initial_value must lie in \[100.0, 650.0\], got 0.0",
         ),
         ("humanoid_sac", ["init_from=nowhere"], r"nowhere"),
+        ("humanoid_sac", ["loss=qr_sac", "network.critic.num_outputs=5"], r"5 outputs: QRSACLoss expects 32"),
+        ("cheetah_speed", ["+network.critic.num_outputs=2"], r"2 outputs: SACLoss expects 1"),
         ("combat_cat_rac", ["env.machines=[Thunderclaw]"], r"Thunderclaw"),
         ("combat_cat_rac", ["loss=sac"], r"continuous actions only"),
         ("combat_cat_rac", ["loss=qr_sac"], r"continuous actions only"),
