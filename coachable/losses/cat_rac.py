@@ -50,6 +50,7 @@ class CatRACLoss(RACLoss):
         super().__init__(actor_network, qvalue_network, **options)
 
     def critic_outputs(self) -> int:
+        """Return the number of logits of one critic."""
         return self.bins.num_atoms
 
     def _values(self, output: Tensor) -> Tensor:

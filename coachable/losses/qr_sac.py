@@ -51,6 +51,7 @@ class QRSACLoss(ActorCriticLoss):
         super().__init__(actor_network, qvalue_network, **options)
 
     def critic_outputs(self) -> int:
+        """Return the number of quantiles of one critic."""
         return self.num_quantiles
 
     def _values(self, output: Tensor) -> Tensor:
