@@ -4,10 +4,10 @@
     python benchmarks/learner_parts.py --only none held_noise --seeds 0 --core 1     several may run side by side
     python benchmarks/learner_parts.py --seeds                           trains nothing, prints what has ended
 
-Every training has 0.7 M env-steps of the first stage and `--frames` of the second one, and as many updates. The
-deterministic policy is then measured over five episodes of 1000 steps in each of the 24 styles. A training that was
-interrupted starts again. Most parts are those of FlashSAC (arXiv 2604.04539); its networks with batch norm are not
-among them.
+Every training has 0.7 M env-steps of the first stage and `--frames` of the second one, and as many updates, but for
+`double_utd`. The deterministic policy is then measured over five episodes of 1000 steps in each of the 24 styles. A
+training that was interrupted starts again. Most parts are those of FlashSAC (arXiv 2604.04539); its networks with batch
+norm are not among them.
 """
 
 import argparse
