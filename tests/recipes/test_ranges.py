@@ -187,8 +187,8 @@ def test_whole_numbers_may_be_written_with_an_exponent():
         ),
         ("rare_targets", ["replay.prioritized=2"], r"prioritized=2 of .*for_events: expected true or false"),
         ("rare_targets", ["+loss.alhpa=2"], r"SACLoss takes no 'alhpa'"),
-        ("racing_qr_sac", ["+env.num_car=3"], r"family_env takes no 'num_car'.*Valid: .*cars, .*track"),
-        ("racing_qr_sac", ["env.compiled=maybe"], r"compiled=maybe of .*family_env: expected true or false"),
+        ("racing_qr_sac", ["+env.num_car=3"], r"family_env takes no 'num_car'"),
+        ("racing_qr_sac", ["env.compiled=maybe"], r"compiled is 'maybe': expected True or False"),
         (
             "rare_targets",
             ["loss._target_=coachable.losses.Odd"],

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from inspect import Parameter, Signature, signature
 from typing import Any, NamedTuple
 
 from coachable.domains.racing import styles
@@ -133,18 +132,6 @@ def family_env(num_envs: int = 64, *, family: str, **options: Any) -> RacingEnv:
         ValueError: If there is no such family.
     """
     return racing_family(family).make_env(num_envs, **options)
-
-
-def _with_options_of_the_env(function: Callable[..., Any]) -> Signature:
-    own = [one for one in signature(function).parameters.values() if one.kind is not Parameter.VAR_KEYWORD]
-    names = {one.name for one in own}
-    options = signature(RacingEnv.__init__).parameters.values()
-    further = [one for one in options if one.kind is Parameter.KEYWORD_ONLY and one.name not in names]
-    return Signature([*own, *further])
-
-
-# For recipes, which compare the names and switches of a configuration with those of the function.
-family_env.__signature__ = _with_options_of_the_env(family_env)  # pyright: ignore[reportFunctionMemberAccess]
 
 
 def home_track(family: str, settings: Mapping[str, Any]) -> str:

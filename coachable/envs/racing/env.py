@@ -88,7 +88,8 @@ class RacingEnv(EnvBase):
     `scenario` (N, 1) int64, `done`, `terminated`, `truncated` (N, 1).
 
     Raises:
-        ValueError: If the car or the track is unknown, or if the numbers of cars and races do not fit together.
+        ValueError: If the car or the track is unknown, or if the numbers of cars and races do not fit together, or if
+            a switch is not a bool.
 
     Example:
         >>> env = RacingEnv(num_envs=2, track="ring", seed=0)
@@ -138,6 +139,10 @@ class RacingEnv(EnvBase):
         opponents = cars > 1 if opponents is None else opponents
         if cars > 1 and not opponents:
             raise ValueError(f"opponents is False for {cars} cars: expected True, or None, in a race of several cars")
+        switches = {"adaptive": adaptive, "curvature": curvature, "opponents": opponents, "put_back": put_back}
+        for name, value in (switches | {"compiled": compiled}).items():
+            if not isinstance(value, bool):
+                raise ValueError(f"{name} is {value!r}: expected True or False")
         super().__init__(device=device, batch_size=torch.Size((num_envs,)))
         self.num_envs, self.cars, self.controlled = num_envs, cars, controlled
         self.races, self.driver, self.episode_steps = num_envs // controlled, driver, episode_steps
