@@ -98,14 +98,19 @@ def run_recipe(config_name: str, build: Callable[[dict[str, Any]], Trainer]) -> 
 
     @hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name=config_name)
     def main(cfg: DictConfig) -> None:
+        overrides = list(HydraConfig.get().overrides.task)
         try:
-            config = plain_config(cfg, list(HydraConfig.get().overrides.task), config_name)
+            config = plain_config(cfg, overrides, config_name)
             train = start_training(build, config)
         except (CheckpointError, ValueError, ImportError) as error:
             if "HYDRA_FULL_ERROR" in os.environ:
                 raise
             # You can fix these errors without a traceback, including the one that TorchRL appends from a worker.
-            raise SystemExit(f"error: {error}".split("\n\nWorker traceback:\n")[0]) from None
+            message = f"error: {error}".split("\n\nWorker traceback:\n")[0]
+            changed = [key for key in _said(overrides) if key != "resume"]
+            if cfg.resume and changed:  # checkpoint and command line make one configuration
+                message += f"\nGiven beside resume=, which may be the reason: {', '.join(changed)}"
+            raise SystemExit(message) from None
         try:
             train.run()
         except (NonFiniteError, CheckpointError, WorkerError) as error:

@@ -1,11 +1,12 @@
 """Every recipe's training, resumed from its middle, ends like the one that was not interrupted, bit for bit."""
 
 import gc
+import sys
 from importlib import import_module
 
 import pytest
 import torch
-from recipe_config import compose_config
+from recipe_config import compose_config, run_recipe
 
 from coachable.training.checkpoint import CheckpointError, CheckpointStore, find_checkpoint, read_state
 from tests.random_kills import RECIPES, differences
@@ -62,3 +63,13 @@ def test_a_refused_resumption_leaves_the_configuration_of_the_run(tmp_path):
     with pytest.raises(CheckpointError, match="was trained on another style space"):
         build(compose_config("rare_targets", [f"resume={tmp_path}", "sampler=one_hot", "train.total_frames=8"]))
     assert (tmp_path / "config.json").read_bytes() == before
+
+
+def test_settings_given_beside_resume_are_named_if_the_training_cannot_be_made(tmp_path, monkeypatch):
+    build = import_module("rare_targets").build
+    build(compose_config("rare_targets", [*TINY, "train.total_frames=4", f"run_dir={tmp_path}"])).run()
+    monkeypatch.setattr(
+        sys, "argv", ["rare_targets.py", f"resume={tmp_path}", "train.total_frames=8", "+env.nonsense=1"]
+    )
+    with pytest.raises(SystemExit, match=r"nonsense(.|\n)*beside resume=.*: train.total_frames, env.nonsense$"):
+        run_recipe("rare_targets", build)
