@@ -194,7 +194,7 @@ def test_whole_numbers_may_be_written_with_an_exponent():
             ["loss._target_=coachable.losses.Odd"],
             r"_target_=.*losses.Odd or .* cannot be used: Error load",
         ),
-        ("rare_targets", ["+network.actor.droput=0.1"], r"make_gaussian_actor takes no 'droput': ResidualMLP"),
+        ("rare_targets", ["+network.actor.drop_out=0.1"], r"make_gaussian_actor takes no 'drop_out': ResidualMLP"),
         ("racing_qr_sac", ["+loss.kapa=2"], r"QRSACLoss takes no 'kapa'. Did you mean kappa"),
         ("humanoid_sac", ["+train.batchsize=2"], r"train.batchsize does not exist: .*Did you mean batch_size"),
     ],
