@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Unpack
 
@@ -9,7 +10,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from coachable.domain import Domain
+from coachable.domain import Domain, StyleMeasures
 from coachable.evaluation.episode_records import RolloutOptions, record_styles
 from coachable.styles import StyleSpace
 
@@ -42,8 +43,7 @@ def evaluate_switching(
 ) -> SwitchReport:
     """Evaluate a policy with a new style from the training distribution every `period` steps.
 
-    No switch counts if the measures have a method `judged`, as in `MeasuredWindow`, that is false in every step. Then
-    compliance cannot be judged, such as savings of fuel without a comparison.
+    No switch counts if compliance cannot be judged in any step, such as savings of fuel without a comparison.
 
     Args:
         domain: Domain in which the policy acts.
@@ -66,8 +66,7 @@ def evaluate_switching(
     summary = {"survived": record.survived.float(), **domain.measures.summarise(record.measures, record.alive)}
     metrics = {name: value.nanmean().item() for name, value in summary.items()}
     complies = domain.measures.complies(record.measures) & record.alive
-    judge = getattr(domain.measures, "judged", None)
-    is_known = judge is None or bool((judge(record.measures) & record.alive).any())
+    is_known = bool((judged_steps(domain.measures, record.measures) & record.alive).any())
     waits, switches = [], 0
     for start in range(period, len(complies) if is_known else 0, period):
         running = record.alive[start]
@@ -76,3 +75,15 @@ def evaluate_switching(
         waits.append((first[running & done] + 1) * domain.control_step)
     times = torch.cat(waits) if waits else torch.empty(0)
     return SwitchReport(metrics, times, len(times) / switches if switches else float("nan"), switches)
+
+
+def judged_steps(measures: StyleMeasures, record: Mapping[str, Tensor]) -> Tensor:
+    """Return the steps (T, N) bool in which compliance can be judged.
+
+    Args:
+        measures: The domain's measured style. If it has a method `judged`, which maps a record to such steps, that
+            decides; otherwise every step can be judged.
+        record: Outputs of `StyleMeasures.step` (T, N), by name.
+    """
+    judge = getattr(measures, "judged", None)
+    return torch.ones_like(next(iter(record.values())), dtype=torch.bool) if judge is None else judge(record)

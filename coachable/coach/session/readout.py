@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from coachable.domain import StyleMeasures
+from coachable.evaluation.switching import judged_steps
 from coachable.keys import TASK_REWARD
 
 
@@ -56,9 +57,8 @@ class MeasuredWindow:
     """Measured style over the last steps since the latest request.
 
     Args:
-        measures: The domain's measured style. In addition to `StyleMeasures` it may have a method `judged`, which
-            returns the steps (T, N) bool in which compliance can be judged, and an attribute `needs`, which says what
-            has to happen before, such as "a footstep". Without `judged`, every step can be judged.
+        measures: The domain's measured style. In addition to `StyleMeasures` it may have a method `judged`, see
+            `judged_steps`, and an attribute `needs`, which says what has to happen before, such as "a footstep".
         length: Largest number of steps to keep.
     """
 
@@ -101,15 +101,11 @@ class MeasuredWindow:
         if not self._rows:
             return None
         record = _stacked(self._rows)
-        judged = self._judged(record)
+        judged = judged_steps(self.measures, record)
         return (self._done(record).sum() / judged.sum()).item() if judged.any() else None
 
-    def _judged(self, record: Mapping[str, Tensor]) -> Tensor:
-        judge = getattr(self.measures, "judged", None)
-        return torch.ones_like(record[TASK_REWARD], dtype=torch.bool) if judge is None else judge(record)
-
     def _done(self, record: Mapping[str, Tensor]) -> Tensor:
-        return self.measures.complies(record) & self._judged(record)
+        return self.measures.complies(record) & judged_steps(self.measures, record)
 
 
 def _stacked(rows: Collection[Mapping[str, Tensor]]) -> dict[str, Tensor]:
