@@ -3,6 +3,7 @@
 import gc
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -52,10 +53,11 @@ class Curriculum:
             self.number = 0
         for later in range(self.number + 1, len(self.stages)):
             check_unused(self.folder(later))
-        # The rounding of sums depends on the number of threads, so all stages and resumptions use the same.
-        learner = share_threads(**self.stages[0]["threads"]).learner
+        # The rounding of sums depends on the learner's threads, so all stages and resumptions use the same. When a
+        # later stage starts, this process itself would count as a busy core.
+        free = asdict(share_threads(**self.stages[0]["threads"]))
         for stage in self.stages:
-            stage["threads"] = {**stage["threads"], "learner": stage["threads"]["learner"] or learner}
+            stage["threads"] = {part: given or free[part] for part, given in stage["threads"].items()}
         self.train = self._start(resume)
 
     def run(self) -> dict[str, float]:

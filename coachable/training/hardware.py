@@ -3,6 +3,7 @@
 import os
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 
@@ -11,6 +12,8 @@ from coachable.training.precision import supports_bf16
 __all__ = ["Hardware", "Threads", "choose_preset", "detect", "estimate_update_seconds", "pick_device", "share_threads"]
 
 _MAX_LEARNER_THREADS = 8  # 512-wide layers do not fill more cores; the barriers cost more than they bring
+_SAMPLE_SECONDS = 0.1  # over which the cores are watched
+_PROC_STAT = Path("/proc/stat")
 
 
 @dataclass(frozen=True)
@@ -19,7 +22,8 @@ class Hardware:
 
     Attributes:
         cores: Number of cores that this process may use.
-        busy: System load of the last minute [cores].
+        busy: How many of these cores other processes keep busy at the moment; the system load of the last minute where
+            the system does not tell [cores].
         memory_gb: Physical memory [GB], or 0 if it cannot be read.
         gpu: Name of the first CUDA device, or None.
         bf16: Whether the GPU, or without one the CPU, multiplies bfloat16 matrices in hardware.
@@ -55,9 +59,10 @@ def detect() -> Hardware:
     """
     gpu = torch.cuda.get_device_name(0) if torch.cuda.is_available() else None
     affinity = getattr(os, "sched_getaffinity", None)  # missing on macOS and Windows
+    usable = affinity(0) if affinity else set(range(os.cpu_count() or 1))
     return Hardware(
-        cores=len(affinity(0)) if affinity else os.cpu_count() or 1,
-        busy=os.getloadavg()[0],
+        cores=len(usable),
+        busy=_busy_cores(usable),
         memory_gb=_memory_gb(),
         gpu=gpu,
         bf16=supports_bf16("cuda" if gpu else "cpu"),
@@ -117,6 +122,8 @@ def share_threads(
     for name, value in (("simulator", simulator), ("learner", learner)):
         if value is not None and value < 1:
             raise ValueError(f"threads.{name} must be at least 1 or null (automatic), got {value}")
+    if simulator is not None and learner is not None:
+        return Threads(simulator, learner)
     hardware = hardware or detect()
     free = max(1, hardware.cores - round(hardware.busy))
     limit = os.environ.get("OMP_NUM_THREADS", "")
@@ -156,6 +163,31 @@ def estimate_update_seconds(parameters: int, batch_size: int, bf16: bool, device
     operations = 16 * 2 * batch_size * parameters
     overhead = 0.003  # about 2-3 ms of Python per update, whatever its size (measured)
     return 2 * operations * best / (2 * 256 * 512 * 512) + overhead
+
+
+def _busy_cores(usable: set[int]) -> float:
+    """Return how many of some cores are busy. The load average would still count a training that has just ended."""
+    if not _PROC_STAT.exists():
+        return os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    before = _core_seconds()
+    time.sleep(_SAMPLE_SECONDS)
+    shares = []
+    for core, (busy, total) in _core_seconds().items():
+        if core in usable and core in before:
+            busy, total = busy - before[core][0], total - before[core][1]
+            shares.append(busy / total if total > 0 else 0.0)
+    return sum(shares)
+
+
+def _core_seconds() -> dict[int, tuple[float, float]]:
+    """Return the time that each core was busy, and that time and the idle time together, in the system's unit."""
+    found = {}
+    for line in _PROC_STAT.read_text(encoding="utf-8").splitlines():
+        name, *counts = line.split()
+        if name.startswith("cpu") and name != "cpu":
+            times = [float(count) for count in counts[:8]]  # user, nice, system, idle, iowait, irq, softirq, steal
+            found[int(name[3:])] = (sum(times) - sum(times[3:5]), sum(times))
+    return found
 
 
 def _memory_gb() -> float:

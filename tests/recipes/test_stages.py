@@ -12,6 +12,7 @@ from recipe_config import compose_config, start_training
 
 from coachable.training.checkpoint import CheckpointError, CheckpointStore, find_checkpoint, read_state
 from coachable.training.curriculum import Curriculum
+from coachable.training.hardware import Threads
 from coachable.training.trainer import Trainer
 from tests.random_kills import differences
 
@@ -146,6 +147,16 @@ def test_a_stage_is_forgotten_before_the_next_one_is_built(tmp_path, monkeypatch
     stages = [{"stage": name, "threads": threads} for name in ("first", "second", "third")]
     Curriculum({"run_dir": str(tmp_path), "stages": stages, "init_from": None, "resume": None}, build).run()
     assert built == ["first", "second", "third"]
+
+
+def test_all_stages_share_the_cores_that_were_free_at_the_start(tmp_path, monkeypatch):
+    """Later the training itself keeps them busy."""
+    monkeypatch.setattr("coachable.training.curriculum.share_threads", lambda **_: Threads(simulator=5, learner=3))
+    stages = [{"stage": "first", "threads": {"simulator": None, "learner": None}}]
+    stages += [{"stage": "second", "threads": {"simulator": None, "learner": 1}}]
+    config = {"run_dir": str(tmp_path), "stages": stages, "init_from": None, "resume": None}
+    shared = [stage["threads"] for stage in Curriculum(config, lambda config: None).stages]
+    assert shared == [{"simulator": 5, "learner": 3}, {"simulator": 5, "learner": 1}]
 
 
 def test_what_the_command_line_says_holds_in_all_stages():

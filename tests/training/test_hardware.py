@@ -6,6 +6,7 @@ import time
 import pytest
 import torch
 
+from coachable.training import hardware
 from coachable.training.hardware import (
     Hardware,
     Threads,
@@ -46,6 +47,27 @@ def test_threads_that_are_asked_for_are_taken_literally(monkeypatch):
     assert share_threads(20, 10, machine(4)) == Threads(20, 10)
     assert share_threads(None, 10, machine(4)) == Threads(4, 10)
     assert share_threads(1, None, machine(4)) == Threads(1, 2)
+
+
+def test_cores_are_busy_as_far_as_they_work_at_the_moment(monkeypatch, tmp_path):
+    """Of three cores, the second waits half of the time for others or a disk, and the third may not be used."""
+    stat = tmp_path / "stat"
+    stat.write_text("cpu 9 9 9 9\ncpu0 100 0 50 700 0 0 0 0 0 0\ncpu1 5 5 0 90 0 0 0 0 0 0\ncpu2 1 0 0 9 0 0 0 0 0 0\nintr 7")
+
+    def later(_):
+        stat.write_text(
+            "cpu 9 9 9 9\ncpu0 110 0 50 700 0 0 0 0 0 0\ncpu1 6 6 1 93 2 1 0 1 0 0\ncpu2 9 0 0 9 0 0 0 0 0 0\nintr 8"
+        )
+
+    monkeypatch.setattr(hardware, "_PROC_STAT", stat)
+    monkeypatch.setattr(time, "sleep", later)
+    assert hardware._busy_cores({0, 1}) == pytest.approx(1.0 + 0.5)
+
+
+def test_the_load_average_counts_where_the_system_does_not_tell_more(monkeypatch, tmp_path):
+    monkeypatch.setattr(hardware, "_PROC_STAT", tmp_path / "none")
+    monkeypatch.setattr("os.getloadavg", lambda: (0.7, 0.5, 0.1))
+    assert hardware._busy_cores({0}) == 0.7
 
 
 def test_a_machine_is_described_and_has_its_preset():
