@@ -203,6 +203,8 @@ def _composed(config_name: str, overrides: list[str]) -> DictConfig:
         cause = error.__cause__ or error.__context__
         named = isinstance(cause, OmegaConfBaseException) and cause.full_key
         message = mistake_in(cause) if named else " ".join(str(error).splitlines()[:2])
+        if isinstance(cause, OmegaConfBaseException) and not named:
+            message += f": {str(cause).splitlines()[0]}"
     raise SystemExit(f"error: {message}")
 
 

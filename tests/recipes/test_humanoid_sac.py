@@ -96,6 +96,7 @@ def test_the_configuration_lists_what_its_targets_take():
         ("domain=[a]", r"domain=\['a'\]: expected a name or path"),
         ("wandb=online", r"wandb=online: expected a group of settings"),
         ("stages=3", r"stages=3: expected a list"),
+        ("stages=[a]", r"stages=\[a\]: Cannot assign str to Dict\[str, Any\]"),
         ("gamma.x=1", r"gamma=\{\}: expected a number in \[0, 1\]"),
         ("train.batch_size", r"expected KEY=VALUE"),
     ],

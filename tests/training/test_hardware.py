@@ -55,7 +55,7 @@ def test_cores_are_busy_as_far_as_they_work_at_the_moment(monkeypatch, tmp_path)
     stat.write_text("cpu 9 9 9 9\ncpu0 100 0 50 700 0 0 0 0\ncpu1 5 5 0 90 0 0 0 0 0 0\ncpu2 1 0 0 9 0 0 0 0\nintr 7")
 
     def later(_):
-        stat.write_text("cpu 9 9 9 9\ncpu0 110 0 50 700 0 0 0 0\ncpu1 6 6 1 93 2 1 0 1 0 0\ncpu2 9 0 0 9 0 0 0 0\nintr 8")
+        stat.write_text("cpu 9 9\ncpu0 110 0 50 700 0 0 0 0\ncpu1 6 6 1 93 2 1 0 1 0 0\ncpu2 9 0 0 9 0 0 0 0\nintr 8")
 
     monkeypatch.setattr(hardware, "_PROC_STAT", stat)
     monkeypatch.setattr(time, "sleep", later)

@@ -134,6 +134,7 @@ def test_bad_actions_are_refused():
         ({"num_envs": 2, "car": "tractor"}, "unknown car"),
         ({"num_envs": 2, "track": "road"}, "unknown track"),
         ({"num_envs": 2, "scenarios": (Scenario("a", 0.5, "solo"),)}, "add up to 0.5"),
+        ({"num_envs": 2, "scenarios": "solo"}, "scenarios is 'solo': expected a list of Scenario"),
     ],
 )
 def test_bad_arguments_are_refused(options, message):

@@ -148,7 +148,8 @@ class Starter:
         cars: Number A of cars in a race.
 
     Raises:
-        ValueError: If there are more cars than grid slots, or if the shares do not add up to 1.
+        ValueError: If there are more cars than grid slots, `scenarios` are no scenarios, or their shares do not add up
+            to 1.
     """
 
     def __init__(
@@ -156,6 +157,8 @@ class Starter:
     ) -> None:
         if cars > GRID_SLOTS:
             raise ValueError(f"{cars} cars for {GRID_SLOTS} grid slots: expected at most {GRID_SLOTS} cars")
+        if not all(isinstance(scenario, Scenario) for scenario in scenarios):
+            raise ValueError(f"scenarios is {scenarios!r}: expected a list of Scenario")
         total = sum(scenario.share for scenario in scenarios)
         if not scenarios or abs(total - 1.0) > 1e-6:
             raise ValueError(f"shares of the scenarios add up to {total:g}: expected 1")
