@@ -23,6 +23,7 @@ OF_TARGETS = {  # the function or class checks them itself, before anything is w
     "env.start_speed=-1": r"start_speed is -1: expected a number of at least 0",
     "env.push_force=-1": r"push_force is -1: expected a number of at least 0",
     "env.push_interval=0": r"push_interval is 0: expected a number above 0",
+    "env.push_share=1.1": r"push_share is 1.1: expected a number in \[0, 1\]",
     "env.num_enemies=3": r"num_enemies is 3: expected a whole number in \[1, 2\]",
     "env.traps=1.5": r"traps is 1.5: expected a whole number of at least 0",
     "loss.kappa=-1": r"kappa is -1: expected a number of at least 0",

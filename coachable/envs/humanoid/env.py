@@ -32,7 +32,7 @@ from coachable.envs.humanoid.rewards import COSTS, bearing_reward, move_reward, 
 from coachable.envs.humanoid.simulation import HumanoidSimulation, Kinematics
 from coachable.finite import require_finite_action
 from coachable.keys import STYLE_FEATURES, TASK_REWARD
-from coachable.ranges import COUNT, NOT_NEGATIVE, POSITIVE
+from coachable.ranges import COUNT, NOT_NEGATIVE, POSITIVE, Range
 from coachable.specs import set_specs
 
 EPISODE_STEPS = 1000
@@ -62,6 +62,7 @@ class HumanoidEnv(EnvBase):
         costs: weights of `walk_costs`, which are taken off the task reward; none by default, as in the paper.
         push_force: largest force of random pushes of the torso [N], in any horizontal direction for 0.2 s; 0 for none.
         push_interval: mean time between pushes [s].
+        push_share: share of the environments, the first ones, with random pushes; regular pushes are in all.
         regular_pushes: whether every push has the largest force and comes exactly `push_interval` after the last one.
         styled_speed: whether the style sets the speed. The task reward is then `bearing_reward`, and the style features
             have the forward speed and the bearing, too.
@@ -88,6 +89,7 @@ class HumanoidEnv(EnvBase):
         costs: Mapping[str, float] | None = None,
         push_force: float = 0.0,
         push_interval: float = 2.0,
+        push_share: float = 1.0,
         regular_pushes: bool = False,
         styled_speed: bool = False,
     ) -> None:
@@ -99,6 +101,7 @@ class HumanoidEnv(EnvBase):
         NOT_NEGATIVE.check("start_speed", start_speed)
         NOT_NEGATIVE.check("push_force", push_force)
         POSITIVE.check("push_interval", push_interval)
+        Range("[0, 1]").check("push_share", push_share)
         if unknown := set(costs or {}) - set(COSTS):
             raise ValueError(f"costs of {', '.join(sorted(unknown))}: expected some of {', '.join(COSTS)}")
         for name, weight in (costs or {}).items():
@@ -117,6 +120,7 @@ class HumanoidEnv(EnvBase):
         self.steps = np.zeros(num_envs, dtype=np.int64)
         self.costs = {name: weight for name, weight in (costs or {}).items() if weight}
         self.push_force, self.push_interval, self.regular_pushes = push_force, push_interval, regular_pushes
+        self._may_be_pushed = np.arange(num_envs) < round(push_share * num_envs)
         self.push = np.zeros((num_envs, 3))
         self._push_left = np.zeros(num_envs, dtype=np.int64)
         self.styled_speed = styled_speed
@@ -282,6 +286,7 @@ class HumanoidEnv(EnvBase):
         """Return the force on each torso in this control step (N, 3) [N], and begin the pushes that are due."""
         if self.push_force:
             begins = (self._random.random(self.num_envs) < CONTROL_STEP / self.push_interval) & (self._push_left == 0)
+            begins &= self._may_be_pushed
             size = self._random.uniform(0.0, self.push_force, self.num_envs)
             if self.regular_pushes:
                 begins = (self.steps > 0) & (self.steps % max(1, round(self.push_interval / CONTROL_STEP)) == 0)

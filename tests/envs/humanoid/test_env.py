@@ -217,6 +217,7 @@ def test_a_diverged_policy_is_named():
         {"costs": {"power": -1.0}},
         {"push_force": -1.0},
         {"push_interval": 0.0},
+        {"push_share": 1.5},
     ],
 )
 def test_bad_arguments_are_refused(options):
@@ -357,8 +358,15 @@ def test_random_pushes_come_as_often_and_as_hard_as_asked():
     assert np.abs(forces.mean(axis=(0, 1))).max() < 2.0  # from every side
 
 
+def test_random_pushes_are_in_a_share_of_the_environments():
+    env = make_env(num_envs=10, push_force=100.0, push_interval=0.5, push_share=0.3)
+    env.reset()
+    pushed = np.any([env._pushes() != 0 for _ in range(400)], axis=(0, 2))
+    assert pushed.tolist() == [True] * 3 + [False] * 7
+
+
 def test_regular_pushes_have_the_full_force_at_equal_intervals():
-    env = make_env(num_envs=50, push_force=100.0, push_interval=0.5, regular_pushes=True)
+    env = make_env(num_envs=50, push_force=100.0, push_interval=0.5, push_share=0.2, regular_pushes=True)
     env.reset()
     forces = []
     for _ in range(60):  # 1.5 s
