@@ -65,8 +65,7 @@ def train_seeds(script: Path, arguments: Sequence[str], seeds: Sequence[int], fo
         )
     folder.mkdir(parents=True, exist_ok=True)
     record.write_text(json.dumps(said), encoding="utf-8")
-    hardware = detect()
-    free = max(1, hardware.cores - round(hardware.busy))
+    free = detect().free
     at_once = min(len(seeds), free)
     threads = [f"threads.{part}={free // at_once}" for part in ("simulator", "learner")]
     threads = [text for text in threads if not any(said.startswith("threads.") for said in arguments)]

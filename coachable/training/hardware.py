@@ -35,6 +35,11 @@ class Hardware:
     gpu: str | None
     bf16: bool
 
+    @property
+    def free(self) -> int:
+        """Number of cores that are not busy, at least 1."""
+        return max(1, self.cores - round(self.busy))
+
     def describe(self) -> str:
         """Return a one-line description."""
         device = f"GPU {self.gpu}" if self.gpu else "no GPU"
@@ -125,7 +130,7 @@ def share_threads(
     if simulator is not None and learner is not None:
         return Threads(simulator, learner)
     hardware = hardware or detect()
-    free = max(1, hardware.cores - round(hardware.busy))
+    free = hardware.free
     limit = os.environ.get("OMP_NUM_THREADS", "")
     wanted = int(limit) if limit.isdigit() and int(limit) > 0 else free
     return Threads(simulator=simulator or free, learner=learner or max(1, min(wanted, free, _MAX_LEARNER_THREADS)))
