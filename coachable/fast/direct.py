@@ -76,6 +76,7 @@ class Share:
 
     def __init__(self, actor: Plan, critic: Plan, target: Plan, gradients: dict[str, Tensor]) -> None:
         self.gradients = gradients
+        self.function = load_sac(actor.members[0].products[0].dtype)
         self._plans = {"actor": actor, "critic": critic, "target": target}  # addresses do not keep tensors alive
         self.networks = [_networks(plan) for plan in self._plans.values()]
 
@@ -92,7 +93,7 @@ def has_direct_gradients(loss_module: LossModule, *plans: Plan) -> bool:
         *plans: Plans of its networks.
     """
     loss: Any = loss_module
-    if load_sac() is None or type(loss) not in (SACLoss, QRSACLoss) or len(loss.actor_network) != 2:
+    if type(loss) not in (SACLoss, QRSACLoss) or len(loss.actor_network) != 2:
         return False
     module, head = loss.actor_network
     critic, estimator = loss.qvalue_network.module, loss.value_estimator
@@ -226,7 +227,7 @@ class DirectGradients:
         slices = cut_rows(count, crew_size())
         while len(self._shares) < len(slices):
             self._shares.append(self._make_share())
-        shares, function, calls = self._shares[: len(slices)], load_sac(), []
+        shares, function, calls = self._shares[: len(slices)], self._shares[0].function, []
         for share, rows in zip(shares, slices, strict=True):
             own = _Job.from_buffer_copy(job)
             own.actor, own.own, own.target = map(ctypes.addressof, share.networks)
@@ -244,11 +245,11 @@ def _readable(plan: Plan) -> bool:
     """Return whether `sac.c` can evaluate a plan."""
     own, low = plan.members[0].parameters[0], plan.members[0].products[0]
     return (
-        plan.head
+        load_sac(low.dtype) is not None
+        and plan.head
         and len(plan.layers) <= _MOST
         and all(layer.norm and layer.out_features % 2 == 0 for layer in plan.layers)
         and own.dtype == torch.float32
-        and low.dtype == torch.bfloat16
     )
 
 

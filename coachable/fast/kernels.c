@@ -94,79 +94,149 @@ void adam(const Parameter *parameters, int64_t count, float rate, float beta1, f
     }
 }
 
-#define ELEMENT uint16_t
-#define LOAD(x) widen(x)
-#define STORE(x) narrow(x)
-#define NAME(x) x##_bf16
-#include "kernels.c"
-#undef ELEMENT
-#undef LOAD
-#undef STORE
-#undef NAME
-
-/* Products of bfloat16 matrices with float32 sums, and the float32 products of a head, on one thread. The right factor
- * is packed first, into memory that stays in the cache from product to product: blocks of BLOCK columns, each
- * (pairs, BLOCK, 2). An inner dimension that does not fill its pairs is filled up with zeros. Sums are made for PANEL
- * rows at once, in vector registers, or in tiles where the processor has them (AMX). */
-#ifdef __AVX512BF16__
+/* Products of matrices of float32 or bfloat16 numbers with float32 sums, on one thread. The right factor is packed first,
+ * into memory that stays in the cache from product to product: blocks of BLOCK columns, each (depth, BLOCK). Sums are made
+ * for PANEL rows at once. */
+#if defined(__AVX2__) && defined(__FMA__)
+#define PRODUCTS
 #include <stdlib.h>
-#include <sys/syscall.h>
-#include <unistd.h>
 
-#define ROWS 6 /* ROWS x BLOCK sums leave 8 of 32 vector registers */
+#define ROWS 6 /* of sums in vector registers at once */
+#ifdef __AVX512F__
+#define WIDTH 16 /* floats of a vector register; ROWS x BLOCK sums leave 8 of 32 registers */
 #define BLOCK 64
-#define EACH_ROW(DO) DO(0) DO(1) DO(2) DO(3) DO(4) DO(5)
+#else
+#define WIDTH 8 /* and 4 of 16 registers */
+#define BLOCK 16
+#endif
+#define VECTORS (BLOCK / WIDTH)
 
 static inline int64_t smaller(int64_t a, int64_t b) { return a < b ? a : b; }
 
-/* sums (ROWS, BLOCK) from ROWS addresses of pairs, `step` elements apart, and one block of the right factor. If
- * `single`, float32 numbers stand in the place of the pairs, here and in packed factors. */
-static inline __attribute__((always_inline)) void tile(const uint16_t *const *left, int64_t step, const uint16_t *right,
-                                                       int64_t pairs, int single, float *sums) {
-    __m512bh x;
-    int32_t pair;
-#define START(r)                                                                                     \
-    const uint16_t *p##r = left[r];                                                                  \
-    __m512 s##r##0 = _mm512_setzero_ps(), s##r##1 = s##r##0, s##r##2 = s##r##0, s##r##3 = s##r##0;
-#define ADD(s, y) s = single ? _mm512_fmadd_ps((__m512)x, (__m512)y, s) : _mm512_dpbf16_ps(s, x, y)
-#define MULTIPLY(r)                                     \
-    memcpy(&pair, p##r + k * step, sizeof pair);        \
-    x = (__m512bh)_mm512_set1_epi32(pair);              \
-    ADD(s##r##0, y0);                                   \
-    ADD(s##r##1, y1);                                   \
-    ADD(s##r##2, y2);                                   \
-    ADD(s##r##3, y3);
-#define FINISH(r)                                       \
-    _mm512_storeu_ps(sums + r * BLOCK, s##r##0);        \
-    _mm512_storeu_ps(sums + r * BLOCK + 16, s##r##1);   \
-    _mm512_storeu_ps(sums + r * BLOCK + 32, s##r##2);   \
-    _mm512_storeu_ps(sums + r * BLOCK + 48, s##r##3);
-    EACH_ROW(START)
-    for (int64_t k = 0; k < pairs; k++) {
-        const uint16_t *y = right + k * 2 * BLOCK;
-        const __m512bh y0 = (__m512bh)_mm512_loadu_si512(y), y1 = (__m512bh)_mm512_loadu_si512(y + 32);
-        const __m512bh y2 = (__m512bh)_mm512_loadu_si512(y + 64), y3 = (__m512bh)_mm512_loadu_si512(y + 96);
-        EACH_ROW(MULTIPLY)
-    }
-    EACH_ROW(FINISH)
-}
-
-/* Addresses of ROWS rows of a row-major matrix from row i; beyond the last, the last again. */
-static inline void rows_from(const uint16_t *matrix, int64_t stride, int64_t i, int64_t rows, const uint16_t **left) {
-    for (int r = 0; r < ROWS; r++) left[r] = matrix + smaller(i + r, rows - 1) * stride;
-}
-
-/* The thread's memory for packed factors. */
-static uint16_t *packing_memory(int64_t size) {
-    static _Thread_local uint16_t *memory;
+/* The thread's memory for packed factors, of `size` bytes. */
+static void *packing_memory(int64_t size) {
+    static _Thread_local void *memory;
     static _Thread_local int64_t held;
     if (size > held) {
         free(memory);
-        held = (size + 1023) / 1024 * 1024;
-        memory = aligned_alloc(64, held * sizeof *memory);
+        held = (size + 4095) / 4096 * 4096;
+        memory = aligned_alloc(64, held);
     }
     return memory;
 }
+
+/* ROWS rows of a left factor: addresses of their first numbers, and how far apart the numbers of a row are. */
+#define PANEL_fp32 ROWS
+
+typedef struct {
+    const float *row[ROWS];
+    int64_t step;
+} Panel_fp32;
+
+/* Length of a packed column. */
+static inline int64_t depth_fp32(int64_t inner) { return inner; }
+#define USE_TILES_fp32
+
+/* Rows from i of a row-major matrix; beyond the last, the last again. */
+static inline Panel_fp32 panel_of_fp32(const float *matrix, int64_t stride, int64_t i, int64_t rows, int64_t inner,
+                                       float *memory) {
+    (void)inner, (void)memory;
+    Panel_fp32 panel = {.step = 1};
+    for (int r = 0; r < ROWS; r++) panel.row[r] = matrix + smaller(i + r, rows - 1) * stride;
+    return panel;
+}
+
+/* What panel_of_columns reads, of a matrix (rows, m). */
+static inline const float *columns_of_fp32(const float *matrix, int64_t rows, int64_t m, float *packed) {
+    (void)rows, (void)m, (void)packed;
+    return matrix;
+}
+
+/* Columns from i as rows. */
+static inline Panel_fp32 panel_of_columns_fp32(const float *columns, int64_t i, int64_t m, int64_t depth, float *memory) {
+    (void)depth, (void)memory;
+    Panel_fp32 panel = {.step = m};
+    for (int r = 0; r < ROWS; r++) panel.row[r] = columns + smaller(i + r, m - 1);
+    return panel;
+}
+
+/* sums (ROWS, BLOCK) of the products of a panel with one block of a right factor. */
+static inline void multiply_fp32(const Panel_fp32 *left, const float *right, int64_t depth, int64_t columns, float *sums) {
+    (void)columns;
+    typedef float Vector __attribute__((vector_size(4 * WIDTH), aligned(4), may_alias));
+    const float *row[ROWS];
+    Vector s[ROWS][VECTORS] = {0}, y[VECTORS];
+    for (int r = 0; r < ROWS; r++) row[r] = left->row[r];
+    for (int64_t k = 0; k < depth; k++, right += BLOCK) {
+#pragma GCC unroll 4
+        for (int v = 0; v < VECTORS; v++) y[v] = *(const Vector *)(right + v * WIDTH);
+#pragma GCC unroll 6
+        for (int r = 0; r < ROWS; r++)
+#pragma GCC unroll 4
+            for (int v = 0; v < VECTORS; v++) s[r][v] += row[r][k * left->step] * y[v];
+    }
+#pragma GCC unroll 6
+    for (int r = 0; r < ROWS; r++)
+#pragma GCC unroll 4
+        for (int v = 0; v < VECTORS; v++) *(Vector *)(sums + r * BLOCK + v * WIDTH) = s[r][v];
+}
+
+/* Transpose 8 x 8 numbers. */
+static inline void transpose_fp32(const float *from, int64_t from_stride, float *to, int64_t to_stride) {
+    __m256 m[8], pairs[8];
+#pragma GCC unroll 8
+    for (int r = 0; r < 8; r++) m[r] = _mm256_loadu_ps(from + r * from_stride);
+#pragma GCC unroll 4
+    for (int r = 0; r < 8; r += 2) {
+        pairs[r] = _mm256_unpacklo_ps(m[r], m[r + 1]);
+        pairs[r + 1] = _mm256_unpackhi_ps(m[r], m[r + 1]);
+    }
+#pragma GCC unroll 2
+    for (int half = 0; half < 8; half += 4)
+#pragma GCC unroll 2
+        for (int r = 0; r < 2; r++) {
+            m[half + 2 * r] = _mm256_shuffle_ps(pairs[half + r], pairs[half + r + 2], 0x44);
+            m[half + 2 * r + 1] = _mm256_shuffle_ps(pairs[half + r], pairs[half + r + 2], 0xee);
+        }
+#pragma GCC unroll 4
+    for (int r = 0; r < 4; r++) {
+        _mm256_storeu_ps(to + r * to_stride, _mm256_permute2f128_ps(m[r], m[r + 4], 0x20));
+        _mm256_storeu_ps(to + (r + 4) * to_stride, _mm256_permute2f128_ps(m[r], m[r + 4], 0x31));
+    }
+}
+
+/* Right factor from a matrix (n, inner) of which the transpose is wanted. */
+static void pack_transposed_fp32(const float *matrix, int64_t n, int64_t inner, float *packed) {
+    for (int64_t j = 0; j < (n + BLOCK - 1) / BLOCK * BLOCK; j += 8) {
+        const float *from = matrix + j * inner;
+        float *to = packed + j / BLOCK * inner * BLOCK + j % BLOCK;
+        int64_t k = 0;
+        for (; j + 8 <= n && k + 8 <= inner; k += 8) transpose_fp32(from + k, inner, to + k * BLOCK, BLOCK);
+        for (; k < inner; k++)
+            for (int64_t c = 0; c < 8; c++) to[k * BLOCK + c] = j + c < n ? from[c * inner + k] : 0.0f;
+    }
+}
+
+/* Right factor from a matrix (inner, n) with rows `stride` apart. */
+static void pack_fp32(const float *matrix, int64_t inner, int64_t n, int64_t stride, float *packed) {
+    for (int64_t j = 0; j < n; j += BLOCK) {
+        const int64_t columns = smaller(BLOCK, n - j);
+        for (int64_t k = 0; k < inner; k++) {
+            float *to = packed + j * inner + k * BLOCK;
+            memcpy(to, matrix + k * stride + j, columns * sizeof *to);
+            memset(to + columns, 0, (BLOCK - columns) * sizeof *to);
+        }
+    }
+}
+#endif
+
+/* The same for bfloat16: the inner dimension goes in pairs, and what does not fill its pairs is filled up with zeros. Sums
+ * are made in vector registers, or in tiles where the processor has them (AMX). */
+#ifdef __AVX512BF16__
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#define EACH_ROW(DO) DO(0) DO(1) DO(2) DO(3) DO(4) DO(5)
 
 /* Transpose 16 x 16 numbers of 32 bits: exchange halves, then quarters, and so on. */
 static inline void transpose(__m512i *m) {
@@ -187,14 +257,14 @@ static inline void transpose(__m512i *m) {
     }
 }
 
-/* PANEL rows of a left factor, and their products with one block of a right factor. */
+/* PANEL_bf16 rows of a left factor, and their products with one block of a right factor. */
 #if defined(__AMX_BF16__) && defined(__linux__)
-#define PANEL 32
+#define PANEL_bf16 32
 
 typedef struct {
     const uint16_t *first;
     int64_t stride;
-} Panel;
+} Panel_bf16;
 
 /* Pairs of an inner dimension: a tile holds 16. */
 static inline int64_t pairs_of(int64_t inner) { return (inner + 31) / 32 * 16; }
@@ -225,28 +295,29 @@ static Tiles set_tiles(void) {
 }
 
 /* While this is in scope, the tiles are ours. Others on this thread may have settings of their own, which are put back. */
-#define USE_TILES const Tiles before __attribute__((cleanup(load_tiles))) = set_tiles();
+#define USE_TILES_bf16 const Tiles before __attribute__((cleanup(load_tiles))) = set_tiles();
 
 /* Whether the kernel lets this process use tiles. */
 int tiles_allowed(void) { return !syscall(SYS_arch_prctl, 0x1023 /* ARCH_REQ_XCOMP_PERM */, 18 /* their data */); }
 
 /* Rows from i of a row-major matrix (rows, inner); copied to `memory` if they do not fill the tiles. */
-static inline Panel panel_of(const uint16_t *matrix, int64_t stride, int64_t i, int64_t rows, int64_t inner,
-                             uint16_t *memory) {
-    const int64_t width = 2 * pairs_of(inner), count = smaller(PANEL, rows - i);
-    if (count == PANEL && width == inner) return (Panel){matrix + i * stride, stride};
+static inline Panel_bf16 panel_of_bf16(const uint16_t *matrix, int64_t stride, int64_t i, int64_t rows, int64_t inner,
+                                       uint16_t *memory) {
+    const int64_t width = 2 * pairs_of(inner), count = smaller(PANEL_bf16, rows - i);
+    if (count == PANEL_bf16 && width == inner) return (Panel_bf16){matrix + i * stride, stride};
     for (int64_t r = 0; r < count; r++) {
         memcpy(memory + r * width, matrix + (i + r) * stride, inner * sizeof *memory);
         memset(memory + r * width + inner, 0, (width - inner) * sizeof *memory);
     }
-    memset(memory + count * width, 0, (PANEL - count) * width * sizeof *memory);
-    return (Panel){memory, width};
+    memset(memory + count * width, 0, (PANEL_bf16 - count) * width * sizeof *memory);
+    return (Panel_bf16){memory, width};
 }
 
 /* Columns from i of a matrix (inner, m) that is packed like a right factor, as rows. */
-static inline Panel panel_of_columns(const uint16_t *packed, int64_t i, int64_t m, int64_t pairs, uint16_t *memory) {
+static inline Panel_bf16 panel_of_columns_bf16(const uint16_t *packed, int64_t i, int64_t m, int64_t depth, uint16_t *memory) {
     (void)m;
-    for (int64_t c = i; c < i + PANEL; c += 16)
+    const int64_t pairs = depth / 2;
+    for (int64_t c = i; c < i + PANEL_bf16; c += 16)
         for (int64_t k = 0; k < pairs; k += 16) {
             const uint16_t *from = packed + (c / BLOCK * pairs + k) * 2 * BLOCK + c % BLOCK * 2;
             __m512i t[16];
@@ -254,10 +325,11 @@ static inline Panel panel_of_columns(const uint16_t *packed, int64_t i, int64_t 
             transpose(t);
             for (int64_t r = 0; r < 16; r++) _mm512_storeu_si512(memory + (c - i + r) * 2 * pairs + 2 * k, t[r]);
         }
-    return (Panel){memory, 2 * pairs};
+    return (Panel_bf16){memory, 2 * pairs};
 }
 
-static inline void multiply(const Panel *left, const uint16_t *right, int64_t pairs, int64_t columns, float *sums) {
+static inline void multiply_bf16(const Panel_bf16 *left, const uint16_t *right, int64_t depth, int64_t columns, float *sums) {
+    const int64_t pairs = depth / 2;
     TOUCH(left->first);
     for (int64_t c = 0; c < smaller(BLOCK, columns); c += 32) {
         _tile_zero(0);
@@ -282,46 +354,76 @@ static inline void multiply(const Panel *left, const uint16_t *right, int64_t pa
     }
 }
 #else
-#define PANEL ROWS
+#define PANEL_bf16 ROWS
 
 typedef struct {
     const uint16_t *row[ROWS];
     int64_t step;
-} Panel;
+} Panel_bf16;
 
 static inline int64_t pairs_of(int64_t inner) { return (inner + 1) / 2; }
 
-#define USE_TILES
+#define USE_TILES_bf16
 int tiles_allowed(void) { return 0; }
 
-static inline Panel panel_of(const uint16_t *matrix, int64_t stride, int64_t i, int64_t rows, int64_t inner,
-                             uint16_t *memory) {
+static inline Panel_bf16 panel_of_bf16(const uint16_t *matrix, int64_t stride, int64_t i, int64_t rows, int64_t inner,
+                                       uint16_t *memory) {
     (void)inner, (void)memory;
-    Panel panel = {.step = 2};
-    rows_from(matrix, stride, i, rows, panel.row);
+    Panel_bf16 panel = {.step = 2};
+    for (int r = 0; r < ROWS; r++) panel.row[r] = matrix + smaller(i + r, rows - 1) * stride;
     return panel;
 }
 
-static inline Panel panel_of_columns(const uint16_t *packed, int64_t i, int64_t m, int64_t pairs, uint16_t *memory) {
+static inline Panel_bf16 panel_of_columns_bf16(const uint16_t *packed, int64_t i, int64_t m, int64_t depth, uint16_t *memory) {
     (void)memory;
-    Panel panel = {.step = 2 * BLOCK};
+    Panel_bf16 panel = {.step = 2 * BLOCK};
     for (int64_t r = 0; r < ROWS; r++) {
         const int64_t column = smaller(i + r, m - 1);
-        panel.row[r] = packed + column / BLOCK * pairs * 2 * BLOCK + column % BLOCK * 2;
+        panel.row[r] = packed + column / BLOCK * depth * BLOCK + column % BLOCK * 2;
     }
     return panel;
 }
 
-static inline void multiply(const Panel *left, const uint16_t *right, int64_t pairs, int64_t columns, float *sums) {
+/* sums (ROWS, BLOCK) from ROWS addresses of pairs, `step` elements apart, and one block of the right factor. */
+static inline void tile(const uint16_t *const *left, int64_t step, const uint16_t *right, int64_t pairs, float *sums) {
+    __m512bh x;
+    int32_t pair;
+#define START(r)                                                                                     \
+    const uint16_t *p##r = left[r];                                                                  \
+    __m512 s##r##0 = _mm512_setzero_ps(), s##r##1 = s##r##0, s##r##2 = s##r##0, s##r##3 = s##r##0;
+#define ADD(s, y) s = _mm512_dpbf16_ps(s, x, y)
+#define MULTIPLY(r)                                     \
+    memcpy(&pair, p##r + k * step, sizeof pair);        \
+    x = (__m512bh)_mm512_set1_epi32(pair);              \
+    ADD(s##r##0, y0);                                   \
+    ADD(s##r##1, y1);                                   \
+    ADD(s##r##2, y2);                                   \
+    ADD(s##r##3, y3);
+#define FINISH(r)                                       \
+    _mm512_storeu_ps(sums + r * BLOCK, s##r##0);        \
+    _mm512_storeu_ps(sums + r * BLOCK + 16, s##r##1);   \
+    _mm512_storeu_ps(sums + r * BLOCK + 32, s##r##2);   \
+    _mm512_storeu_ps(sums + r * BLOCK + 48, s##r##3);
+    EACH_ROW(START)
+    for (int64_t k = 0; k < pairs; k++) {
+        const uint16_t *y = right + k * 2 * BLOCK;
+        const __m512bh y0 = (__m512bh)_mm512_loadu_si512(y), y1 = (__m512bh)_mm512_loadu_si512(y + 32);
+        const __m512bh y2 = (__m512bh)_mm512_loadu_si512(y + 64), y3 = (__m512bh)_mm512_loadu_si512(y + 96);
+        EACH_ROW(MULTIPLY)
+    }
+    EACH_ROW(FINISH)
+}
+
+static inline void multiply_bf16(const Panel_bf16 *left, const uint16_t *right, int64_t depth, int64_t columns, float *sums) {
     (void)columns;
-    tile(left->row, left->step, right, pairs, 0, sums);
+    tile(left->row, left->step, right, depth / 2, sums);
 }
 #endif
 
-static int64_t packed_size(int64_t inner, int64_t n) { return 2 * pairs_of(inner) * ((n + BLOCK - 1) / BLOCK * BLOCK); }
+static inline int64_t depth_bf16(int64_t inner) { return 2 * pairs_of(inner); }
 
 /* Right factor from a matrix (n, inner) of which the transpose is wanted. */
-static void pack_transposed(const uint16_t *matrix, int64_t n, int64_t inner, uint16_t *packed) {
+static void pack_transposed_bf16(const uint16_t *matrix, int64_t n, int64_t inner, uint16_t *packed) {
     const int64_t pairs = pairs_of(inner);
     for (int64_t j = 0; j < n; j += 16) {
         uint16_t *to = packed + j / BLOCK * pairs * 2 * BLOCK + j % BLOCK * 2;
@@ -341,7 +443,7 @@ static void pack_transposed(const uint16_t *matrix, int64_t n, int64_t inner, ui
 }
 
 /* Right factor from a matrix (inner, n) with rows `stride` apart. */
-static void pack(const uint16_t *matrix, int64_t inner, int64_t n, int64_t stride, uint16_t *packed) {
+static void pack_bf16(const uint16_t *matrix, int64_t inner, int64_t n, int64_t stride, uint16_t *packed) {
     const int64_t pairs = pairs_of(inner);
     for (int64_t k = 0; k < 2 * pairs; k += 2)
         for (int64_t j = 0; j < n; j += BLOCK) {
@@ -360,142 +462,39 @@ static void pack(const uint16_t *matrix, int64_t inner, int64_t n, int64_t strid
         }
 }
 
-/* z = x times the transpose of weight (n, inner), and then layer_forward with its arguments; x (rows, inner) is also
- * the skip. If inner is odd, a column of zeros follows in x. */
-void dense_forward(int64_t inner, const uint16_t *weight, uint16_t *z, const float *bias, const float *gamma,
-                   const float *beta, const uint16_t *x, int64_t x_stride, int64_t from, int64_t to, int64_t width,
-                   float eps, int64_t rows, int64_t n, uint16_t *out, float *mean, float *rstd, float *scratch) {
-    FLUSH_TINY
-    USE_TILES
-    const int64_t pairs = pairs_of(inner), size = packed_size(inner, n);
-    uint16_t *packed = packing_memory(size + PANEL * 2 * pairs);
-    float sums[PANEL * BLOCK];
-    pack_transposed(weight, n, inner, packed);
-    for (int64_t i = 0; i < rows; i += PANEL) {
-        const int64_t count = smaller(PANEL, rows - i);
-        const Panel left = panel_of(x, x_stride, i, rows, inner, packed + size);
-        for (int64_t j = 0; j < n; j += BLOCK) {
-            const int64_t columns = smaller(BLOCK, n - j);
-            multiply(&left, packed + j * 2 * pairs, pairs, columns, sums);
-            for (int64_t r = 0; r < count; r++)
-                for (int64_t c = 0; c < columns; c++) z[(i + r) * n + j + c] = narrow(sums[r * BLOCK + c]);
-        }
-        layer_forward_bf16(z + i * n, bias, gamma, beta, x + i * x_stride, x_stride, from, to, width, eps, count, n,
-                           out + i * n, mean + i, rstd + i, scratch);
-    }
-}
-
-/* Gradient of a layer's input: below (rows, n) = dz (rows, inner) times weight (inner, n; rows `stride` apart),
- * plus columns from `to` of grad (rows, inner) at columns from `from`, which may be negative; an even inner dimension. */
-void dense_backward(const uint16_t *dz, int64_t rows, int64_t inner, const uint16_t *weight, int64_t stride, int64_t n,
-                    const uint16_t *restrict grad, int64_t from, int64_t to, int64_t width, uint16_t *restrict below) {
-    FLUSH_TINY
-    USE_TILES
-    const int64_t pairs = pairs_of(inner), size = packed_size(inner, n);
-    uint16_t *packed = packing_memory(size + PANEL * 2 * pairs);
-    float sums[PANEL * BLOCK];
-    pack(weight, inner, n, stride, packed);
-    for (int64_t i = 0; i < rows; i += PANEL) {
-        const Panel left = panel_of(dz, inner, i, rows, inner, packed + size);
-        for (int64_t j = 0; j < n; j += BLOCK) {
-            const int64_t first = from > j ? from - j : 0, last = smaller(from + width, j + BLOCK) - j;
-            multiply(&left, packed + j * 2 * pairs, pairs, n - j, sums);
-            for (int64_t r = 0; r < smaller(PANEL, rows - i); r++) {
-                float *restrict s = sums + r * BLOCK;
-                const uint16_t *restrict g = grad + (i + r) * inner + to - from + j;
-                for (int64_t c = first; c < last; c++) s[c] += widen(g[c]);
-                for (int64_t c = 0; c < smaller(BLOCK, n - j); c++) below[(i + r) * n + j + c] = narrow(s[c]);
-            }
-        }
-    }
-}
-
-/* Gradient of a weight (m, n), added to what is there if `add`: the transpose of dz (rows, m) times x (rows, n). */
-void weight_gradient(const uint16_t *dz, int64_t m, const uint16_t *x, int64_t n, int64_t x_stride, int64_t rows,
-                     int add, float *restrict grad) {
-    FLUSH_TINY
-    USE_TILES
-    const int64_t pairs = pairs_of(rows), dz_size = packed_size(rows, m), x_size = packed_size(rows, n);
-    uint16_t *dz_packed = packing_memory(dz_size + x_size + PANEL * 2 * pairs), *x_packed = dz_packed + dz_size;
-    float sums[PANEL * BLOCK];
-    pack(dz, rows, m, m, dz_packed);
-    pack(x, rows, n, x_stride, x_packed);
-    for (int64_t i = 0; i < m; i += PANEL) {
-        const Panel left = panel_of_columns(dz_packed, i, m, pairs, x_packed + x_size);
-        for (int64_t j = 0; j < n; j += BLOCK) {
-            multiply(&left, x_packed + j * 2 * pairs, pairs, n - j, sums);
-            for (int64_t r = 0; r < smaller(PANEL, m - i); r++)
-                for (int64_t c = 0; c < smaller(BLOCK, n - j); c++) {
-                    float *to = grad + (i + r) * n + j + c;
-                    *to = (add ? *to : 0.0f) + sums[r * BLOCK + c];
-                }
-        }
-    }
-}
-
-/* A linear head of many outputs, in float32: the same as head_forward below. */
-void wide_head_forward(const uint16_t *restrict x, const float *weight, const float *restrict bias, int64_t rows,
-                       int64_t n, int64_t outputs, float *restrict y) {
-    FLUSH_TINY
-    const int64_t size = packed_size(2 * n, outputs), pairs = pairs_of(2 * n); /* each pair is a number here */
-    uint16_t *packed = packing_memory(size + ROWS * 2 * n);
-    float *some = (float *)(packed + size), sums[ROWS * BLOCK];
-    const uint16_t *left[ROWS];
-    pack_transposed((const uint16_t *)weight, outputs, 2 * n, packed);
-    for (int64_t i = 0; i < rows; i += ROWS) {
-        const int64_t count = smaller(ROWS, rows - i);
-        for (int64_t k = 0; k < count * n; k++) some[k] = widen(x[i * n + k]);
-        rows_from((uint16_t *)some, 2 * n, 0, count, left);
-        for (int64_t j = 0; j < outputs; j += BLOCK) {
-            tile(left, 2, packed + j * 2 * pairs, n, 1, sums);
-            for (int64_t r = 0; r < count; r++)
-                for (int64_t c = 0; c < smaller(BLOCK, outputs - j); c++)
-                    y[(i + r) * outputs + j + c] = sums[r * BLOCK + c] + bias[j + c];
-        }
-    }
-}
-
-/* Its gradients: the same as head_backward below. */
-void wide_head_backward(const float *grad, const uint16_t *restrict x, const float *restrict weight, int64_t count,
-                        int64_t n, int64_t outputs, int trained, int add, uint16_t *restrict dx,
-                        float *restrict dweight, float *restrict dbias) {
-    FLUSH_TINY
-    float *packed = (float *)packing_memory(packed_size(2 * (count < outputs ? outputs : count), BLOCK));
-    float sums[ROWS * BLOCK];
-    const uint16_t *left[ROWS];
-    for (int64_t j = 0; j < n; j += BLOCK) {
-        const int64_t columns = smaller(BLOCK, n - j);
-        for (int64_t k = 0; k < outputs; k++) memcpy(packed + k * BLOCK, weight + k * n + j, columns * sizeof *packed);
-        for (int64_t i = 0; i < count; i += ROWS) {
-            rows_from((const uint16_t *)grad, 2 * outputs, i, count, left);
-            tile(left, 2, (uint16_t *)packed, outputs, 1, sums);
-            for (int64_t r = 0; r < smaller(ROWS, count - i); r++)
-                for (int64_t c = 0; c < columns; c++) dx[(i + r) * n + j + c] = narrow(sums[r * BLOCK + c]);
-        }
-        if (!trained) continue;
-        for (int64_t k = 0; k < count; k++)
-            for (int64_t c = 0; c < columns; c++) packed[k * BLOCK + c] = widen(x[k * n + j + c]);
-        for (int64_t i = 0; i < outputs; i += ROWS) {
-            rows_from((const uint16_t *)grad, 2, i, outputs, left);
-            tile(left, 2 * outputs, (uint16_t *)packed, count, 1, sums);
-            for (int64_t r = 0; r < smaller(ROWS, outputs - i); r++)
-                for (int64_t c = 0; c < columns; c++) {
-                    float *to = dweight + (i + r) * n + j + c;
-                    *to = (add ? *to : 0.0f) + sums[r * BLOCK + c];
-                }
-        }
-    }
-    if (trained && !add) memset(dbias, 0, outputs * sizeof *dbias);
-    for (int64_t r = 0; trained && r < count; r++)
-        for (int64_t o = 0; o < outputs; o++) dbias[o] += grad[r * outputs + o];
+static inline const uint16_t *columns_of_bf16(const uint16_t *matrix, int64_t rows, int64_t m, uint16_t *packed) {
+    pack_bf16(matrix, rows, m, m, packed);
+    return packed;
 }
 #endif
+
+#define ELEMENT uint16_t
+#define LOAD(x) widen(x)
+#define STORE(x) narrow(x)
+#define NAME(x) x##_bf16
+#ifdef __AVX512BF16__
+#define DENSE
+#endif
+#include "kernels.c"
+#undef ELEMENT
+#undef LOAD
+#undef STORE
+#undef NAME
+#undef DENSE
 
 #define ELEMENT float
 #define LOAD(x) (x)
 #define STORE(x) (x)
 #define NAME(x) x##_fp32
+#ifdef PRODUCTS
+#define DENSE
+#endif
 #include "kernels.c"
+#undef ELEMENT
+#undef LOAD
+#undef STORE
+#undef NAME
+#undef DENSE
 
 #else
 
@@ -643,5 +642,140 @@ void NAME(head_backward)(const float *restrict grad, const ELEMENT *restrict x, 
         for (int64_t j = 0; j < n; j++) dx[j] = STORE(scratch[j]);
     }
 }
+
+#ifdef DENSE
+
+/* Numbers of a packed right factor (inner, n). */
+static inline int64_t NAME(packed_size)(int64_t inner, int64_t n) {
+    return NAME(depth)(inner) * ((n + BLOCK - 1) / BLOCK * BLOCK);
+}
+
+/* z = x times the transpose of weight (n, inner), and then layer_forward with its arguments; x (rows, inner) is also
+ * the skip. If inner is odd, a column of zeros follows in a bfloat16 x. */
+void NAME(dense_forward)(int64_t inner, const ELEMENT *weight, ELEMENT *z, const float *bias, const float *gamma,
+                         const float *beta, const ELEMENT *x, int64_t x_stride, int64_t from, int64_t to, int64_t width,
+                         float eps, int64_t rows, int64_t n, ELEMENT *out, float *mean, float *rstd, float *scratch) {
+    FLUSH_TINY
+    NAME(USE_TILES)
+    const int64_t depth = NAME(depth)(inner), size = NAME(packed_size)(inner, n);
+    ELEMENT *packed = packing_memory((size + NAME(PANEL) * depth) * sizeof *packed);
+    float sums[NAME(PANEL) * BLOCK];
+    NAME(pack_transposed)(weight, n, inner, packed);
+    for (int64_t i = 0; i < rows; i += NAME(PANEL)) {
+        const int64_t count = smaller(NAME(PANEL), rows - i);
+        const NAME(Panel) left = NAME(panel_of)(x, x_stride, i, rows, inner, packed + size);
+        for (int64_t j = 0; j < n; j += BLOCK) {
+            const int64_t columns = smaller(BLOCK, n - j);
+            NAME(multiply)(&left, packed + j * depth, depth, columns, sums);
+            for (int64_t r = 0; r < count; r++)
+                for (int64_t c = 0; c < columns; c++) z[(i + r) * n + j + c] = STORE(sums[r * BLOCK + c]);
+        }
+        NAME(layer_forward)(z + i * n, bias, gamma, beta, x + i * x_stride, x_stride, from, to, width, eps, count, n,
+                            out + i * n, mean + i, rstd + i, scratch);
+    }
+}
+
+/* Gradient of a layer's input: below (rows, n) = dz (rows, inner) times weight (inner, n; rows `stride` apart),
+ * plus columns from `to` of grad (rows, inner) at columns from `from`, which may be negative; an even inner dimension. */
+void NAME(dense_backward)(const ELEMENT *dz, int64_t rows, int64_t inner, const ELEMENT *weight, int64_t stride, int64_t n,
+                          const ELEMENT *restrict grad, int64_t from, int64_t to, int64_t width, ELEMENT *restrict below) {
+    FLUSH_TINY
+    NAME(USE_TILES)
+    const int64_t depth = NAME(depth)(inner), size = NAME(packed_size)(inner, n);
+    ELEMENT *packed = packing_memory((size + NAME(PANEL) * depth) * sizeof *packed);
+    float sums[NAME(PANEL) * BLOCK];
+    NAME(pack)(weight, inner, n, stride, packed);
+    for (int64_t i = 0; i < rows; i += NAME(PANEL)) {
+        const NAME(Panel) left = NAME(panel_of)(dz, inner, i, rows, inner, packed + size);
+        for (int64_t j = 0; j < n; j += BLOCK) {
+            const int64_t first = from > j ? from - j : 0, last = smaller(from + width, j + BLOCK) - j;
+            NAME(multiply)(&left, packed + j * depth, depth, n - j, sums);
+            for (int64_t r = 0; r < smaller(NAME(PANEL), rows - i); r++) {
+                float *restrict s = sums + r * BLOCK;
+                const ELEMENT *restrict g = grad + (i + r) * inner + to - from + j;
+                for (int64_t c = first; c < last; c++) s[c] += LOAD(g[c]);
+                for (int64_t c = 0; c < smaller(BLOCK, n - j); c++) below[(i + r) * n + j + c] = STORE(s[c]);
+            }
+        }
+    }
+}
+
+/* Gradient of a weight (m, n), added to what is there if `add`: the transpose of dz (rows, m) times x (rows, n). */
+void NAME(weight_gradient)(const ELEMENT *dz, int64_t m, const ELEMENT *x, int64_t n, int64_t x_stride, int64_t rows, int add,
+                           float *restrict grad) {
+    FLUSH_TINY
+    NAME(USE_TILES)
+    const int64_t depth = NAME(depth)(rows), dz_size = NAME(packed_size)(rows, m), x_size = NAME(packed_size)(rows, n);
+    ELEMENT *packed = packing_memory((dz_size + x_size + NAME(PANEL) * depth) * sizeof *packed);
+    ELEMENT *x_packed = packed + dz_size;
+    float sums[NAME(PANEL) * BLOCK];
+    const ELEMENT *dz_columns = NAME(columns_of)(dz, rows, m, packed);
+    NAME(pack)(x, rows, n, x_stride, x_packed);
+    for (int64_t i = 0; i < m; i += NAME(PANEL)) {
+        const NAME(Panel) left = NAME(panel_of_columns)(dz_columns, i, m, depth, x_packed + x_size);
+        for (int64_t j = 0; j < n; j += BLOCK) {
+            NAME(multiply)(&left, x_packed + j * depth, depth, n - j, sums);
+            for (int64_t r = 0; r < smaller(NAME(PANEL), m - i); r++)
+                for (int64_t c = 0; c < smaller(BLOCK, n - j); c++) {
+                    float *to = grad + (i + r) * n + j + c;
+                    *to = (add ? *to : 0.0f) + sums[r * BLOCK + c];
+                }
+        }
+    }
+}
+
+/* A linear head of many outputs, in float32: the same as head_forward. */
+void NAME(wide_head_forward)(const ELEMENT *restrict x, const float *weight, const float *restrict bias, int64_t rows,
+                             int64_t n, int64_t outputs, float *restrict y) {
+    FLUSH_TINY
+    const int64_t size = n * ((outputs + BLOCK - 1) / BLOCK * BLOCK);
+    float *packed = packing_memory((size + ROWS * n) * sizeof *packed), *some = packed + size, sums[ROWS * BLOCK];
+    pack_transposed_fp32(weight, outputs, n, packed);
+    for (int64_t i = 0; i < rows; i += ROWS) {
+        const int64_t count = smaller(ROWS, rows - i);
+        for (int64_t k = 0; k < count * n; k++) some[k] = LOAD(x[i * n + k]);
+        const Panel_fp32 left = panel_of_fp32(some, n, 0, count, n, NULL);
+        for (int64_t j = 0; j < outputs; j += BLOCK) {
+            multiply_fp32(&left, packed + j * n, n, outputs - j, sums);
+            for (int64_t r = 0; r < count; r++)
+                for (int64_t c = 0; c < smaller(BLOCK, outputs - j); c++)
+                    y[(i + r) * outputs + j + c] = sums[r * BLOCK + c] + bias[j + c];
+        }
+    }
+}
+
+/* Its gradients: the same as head_backward. */
+void NAME(wide_head_backward)(const float *grad, const ELEMENT *restrict x, const float *restrict weight, int64_t count,
+                              int64_t n, int64_t outputs, int trained, int add, ELEMENT *restrict dx,
+                              float *restrict dweight, float *restrict dbias) {
+    FLUSH_TINY
+    float *packed = packing_memory((count < outputs ? outputs : count) * BLOCK * sizeof *packed), sums[ROWS * BLOCK];
+    for (int64_t j = 0; j < n; j += BLOCK) {
+        const int64_t columns = smaller(BLOCK, n - j);
+        pack_fp32(weight + j, outputs, columns, n, packed);
+        for (int64_t i = 0; i < count; i += ROWS) {
+            const Panel_fp32 left = panel_of_fp32(grad, outputs, i, count, outputs, NULL);
+            multiply_fp32(&left, packed, outputs, columns, sums);
+            for (int64_t r = 0; r < smaller(ROWS, count - i); r++)
+                for (int64_t c = 0; c < columns; c++) dx[(i + r) * n + j + c] = STORE(sums[r * BLOCK + c]);
+        }
+        if (!trained) continue;
+        for (int64_t k = 0; k < count; k++)
+            for (int64_t c = 0; c < columns; c++) packed[k * BLOCK + c] = LOAD(x[k * n + j + c]);
+        for (int64_t i = 0; i < outputs; i += ROWS) {
+            const Panel_fp32 left = panel_of_columns_fp32(grad, i, outputs, count, NULL);
+            multiply_fp32(&left, packed, count, columns, sums);
+            for (int64_t r = 0; r < smaller(ROWS, outputs - i); r++)
+                for (int64_t c = 0; c < columns; c++) {
+                    float *to = dweight + (i + r) * n + j + c;
+                    *to = (add ? *to : 0.0f) + sums[r * BLOCK + c];
+                }
+        }
+    }
+    if (trained && !add) memset(dbias, 0, outputs * sizeof *dbias);
+    for (int64_t r = 0; trained && r < count; r++)
+        for (int64_t o = 0; o < outputs; o++) dbias[o] += grad[r * outputs + o];
+}
+#endif
 
 #endif

@@ -20,6 +20,7 @@ import torch
 KERNEL_THREADS = 4  # the kernels run on one thread; beside many, the parallel operations of torch are faster
 
 _LOG = logging.getLogger(__name__)
+_NAMES = {torch.bfloat16: "bf16", torch.float32: "fp32"}  # as the functions' names end
 _TYPES = (ctypes.c_void_p, ctypes.c_int64, ctypes.c_int)
 _SOURCE = Path(__file__).with_name("sac.c")
 _INCLUDED = Path(__file__).with_name("kernels.c")
@@ -32,7 +33,7 @@ _FLAGS = (
 
 @dataclass(frozen=True)
 class Products:
-    """Products of bfloat16 matrices with what follows them, and heads of many outputs, on one thread."""
+    """Products of matrices with what follows them, and heads of many outputs, on one thread."""
 
     dense_forward: Any
     dense_backward: Any
@@ -54,9 +55,13 @@ class Kernels:
     products: Products | None
 
 
-def load_sac() -> Any:
-    """Return the function `sac_gradients` of `sac.c`, or `None` where it was not built; see `direct.py`."""
-    kernels = load_kernels().get(torch.bfloat16)
+def load_sac(dtype: torch.dtype) -> Any:
+    """Return the function `sac_gradients` of `sac.c`, or `None` where it was not built; see `direct.py`.
+
+    Args:
+        dtype: Of the matrix products, `torch.float32` or `torch.bfloat16`.
+    """
+    kernels = load_kernels().get(dtype)
     return None if kernels is None or kernels.products is None else kernels.products.sac_gradients
 
 
@@ -138,16 +143,16 @@ def _only_ours(path: Path) -> bool:
     return status.st_uid == os.geteuid() and not status.st_mode & 0o022 and not stat.S_ISLNK(status.st_mode)
 
 
-def _products(library: ctypes.CDLL) -> Products | None:
-    """Return the products where the processor has bfloat16 in vector registers.
+def _products(library: ctypes.CDLL, dtype: torch.dtype) -> Products | None:
+    """Return the products where the processor has the vector instructions for them: AVX2, or bfloat16 of AVX-512.
 
     Where it also has tiles (AMX) that the library does not use, because the compiler or the kernel does not know them,
-    torch's products are faster.
+    torch's products of bfloat16 matrices are faster.
     """
-    capabilities = torch.cpu.get_capabilities()
-    if not capabilities.get("avx512_bf16") or not hasattr(library, "dense_forward"):
+    name = _NAMES[dtype]
+    if not hasattr(library, f"dense_forward_{name}"):
         return None
-    if capabilities.get("amx_bf16") and not library.tiles_allowed():
+    if dtype == torch.bfloat16 and torch.cpu.get_capabilities().get("amx_bf16") and not library.tiles_allowed():
         return None
     p, i, flag = _TYPES
     arguments = {
@@ -158,9 +163,9 @@ def _products(library: ctypes.CDLL) -> Products | None:
         "wide_head_backward": [p, p, p, i, i, i, flag, flag, p, p, p],
         "sac_gradients": [p, i, i, flag, flag],
     }
-    functions = {name: library[name] for name in arguments}
-    for name, function in functions.items():
-        function.argtypes, function.restype = arguments[name], None
+    functions = {function: library[f"{function}_{name}"] for function in arguments}
+    for function, function_pointer in functions.items():
+        function_pointer.argtypes, function_pointer.restype = arguments[function], None
     return Products(**functions)
 
 
@@ -170,7 +175,7 @@ def _bind(library: ctypes.CDLL) -> dict[torch.dtype, Kernels]:
     adam = library.adam
     adam.argtypes = [p, i, *[ctypes.c_float] * 6]
     adam.restype = None
-    for dtype, name in ((torch.bfloat16, "bf16"), (torch.float32, "fp32")):
+    for dtype, name in _NAMES.items():
         forward, backward = library[f"layer_forward_{name}"], library[f"layer_backward_{name}"]
         forward.argtypes = [p, p, p, p, p, i, i, i, i, ctypes.c_float, i, i, p, p, p, p]
         backward.argtypes = [p, p, p, p, p, p, p, p, i, flag, flag, i, p, p, p, p, p]
@@ -178,6 +183,5 @@ def _bind(library: ctypes.CDLL) -> dict[torch.dtype, Kernels]:
         head.argtypes = [p, p, p, i, i, i, p]
         head_backward.argtypes = [p, p, p, i, i, i, flag, flag, p, p, p, p]
         forward.restype = backward.restype = head.restype = head_backward.restype = None
-        products = _products(library) if dtype == torch.bfloat16 else None
-        kernels[dtype] = Kernels(forward, backward, head, head_backward, adam, products)
+        kernels[dtype] = Kernels(forward, backward, head, head_backward, adam, _products(library, dtype))
     return kernels

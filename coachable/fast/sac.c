@@ -1,9 +1,11 @@
 /* Gradients of SAC and QR-SAC for some rows of a batch, from the networks' inputs to the parameters' gradients, see
- * direct.py. Built where kernels.c has products of bfloat16 matrices. */
+ * direct.py. The file includes itself for each type of matrix products that kernels.c has. */
+
+#ifndef ELEMENT
 
 #include "kernels.c"
 
-#ifdef __AVX512BF16__
+#ifdef PRODUCTS
 
 #define MOST 8 /* layers of a network, or inputs */
 #define FEW 4  /* outputs of a head; beyond, products of matrices are faster */
@@ -12,7 +14,7 @@ typedef struct {
     int64_t inner, outer;    /* widths of input and output */
     int64_t from, to, width; /* columns of the skip, see layer_forward */
     double eps;
-    const uint16_t *weight;
+    const void *weight; /* in the type of the products */
     const float *bias, *gamma, *beta;
     float *dweight, *dbias, *dgamma, *dbeta; /* null in a network that is not trained */
 } Layer;
@@ -108,99 +110,10 @@ static inline float log1p_of(float e) {
 
 static inline float tanh_of(float x) { return 1.0f - 2.0f / (exp_of(2.0f * x) + 1.0f); }
 
-/* Rows of a network's input in bfloat16, with a column of zeros if their number is odd; `last` (rows, axes) follows. */
-static const uint16_t *assemble(const Inputs *inputs, int64_t start, int64_t rows, const float *last, int64_t axes,
-                                int64_t *stride) {
-    int64_t width = last ? axes : 0;
-    for (int64_t i = 0; i < inputs->count; i++) width += inputs->width[i];
-    *stride = width + width % 2;
-    uint16_t *x = take(rows * *stride * sizeof *x);
-    for (int64_t r = 0; r < rows; r++) {
-        uint16_t *to = x + r * *stride;
-        to[*stride - 1] = 0;
-        for (int64_t i = 0; i < inputs->count; i++) {
-            const float *from = inputs->part[i] + (start + r) * inputs->width[i];
-            for (int64_t j = 0; j < inputs->width[i]; j++) *to++ = narrow(from[j]);
-        }
-        if (last)
-            for (int64_t j = 0; j < axes; j++) *to++ = narrow(last[r * axes + j]);
-    }
-    return x;
-}
-
-/* What a backward pass needs of a forward pass. */
-typedef struct {
-    const uint16_t *x;
-    int64_t stride;
-    uint16_t *z[MOST], *out[MOST];
-    float *mean[MOST], *rstd[MOST];
-} Tape;
-
 static int64_t widest(const Network *net) {
     int64_t n = net->layer[0].inner;
     for (int64_t i = 0; i < net->layers; i++) n = net->layer[i].outer > n ? net->layer[i].outer : n;
     return n;
-}
-
-static float *forward(const Network *net, const uint16_t *x, int64_t stride, int64_t rows, Tape *tape) {
-    float *scratch = floats(2 * widest(net)), *y = floats(rows * net->outputs);
-    tape->x = x;
-    tape->stride = stride;
-    int64_t n = 0;
-    for (int64_t i = 0; i < net->layers; i++) {
-        const Layer *layer = net->layer + i;
-        n = layer->outer;
-        tape->z[i] = take(rows * n * sizeof **tape->z);
-        tape->out[i] = take(rows * n * sizeof **tape->out);
-        tape->mean[i] = floats(rows);
-        tape->rstd[i] = floats(rows);
-        dense_forward(layer->inner, layer->weight, tape->z[i], layer->bias, layer->gamma, layer->beta, x, stride,
-                      layer->from, layer->to, layer->width, (float)layer->eps, rows, n, tape->out[i], tape->mean[i],
-                      tape->rstd[i], scratch);
-        x = tape->out[i];
-        stride = n;
-    }
-    if (net->outputs <= FEW)
-        head_forward_bf16(x, net->weight, net->bias, rows, n, net->outputs, y);
-    else
-        wide_head_forward(x, net->weight, net->bias, rows, n, net->outputs, y);
-    return y;
-}
-
-/* Backward pass from dy (count, outputs): the parameters' gradients if `trained`; else the gradient of `columns` inputs
- * from `first`, for the rows of `index`, written to those rows of dx (rows, columns). */
-static void backward(const Network *net, const Tape *tape, const float *dy, int64_t count, int trained,
-                     const int64_t *index, float *dx, int64_t first, int64_t columns) {
-    const int64_t size = count * widest(net);
-    float *scratch = floats(2 * widest(net));
-    uint16_t *here = take(size * sizeof *here), *below = take(size * sizeof *below), *dz = take(size * sizeof *dz);
-    const int64_t top = net->layers - 1;
-    const uint16_t *x = tape->out[top];
-    if (net->outputs <= FEW)
-        head_backward_bf16(dy, x, net->weight, count, net->layer[top].outer, net->outputs, trained, 0, here,
-                           net->dweight, net->dbias, scratch);
-    else
-        wide_head_backward(dy, x, net->weight, count, net->layer[top].outer, net->outputs, trained, 0, here,
-                           net->dweight, net->dbias);
-    for (int64_t i = top; i >= 0; i--) {
-        const Layer *layer = net->layer + i;
-        const int64_t n = layer->inner, m = layer->outer;
-        layer_backward_bf16(here, tape->z[i], layer->bias, layer->gamma, layer->beta, tape->mean[i], tape->rstd[i], index,
-                            count, trained, 0, m, dz, layer->dgamma, layer->dbeta, layer->dbias, scratch);
-        if (trained)
-            weight_gradient(dz, m, i ? tape->out[i - 1] : tape->x, n, i ? n : tape->stride, count, 0, layer->dweight);
-        if (i) {
-            dense_backward(dz, count, m, layer->weight, n, n, here, layer->from, layer->to, layer->width, below);
-            uint16_t *free = here;
-            here = below;
-            below = free;
-        } else if (dx) {
-            dense_backward(dz, count, m, layer->weight + first, n, columns, here, layer->from - first, layer->to,
-                           layer->width, below);
-            for (int64_t r = 0; r < count; r++)
-                for (int64_t j = 0; j < columns; j++) dx[index[r] * columns + j] = widen(below[r * columns + j]);
-        }
-    }
 }
 
 /* Actions tanh(loc + scale * noise) and their log-densities from the policy's output y (rows, 2 axes). If they are
@@ -265,19 +178,129 @@ static float quantile_loss(const float *q, const float *y, int64_t n, float kapp
     return total * scale;
 }
 
-static void critic_gradients(const Job *job, int64_t start, int64_t rows) {
+#define ELEMENT float
+#define LOAD(x) (x)
+#define STORE(x) (x)
+#define NAME(x) x##_fp32
+#include "sac.c"
+#undef ELEMENT
+#undef LOAD
+#undef STORE
+#undef NAME
+
+#ifdef __AVX512BF16__
+#define ELEMENT uint16_t
+#define LOAD(x) widen(x)
+#define STORE(x) narrow(x)
+#define NAME(x) x##_bf16
+#include "sac.c"
+#endif
+#endif
+
+#else
+
+/* Rows of a network's input, with a column of zeros if their number is odd; `last` (rows, axes) follows. */
+static const ELEMENT *NAME(assemble)(const Inputs *inputs, int64_t start, int64_t rows, const float *last, int64_t axes,
+                                int64_t *stride) {
+    int64_t width = last ? axes : 0;
+    for (int64_t i = 0; i < inputs->count; i++) width += inputs->width[i];
+    *stride = width + width % 2;
+    ELEMENT *x = take(rows * *stride * sizeof *x);
+    for (int64_t r = 0; r < rows; r++) {
+        ELEMENT *to = x + r * *stride;
+        to[*stride - 1] = 0;
+        for (int64_t i = 0; i < inputs->count; i++) {
+            const float *from = inputs->part[i] + (start + r) * inputs->width[i];
+            for (int64_t j = 0; j < inputs->width[i]; j++) *to++ = STORE(from[j]);
+        }
+        if (last)
+            for (int64_t j = 0; j < axes; j++) *to++ = STORE(last[r * axes + j]);
+    }
+    return x;
+}
+
+/* What a backward pass needs of a forward pass. */
+typedef struct {
+    const ELEMENT *x;
+    int64_t stride;
+    ELEMENT *z[MOST], *out[MOST];
+    float *mean[MOST], *rstd[MOST];
+} NAME(Tape);
+
+static float *NAME(network_forward)(const Network *net, const ELEMENT *x, int64_t stride, int64_t rows, NAME(Tape) *tape) {
+    float *scratch = floats(2 * widest(net)), *y = floats(rows * net->outputs);
+    tape->x = x;
+    tape->stride = stride;
+    int64_t n = 0;
+    for (int64_t i = 0; i < net->layers; i++) {
+        const Layer *layer = net->layer + i;
+        n = layer->outer;
+        tape->z[i] = take(rows * n * sizeof **tape->z);
+        tape->out[i] = take(rows * n * sizeof **tape->out);
+        tape->mean[i] = floats(rows);
+        tape->rstd[i] = floats(rows);
+        NAME(dense_forward)(layer->inner, layer->weight, tape->z[i], layer->bias, layer->gamma, layer->beta, x, stride,
+                      layer->from, layer->to, layer->width, (float)layer->eps, rows, n, tape->out[i], tape->mean[i],
+                      tape->rstd[i], scratch);
+        x = tape->out[i];
+        stride = n;
+    }
+    if (net->outputs <= FEW)
+        NAME(head_forward)(x, net->weight, net->bias, rows, n, net->outputs, y);
+    else
+        NAME(wide_head_forward)(x, net->weight, net->bias, rows, n, net->outputs, y);
+    return y;
+}
+
+/* Backward pass from dy (count, outputs): the parameters' gradients if `trained`; else the gradient of `columns` inputs
+ * from `first`, for the rows of `index`, written to those rows of dx (rows, columns). */
+static void NAME(network_backward)(const Network *net, const NAME(Tape) *tape, const float *dy, int64_t count, int trained,
+                     const int64_t *index, float *dx, int64_t first, int64_t columns) {
+    const int64_t size = count * widest(net);
+    float *scratch = floats(2 * widest(net));
+    ELEMENT *here = take(size * sizeof *here), *below = take(size * sizeof *below), *dz = take(size * sizeof *dz);
+    const int64_t top = net->layers - 1;
+    const ELEMENT *x = tape->out[top];
+    if (net->outputs <= FEW)
+        NAME(head_backward)(dy, x, net->weight, count, net->layer[top].outer, net->outputs, trained, 0, here,
+                           net->dweight, net->dbias, scratch);
+    else
+        NAME(wide_head_backward)(dy, x, net->weight, count, net->layer[top].outer, net->outputs, trained, 0, here,
+                           net->dweight, net->dbias);
+    for (int64_t i = top; i >= 0; i--) {
+        const Layer *layer = net->layer + i;
+        const int64_t n = layer->inner, m = layer->outer;
+        NAME(layer_backward)(here, tape->z[i], layer->bias, layer->gamma, layer->beta, tape->mean[i], tape->rstd[i], index,
+                            count, trained, 0, m, dz, layer->dgamma, layer->dbeta, layer->dbias, scratch);
+        if (trained)
+            NAME(weight_gradient)(dz, m, i ? tape->out[i - 1] : tape->x, n, i ? n : tape->stride, count, 0, layer->dweight);
+        if (i) {
+            NAME(dense_backward)(dz, count, m, layer->weight, n, n, here, layer->from, layer->to, layer->width, below);
+            ELEMENT *free = here;
+            here = below;
+            below = free;
+        } else if (dx) {
+            NAME(dense_backward)(dz, count, m, (const ELEMENT *)layer->weight + first, n, columns, here, layer->from - first, layer->to,
+                           layer->width, below);
+            for (int64_t r = 0; r < count; r++)
+                for (int64_t j = 0; j < columns; j++) dx[index[r] * columns + j] = LOAD(below[r * columns + j]);
+        }
+    }
+}
+
+static void NAME(critic_gradients)(const Job *job, int64_t start, int64_t rows) {
     const int64_t axes = job->axes, n = job->outputs;
-    Tape tape;
+    NAME(Tape) tape;
     int64_t stride;
     float *y = floats(rows * n), *best = floats(rows), *log_prob = floats(rows), *dq = floats(rows * n);
     Mark before = mark();
-    const uint16_t *x = assemble(&job->next_policy, start, rows, NULL, 0, &stride);
-    const float *output = forward(job->actor, x, stride, rows, &tape);
+    const ELEMENT *x = NAME(assemble)(&job->next_policy, start, rows, NULL, 0, &stride);
+    const float *output = NAME(network_forward)(job->actor, x, stride, rows, &tape);
     const float *action = sample(job, output, job->next_noise + start * axes, rows, log_prob, NULL, NULL);
-    x = assemble(&job->next_critic, start, rows, action, axes, &stride);
+    x = NAME(assemble)(&job->next_critic, start, rows, action, axes, &stride);
     for (int64_t k = 0; k < job->critics; k++) {
         Mark inner = mark();
-        const float *q = forward(job->target + k, x, stride, rows, &tape);
+        const float *q = NAME(network_forward)(job->target + k, x, stride, rows, &tape);
         for (int64_t r = 0; r < rows; r++) {
             const float value = value_of(q + r * n, n);
             if (k && !(value < best[r] || value != value)) continue;
@@ -293,10 +316,10 @@ static void critic_gradients(const Job *job, int64_t start, int64_t rows) {
             y[r * n + j] = job->reward[start + r] + (discount != 0.0f ? discount * (y[r * n + j] - entropy) : 0.0f);
         job->loss[start + r] = job->td_error[start + r] = 0.0f;
     }
-    x = assemble(&job->critic, start, rows, job->taken + start * axes, axes, &stride);
+    x = NAME(assemble)(&job->critic, start, rows, job->taken + start * axes, axes, &stride);
     for (int64_t k = 0; k < job->critics; k++) {
         Mark inner = mark();
-        const float *q = forward(job->own + k, x, stride, rows, &tape), share = 1.0f / (float)job->batch;
+        const float *q = NAME(network_forward)(job->own + k, x, stride, rows, &tape), share = 1.0f / (float)job->batch;
         for (int64_t r = 0; r < rows; r++) {
             const float *here = q + r * n, *wanted = y + r * n;
             const float error = value_of(here, n) - value_of(wanted, n), size = error < 0.0f ? -error : error;
@@ -305,24 +328,24 @@ static void critic_gradients(const Job *job, int64_t start, int64_t rows) {
                                         : squared_loss(here, wanted, n, share, dq + r * n);
             if (size > job->td_error[start + r]) job->td_error[start + r] = size;
         }
-        backward(job->own + k, &tape, dq, rows, 1, NULL, NULL, 0, 0);
+        NAME(network_backward)(job->own + k, &tape, dq, rows, 1, NULL, NULL, 0, 0);
         give_back(inner);
     }
 }
 
-static void policy_gradients(const Job *job, int64_t start, int64_t rows) {
+static void NAME(policy_gradients)(const Job *job, int64_t start, int64_t rows) {
     const int64_t axes = job->axes, n = job->outputs;
     const float share = 1.0f / (float)job->batch, entropy = (float)job->alpha * share;
     const float *noise = job->noise + start * axes;
-    Tape tape, *tapes = take(job->critics * sizeof *tapes);
+    NAME(Tape) tape, *tapes = take(job->critics * sizeof *tapes);
     int64_t stride, critic_stride, *index = take(rows * sizeof *index), *lowest = take(rows * sizeof *lowest);
     float *scale = floats(rows * axes), *slope = floats(rows * axes), *value = job->value + start;
-    const uint16_t *x = assemble(&job->policy, start, rows, NULL, 0, &stride);
-    const float *output = forward(job->actor, x, stride, rows, &tape);
+    const ELEMENT *x = NAME(assemble)(&job->policy, start, rows, NULL, 0, &stride);
+    const float *output = NAME(network_forward)(job->actor, x, stride, rows, &tape);
     const float *action = sample(job, output, noise, rows, job->log_prob + start, scale, slope);
-    x = assemble(&job->critic, start, rows, action, axes, &critic_stride);
+    x = NAME(assemble)(&job->critic, start, rows, action, axes, &critic_stride);
     for (int64_t k = 0; k < job->critics; k++) {
-        const float *q = forward(job->own + k, x, critic_stride, rows, tapes + k);
+        const float *q = NAME(network_forward)(job->own + k, x, critic_stride, rows, tapes + k);
         for (int64_t r = 0; r < rows; r++) {
             const float mean = value_of(q + r * n, n);
             if (k && !(mean < value[r] || mean != mean)) continue;
@@ -338,7 +361,7 @@ static void policy_gradients(const Job *job, int64_t start, int64_t rows) {
         Mark inner = mark();
         for (int64_t r = 0; r < rows; r++)
             if (lowest[r] == k) index[count++] = r;
-        if (count) backward(job->own + k, tapes + k, dq, count, 0, index, by_action, first, axes);
+        if (count) NAME(network_backward)(job->own + k, tapes + k, dq, count, 0, index, by_action, first, axes);
         give_back(inner);
     }
     for (int64_t r = 0; r < rows; r++)
@@ -349,15 +372,15 @@ static void policy_gradients(const Job *job, int64_t start, int64_t rows) {
             dy[r * 2 * axes + j] = by_loc;
             dy[r * 2 * axes + axes + j] = (by_loc * noise[i] - entropy / scale[i]) * slope[i];
         }
-    backward(job->actor, &tape, dy, rows, 1, NULL, NULL, 0, 0);
+    NAME(network_backward)(job->actor, &tape, dy, rows, 1, NULL, NULL, 0, 0);
 }
 
 /* Set the gradients of the critics, the policy or both for rows from `start`, and the results for these rows. */
-void sac_gradients(const Job *job, int64_t start, int64_t rows, int critics, int policy) {
+void NAME(sac_gradients)(const Job *job, int64_t start, int64_t rows, int critics, int policy) {
     FLUSH_TINY
     const Mark before = mark();
-    if (critics) critic_gradients(job, start, rows);
-    if (policy) policy_gradients(job, start, rows);
+    if (critics) NAME(critic_gradients)(job, start, rows);
+    if (policy) NAME(policy_gradients)(job, start, rows);
     give_back(before);
 }
 

@@ -134,7 +134,8 @@ class _MemberSpace:
             self._dw = torch.empty(max(layer.in_features for layer in layers) * widest, dtype=inputs.dtype)
         self._layer_forward, self._layer_backward = kernels.layer_forward, kernels.layer_backward
         even = all(layer.out_features % 2 == 0 for layer in layers)
-        self._own_products = kernels.products if even else None
+        # Torch multiplies float32 matrices as fast.
+        self._own_products = kernels.products if even and inputs.dtype == torch.bfloat16 else None
         # Addresses do not keep tensors alive.
         self._own, self._low, self._buffers, self._grads = member.parameters, member.products, buffers, member.grads
         self._forward_steps: list[tuple[Any, ...]] = []

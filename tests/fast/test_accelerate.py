@@ -207,7 +207,7 @@ def test_a_copy_of_a_loss_goes_its_own_way():
 
 
 def test_an_error_inside_the_update_restores_the_loss(monkeypatch):
-    loss = qr_sac()
+    loss = cat_rac()
     learner = make_learner(loss, True, precision="fp32")
     ordinary = loss._vmap_qnetworkN0
     monkeypatch.setattr(loss, "actor_loss", None)

@@ -14,7 +14,16 @@ from coachable.training import Learner
 from coachable.training.learner import NonFiniteLossError
 from tests.sac_problem import ACT, OBS, WIDTHS, ScaledStyle, cat_rac, make_batch, make_loss, qr_sac
 
-pytestmark = pytest.mark.skipif(load_sac() is None, reason="no C compiler, or no bfloat16 in vector registers")
+PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16}
+
+
+@pytest.fixture(params=PRECISIONS, autouse=True)
+def precision(request, monkeypatch):
+    """The precision of the learners that :func:`accelerated` makes."""
+    if load_sac(PRECISIONS[request.param]) is None:
+        pytest.skip(f"no C compiler, or no vector instructions for {request.param}")
+    monkeypatch.setitem(globals(), "PRECISION", request.param)
+    return request.param
 
 
 def learnt_temperature():
@@ -32,7 +41,7 @@ LOSSES = [make_loss, learnt_temperature, qr_sac, narrow_huber]
 
 def accelerated(build, **options):
     torch.manual_seed(0)
-    learner = Learner(build(), precision="bf16", **options)
+    learner = Learner(build(), precision=PRECISION, **options)
     assert accelerate(learner)
     return learner
 
@@ -124,10 +133,6 @@ def test_what_sac_c_does_not_compute_is_left_to_the_loss_module():
     assert accelerated(lambda: make_loss(loss_function="smooth_l1")).backend._direct is None
     assert accelerated(lambda: make_loss(width=33)).backend._direct is None
     assert accelerated(lambda: make_loss(reduction="sum")).backend._direct is None
-    learner = Learner(make_loss(), precision="fp32")
-    assert accelerate(learner)
-    assert learner.backend._direct is None
-
     class Mine(QRSACLoss):
         pass
 

@@ -112,46 +112,54 @@ def test_small_head(n, rows, dtype):
         torch.testing.assert_close(dbias, add + grad.sum(0), rtol=1e-4, atol=1e-4)
 
 
-products = kernels[torch.bfloat16].products if kernels else None
-needs_products = pytest.mark.skipif(products is None, reason="no bfloat16 products in vector registers")
+@pytest.fixture(params=DTYPES)
+def dtype(request):
+    if not kernels or kernels[request.param].products is None:
+        pytest.skip(f"no products of {request.param} in vector registers")
+    return request.param
 
 
-@needs_products
+@pytest.fixture
+def products(dtype):
+    return kernels[dtype].products
+
+
+TOLERANCES = {torch.bfloat16: {"rtol": 1e-2, "atol": 1e-2}, torch.float32: {"rtol": 1e-4, "atol": 1e-4}}
+
+
 @pytest.mark.parametrize(
     ("rows", "inner", "n"),
     [(1, 2, 1), (7, 33, 70), (13, 109, 128), (64, 128, 200), (1, 1, 17), (3, 17, 255), (257, 255, 1)],
 )
-def test_product_of_the_forward_pass(rows, inner, n):
+def test_product_of_the_forward_pass(rows, inner, n, products, dtype):
     stride = inner + inner % 2
-    x, weight, z, out = (rounded(*shape) for shape in ((rows, stride), (n, inner), (rows, n), (rows, n)))
+    x, weight, z, out = (rounded(*shape, dtype=dtype) for shape in ((rows, stride), (n, inner), (rows, n), (rows, n)))
     x[:, inner:] = 0
     (bias, gamma, beta), (mean, rstd) = (normal(n) for _ in range(3)), (ones(rows) for _ in range(2))
     width, scratch = min(inner, n), ones(n)
     first = [t.data_ptr() for t in (weight, z, bias, gamma, beta, x)]
     last = [t.data_ptr() for t in (out, mean, rstd, scratch)]
     products.dense_forward(inner, *first, stride, 0, 0, width, 1e-5, rows, n, *last)
-    torch.testing.assert_close(z.float(), x[:, :inner].float() @ weight.float().t(), rtol=1e-2, atol=1e-2)
+    torch.testing.assert_close(z.float(), x[:, :inner].float() @ weight.float().t(), **TOLERANCES[dtype])
     expected = F.relu(F.layer_norm(z.float() + bias, (n,), gamma, beta))
     expected[:, :width] += x[:, :width].float()
-    torch.testing.assert_close(out.float(), expected, rtol=1e-2, atol=1e-2)
+    torch.testing.assert_close(out.float(), expected, **TOLERANCES[dtype])
 
 
-@needs_products
-def test_denormal_numbers_count_as_zero():
+def test_denormal_numbers_count_as_zero(products, dtype):
     """They take some processors over a hundred times as long as others."""
-    x, weight, grad = rounded(8, 64), normal(40, 64), slanted(torch.full((8, 40), 1e-39))
-    dx, dweight, dbias = rounded(8, 64), normal(40, 64), normal(40)
+    x, weight, grad = rounded(8, 64, dtype=dtype), normal(40, 64), slanted(torch.full((8, 40), 1e-39))
+    dx, dweight, dbias = rounded(8, 64, dtype=dtype), normal(40, 64), normal(40)
     last = [t.data_ptr() for t in (dx, dweight, dbias)]
     products.wide_head_backward(*[t.data_ptr() for t in (grad, x, weight)], 8, 64, 40, 1, 0, *last)
     assert not any(t.any() for t in (dx, dweight, dbias))
     assert (torch.tensor(1e-39) + 0) > 0, "the processor's mode is as before"
 
 
-@needs_products
-def test_products_leave_the_tiles_to_torch():
+def test_products_leave_the_tiles_to_torch(products, dtype):
     """Where the processor has tiles, torch's products configure them too, some only once per thread."""
     rows, inner, n = 64, 128, 96
-    dz, x, grad = rounded(rows, n), rounded(rows, inner), normal(n, inner)
+    dz, x, grad = rounded(rows, n, dtype=dtype), rounded(rows, inner, dtype=dtype), normal(n, inner)
     expected = dz.float().t() @ x.float()
     before = torch.mm(dz.t(), x)
     products.weight_gradient(dz.data_ptr(), n, x.data_ptr(), inner, inner, rows, 0, grad.data_ptr())
@@ -159,42 +167,41 @@ def test_products_leave_the_tiles_to_torch():
     assert torch.equal(torch.mm(dz.t(), x), before)
 
 
-@needs_products
 @pytest.mark.parametrize(
     ("rows", "inner", "n", "to"),
     [(1, 2, 1, 0), (7, 64, 71, 0), (13, 128, 109, 19), (64, 200, 128, 72), (3, 18, 17, 1), (257, 2, 255, 0)],
 )
-def test_products_of_the_backward_pass(rows, inner, n, to):
+def test_products_of_the_backward_pass(rows, inner, n, to, products, dtype):
     """Gradient of some columns of the input, and of the weight."""
-    dz, weight, grad, x = rounded(rows, inner), rounded(inner, n), rounded(rows, inner), rounded(rows, n)
+    shapes = (rows, inner), (inner, n), (rows, inner), (rows, n)
+    dz, weight, grad, x = (rounded(*shape, dtype=dtype) for shape in shapes)
     width = min(inner - to, n)
     skip = F.pad(grad[:, to : to + width].float(), (0, n - width))
     expected = dz.float() @ weight.float() + skip
     for start in (0, n // 3):
-        below = rounded(rows, n - start)
+        below = rounded(rows, n - start, dtype=dtype)
         place = weight[:, start:].data_ptr(), n, n - start, grad.data_ptr(), -start, to, width, below.data_ptr()
         products.dense_backward(dz.data_ptr(), rows, inner, *place)
-        torch.testing.assert_close(below.float(), expected[:, start:], rtol=1e-2, atol=1e-2)
+        torch.testing.assert_close(below.float(), expected[:, start:], **TOLERANCES[dtype])
     into = ones(inner, n)
     for add in (1, 0):
         products.weight_gradient(dz.data_ptr(), inner, x.data_ptr(), n, n, rows, add, into.data_ptr())
         torch.testing.assert_close(into, add + dz.float().t() @ x.float(), rtol=1e-3, atol=1e-3)
 
 
-@needs_products
 @pytest.mark.parametrize(
     ("rows", "n", "outputs"),
     [(1, 1, 5), (7, 70, 13), (33, 512, 42), (13, 128, 255), (3, 17, 17), (257, 255, 5), (257, 1, 255)],
 )
-def test_head_of_many_outputs(rows, n, outputs):
-    x, weight, bias, grad = rounded(rows, n), normal(outputs, n), normal(outputs), normal(rows, outputs)
-    y, dx, dweight, dbias = ones(rows, outputs), rounded(rows, n), ones(outputs, n), ones(outputs)
+def test_head_of_many_outputs(rows, n, outputs, products, dtype):
+    x, weight, bias, grad = rounded(rows, n, dtype=dtype), normal(outputs, n), normal(outputs), normal(rows, outputs)
+    y, dx, dweight, dbias = ones(rows, outputs), rounded(rows, n, dtype=dtype), ones(outputs, n), ones(outputs)
     address, last = [t.data_ptr() for t in (x, weight, bias)], [t.data_ptr() for t in (dx, dweight, dbias)]
     products.wide_head_forward(*address, rows, n, outputs, y.data_ptr())
     torch.testing.assert_close(y, F.linear(x.float(), weight, bias), rtol=1e-4, atol=1e-4)
     for trained, add in ((0, 0), (1, 1), (1, 0)):
         products.wide_head_backward(grad.data_ptr(), *address[:2], rows, n, outputs, trained, add, *last)
-        torch.testing.assert_close(dx.float(), grad @ weight, **DTYPES[torch.bfloat16])
+        torch.testing.assert_close(dx.float(), grad @ weight, **DTYPES[dtype])
         before = add if trained else 1  # the ones from before
         torch.testing.assert_close(dweight, before + trained * grad.t() @ x.float(), rtol=1e-4, atol=1e-4)
         torch.testing.assert_close(dbias, before + trained * grad.sum(0), rtol=1e-4, atol=1e-4)
