@@ -6,7 +6,8 @@
 Every contestant is a process of its own for each number of threads (`learner_workers.py`); they take turns in rounds of
 a few updates. The table gives medians of the wall time over the rounds. Contestants with `resnet` in their names have
 the networks of `coachable`: residual, with layer norm. The others have plain ReLU networks of the same widths, which is
-less work. The gain of `matmul-bf16`, large products of matrices, is what the processor gives a further thread.
+less work. They multiply in bfloat16 where the processor does, else in float32. The gain of `matmul-bf16` or
+`matmul-fp32`, large products of matrices, is what the processor gives a further thread.
 """
 
 import argparse
@@ -19,11 +20,14 @@ from contest import Worker, measure, processor
 from learner_work import WIDTH, flops_per_update
 from learner_workers import MATMUL_FLOPS, PEERS, WORKERS
 
-OURS, YARDSTICK = "coachable-bf16", "matmul-bf16"
+from coachable.training.precision import supports_bf16
+
+PRECISION = "bf16" if supports_bf16("cpu") else "fp32"
+OURS, YARDSTICK = f"coachable-{PRECISION}", f"matmul-{PRECISION}"
 DEFAULT = (
     OURS,
-    "single-file-resnet-bf16",
-    "single-file-bf16",
+    f"single-file-resnet-{PRECISION}",
+    f"single-file-{PRECISION}",
     "torchrl-resnet",
     "torchrl",
     "sb3",
