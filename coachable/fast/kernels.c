@@ -219,14 +219,18 @@ static void pack_transposed_fp32(const float *matrix, int64_t n, int64_t inner, 
 
 /* Right factor from a matrix (inner, n) with rows `stride` apart. */
 static void pack_fp32(const float *matrix, int64_t inner, int64_t n, int64_t stride, float *packed) {
-    for (int64_t j = 0; j < n; j += BLOCK) {
-        const int64_t columns = smaller(BLOCK, n - j);
-        for (int64_t k = 0; k < inner; k++) {
-            float *to = packed + j * inner + k * BLOCK;
-            memcpy(to, matrix + k * stride + j, columns * sizeof *to);
-            memset(to + columns, 0, (BLOCK - columns) * sizeof *to);
+    for (int64_t some = 0; some < inner; some += 8) /* so that rows are read in a piece */
+        for (int64_t j = 0; j < n; j += BLOCK) {
+            const int64_t columns = smaller(BLOCK, n - j);
+            for (int64_t k = some; k < smaller(some + 8, inner); k++) {
+                float *to = packed + j * inner + k * BLOCK;
+                const float *from = matrix + k * stride + j;
+                if (columns == BLOCK)
+                    memcpy(to, from, BLOCK * sizeof *to);
+                else
+                    for (int64_t c = 0; c < BLOCK; c++) to[c] = c < columns ? from[c] : 0.0f;
+            }
         }
-    }
 }
 #endif
 
