@@ -17,15 +17,6 @@ from tests.sac_problem import ACT, OBS, WIDTHS, ScaledStyle, cat_rac, make_batch
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16}
 
 
-@pytest.fixture(params=PRECISIONS, autouse=True)
-def precision(request, monkeypatch):
-    """The precision of the learners that :func:`accelerated` makes."""
-    if load_sac(PRECISIONS[request.param]) is None:
-        pytest.skip(f"no C compiler, or no vector instructions for {request.param}")
-    monkeypatch.setitem(globals(), "PRECISION", request.param)
-    return request.param
-
-
 def learnt_temperature():
     return make_loss(fixed_alpha=False, target_entropy=-3.0)
 
@@ -39,11 +30,19 @@ def narrow_huber():
 LOSSES = [make_loss, learnt_temperature, qr_sac, narrow_huber]
 
 
-def accelerated(build, **options):
-    torch.manual_seed(0)
-    learner = Learner(build(), precision=PRECISION, **options)
-    assert accelerate(learner)
-    return learner
+@pytest.fixture(params=PRECISIONS)
+def accelerated(request):
+    """Makes accelerated learners of one precision."""
+    if load_sac(PRECISIONS[request.param]) is None:
+        pytest.skip(f"no C compiler, or no vector instructions for {request.param}")
+
+    def make(build, **options):
+        torch.manual_seed(0)
+        learner = Learner(build(), precision=request.param, **options)
+        assert accelerate(learner)
+        return learner
+
+    return make
 
 
 def plain(learner):
@@ -64,7 +63,7 @@ def threads(request):
 @pytest.mark.parametrize("shape", [(96,), (35,), (16, 3), (1,)])
 @pytest.mark.parametrize("order", ["simultaneous", "policy_first"])
 @pytest.mark.parametrize("build", LOSSES)
-def test_updates_equal_those_of_the_loss_module(build, order, shape, threads):
+def test_updates_equal_those_of_the_loss_module(build, order, shape, threads, accelerated):
     """Metrics, TD errors, parameters and targets after two updates, from the same random numbers."""
     ours, theirs = accelerated(build, update_order=order), plain(accelerated(build, update_order=order))
     for seed in range(2):
@@ -84,7 +83,7 @@ def test_updates_equal_those_of_the_loss_module(build, order, shape, threads):
         assert differs.float().mean() < 0.01, name
 
 
-def test_sums_over_several_steps_are_discounted_by_their_number():
+def test_sums_over_several_steps_are_discounted_by_their_number(accelerated):
     results = []
     for learner in (accelerated(make_loss), plain(accelerated(make_loss))):
         batch = make_batch(64)
@@ -96,7 +95,7 @@ def test_sums_over_several_steps_are_discounted_by_their_number():
     assert not torch.isclose(accelerated(make_loss).update(make_batch(64))["loss_qvalue"], results[0])
 
 
-def test_networks_without_style():
+def test_networks_without_style(accelerated):
     def build():
         critics = [make_critic(OBS, ACT, None, WIDTHS) for _ in range(2)]
         loss = make_loss()
@@ -109,7 +108,7 @@ def test_networks_without_style():
     torch.testing.assert_close(*results, rtol=1e-4, atol=1e-5)
 
 
-def test_the_value_of_a_terminal_state_does_not_count():
+def test_the_value_of_a_terminal_state_does_not_count(accelerated):
     learner = accelerated(make_loss)
     batch = make_batch(32)
     batch["next", "terminated"][:] = True
@@ -120,7 +119,7 @@ def test_the_value_of_a_terminal_state_does_not_count():
 
 
 @pytest.mark.parametrize("network", ["actor_network_params", "qvalue_network_params"])
-def test_numbers_that_are_not_finite_are_noticed(network):
+def test_numbers_that_are_not_finite_are_noticed(network, accelerated):
     learner = accelerated(make_loss)
     with torch.no_grad():
         next(iter(getattr(learner.loss_module, network).values(True, True))).fill_(math.nan)
@@ -128,11 +127,12 @@ def test_numbers_that_are_not_finite_are_noticed(network):
         learner.update(make_batch(32))
 
 
-def test_what_sac_c_does_not_compute_is_left_to_the_loss_module():
+def test_what_sac_c_does_not_compute_is_left_to_the_loss_module(accelerated):
     assert accelerated(cat_rac).backend._direct is None
     assert accelerated(lambda: make_loss(loss_function="smooth_l1")).backend._direct is None
     assert accelerated(lambda: make_loss(width=33)).backend._direct is None
     assert accelerated(lambda: make_loss(reduction="sum")).backend._direct is None
+
     class Mine(QRSACLoss):
         pass
 
@@ -144,7 +144,7 @@ def test_what_sac_c_does_not_compute_is_left_to_the_loss_module():
     )
 
 
-def test_weighted_batches_are_left_to_the_loss_module():
+def test_weighted_batches_are_left_to_the_loss_module(accelerated):
     results = []
     for learner in (accelerated(make_loss), plain(accelerated(make_loss))):
         batch = make_batch(32)
@@ -154,7 +154,7 @@ def test_weighted_batches_are_left_to_the_loss_module():
     torch.testing.assert_close(*results, rtol=0, atol=0)
 
 
-def test_a_loss_whose_parameters_moved_is_followed():
+def test_a_loss_whose_parameters_moved_is_followed(accelerated):
     ours, theirs = accelerated(make_loss), plain(accelerated(make_loss))
     for learner in (ours, theirs):
         learner.loss_module.share_memory()
