@@ -142,9 +142,10 @@ def is_trained(parameter: Parameter, value: float | str) -> bool:
     """
     if isinstance(parameter, Choice):
         return value in parameter.options
-    return not isinstance(value, str) and bool(
-        np.float32(parameter.low) <= np.float32(value) <= np.float32(parameter.high)
-    )
+    with np.errstate(over="ignore"):  # a larger number becomes infinite, which no range holds
+        return not isinstance(value, str) and bool(
+            np.float32(parameter.low) <= np.float32(value) <= np.float32(parameter.high)
+        )
 
 
 def _is_count(value: Any) -> bool:

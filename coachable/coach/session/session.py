@@ -21,7 +21,7 @@ from coachable.coach.session.readout import MeasuredWindow, StyleReport
 from coachable.coach.session.recording import Recording, check_seed, is_trained
 from coachable.coach.session.timeline import Timeline
 from coachable.domain import Domain
-from coachable.styles import StyleSpace, Weight
+from coachable.styles import Choice, StyleSpace, Weight
 from coachable.training.weights import domain_of, load_policy
 
 
@@ -376,7 +376,8 @@ class CoachSession:
 
     def _request(self, theta: Tensor, asked: Mapping[str, Any]) -> None:
         """Put a style in force and record it; `asked` are the requested values before clamping."""
-        values = {**self._outside, **asked}.items()
+        numbers = {name: float(v) for name, v in asked.items() if not isinstance(self.space[name], Choice)}
+        values = {**self._outside, **numbers}.items()
         self._outside = {name: value for name, value in values if not is_trained(self.space[name], value)}
         before, self._theta = self.style, theta
         changed = {name: value for name, value in self.style.items() if value != before[name]}

@@ -1,6 +1,7 @@
 """The coaching session: when requests act, and what is measured."""
 
 import math
+from contextlib import nullcontext
 from dataclasses import replace
 
 import pytest
@@ -36,6 +37,14 @@ def test_outside_the_trained_range_is_clamped_with_a_warning_and_flagged(session
     assert session.report().outside == {"target": 1.5}
     session.set(target=0.8)
     assert session.report().outside == {}
+
+
+@pytest.mark.parametrize(("value", "outside"), [("0.5", {}), ("1.5", {"target": 1.5}), (1e300, {"target": 1e300})])
+def test_what_lies_outside_are_numbers(session, value, outside):
+    """A number may be given as text, and need not fit into a float32."""
+    with pytest.warns(StyleRangeWarning) if outside else nullcontext():
+        session.set(target=value)
+    assert session.report().outside == outside
 
 
 def test_a_drawn_style_is_within_the_trained_range(session):
