@@ -295,7 +295,7 @@ def _verify(options: argparse.Namespace) -> int:
 
 
 def _coach(options: argparse.Namespace) -> int:
-    require_agent(options.source)  # before the page's address is announced
+    require_agent(options.source)  # before torch is imported
     from coachable.coach.page.command import serve
 
     serve(say=lambda text: print(text, flush=True), **_arguments(options))

@@ -101,11 +101,11 @@ def test_wrong_arguments_are_named(arguments, message, capsys, tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("source", ["walker", "README.md", ""])
-def test_no_page_is_announced_for_what_is_no_agent(source, capsys, monkeypatch, tmp_path):
-    def announced(*_, **__):
-        raise AssertionError("the page was announced")
+def test_no_page_is_served_for_what_is_no_agent(source, capsys, monkeypatch, tmp_path):
+    def served(*_, **__):
+        raise AssertionError("the page was served")
 
-    monkeypatch.setattr("coachable.coach.page.command.serve", announced)
+    monkeypatch.setattr("coachable.coach.page.command.serve", served)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "README.md").write_text("# Not an agent\n")
     assert main(["coach", source]) == 2

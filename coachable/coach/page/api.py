@@ -158,8 +158,9 @@ class CoachApi:
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore", StyleRangeWarning)  # the answer has what lies outside
                     change(session)
-                outside = {"outside": session.report().outside}
-                answer = {"style": session.style, "controls": session.controls, **outside}
+                report = session.report()
+                self.publish(report)  # so that a state which is read after the answer has the change
+                answer = {"style": session.style, "controls": session.controls, "outside": report.outside}
             except ValueError as error:
                 answer = {"error": str(error)}
             with contextlib.suppress(RuntimeError):  # the server has stopped meanwhile

@@ -65,7 +65,7 @@ def serve(
 
     Args:
         source: The agent, see `CoachSession.open`.
-        say: Called with the address of the page.
+        say: Called with the address of the page as soon as the agent acts, and at the end.
         port: First port to try.
         host: Address to listen on.
         seed: Seed of the session.
@@ -81,16 +81,10 @@ def serve(
     from coachable.coach.page.server import make_server, page_address
 
     with suppress(KeyboardInterrupt), ExitStack() as closing:
-        # The server starts first, so that you can open the page while the agent is being loaded.
+        # The server starts first, so that an address at which it cannot listen is reported at once.
         server = make_server(host, port)
         closing.callback(_quietly, server.stop)
         loading = server.gui.add_markdown("Loading the agent ...")
-        found = server.get_port()
-        address = page_address(host, found)
-        note = "" if found == port else f" (port {port} is in use)"
-        say(f"coaching {source} at {address}{note}; Ctrl-C ends it")
-        if open_browser:
-            webbrowser.open(address)
 
         from coachable.coach.page.coach_page import CoachPage
         from coachable.coach.session.session import CoachSession
@@ -101,6 +95,12 @@ def serve(
         closing.callback(page.stop)
         loading.remove()
         page.start()
+        found = server.get_port()
+        address = page_address(host, found)
+        note = "" if port in (0, found) else f" (port {port} is in use)"
+        say(f"coaching {source} at {address}{note}; Ctrl-C ends it")
+        if open_browser:
+            webbrowser.open(address)
         wait()
     say("ended")
 

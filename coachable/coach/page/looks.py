@@ -64,11 +64,14 @@ body { font-family: FONT !important; }
 .links a { color: #0a7aba; }
 .legend div { display: flex; gap: 8px; align-items: center; }
 .legend i { flex: none; width: 14px; height: 14px; border-radius: 3px; border: 1px solid rgba(128, 128, 128, 0.7); }
-@media (max-width: 576px) {
-  .gauges { top: 6px; bottom: auto; left: 6px; font-size: 10px; line-height: 1.35; min-width: 0; padding: 3px 6px;
-    background: INK8c; }
-  .gauge b { flex-basis: 10em; }
+@media (max-width: 720px) {
+  .gauges { left: 6px; font-size: 10px; line-height: 1.35; min-width: 0; padding: 3px 6px;
+    box-sizing: border-box; max-width: calc(100vw - 400px); overflow: hidden; }
+  .gauge b { flex: 0 1 10em; overflow: hidden; text-overflow: ellipsis; }
   .gauge span { min-width: 7em; }
+}
+@media (max-width: 576px) {
+  .gauges { top: 6px; bottom: auto; max-width: none; background: INK8c; }
   .gauge:nth-child(n + 5) { display: none; }
   [style*="width: 20em"] { width: 100% !important; }
   .map { left: auto; right: 6px; top: 6px; width: 90px; height: 90px; }

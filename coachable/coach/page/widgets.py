@@ -110,7 +110,8 @@ class MeasuredText:
             measures: Names of the parameter's measures.
         """
         name, values = self.parameter.name, report.measured
-        shown = [f"{self._name(m)}**{self._value(m, values[m])}**" for m in measures if m in values]
+        measured = sorted((m for m in measures if m in values), key=lambda m: m != name)  # the nameless one comes first
+        shown = [f"{self._name(m)}**{self._value(m, values[m])}**" for m in measured]
         found = "no measure of its own" if report.seconds and not measures else "not measured yet"
         if shown:
             found = f"measured {', '.join(shown)} in {report.seconds:.1f} s"

@@ -12,7 +12,7 @@ from coachable.styles import Choice, StyleSpace
 __all__ = ["Binding", "make_bindings"]
 
 # Pairs of neighbouring keys, for less and more, and axes and pairs of buttons of the standard gamepad of browsers.
-_KEYS = ("qw", "as", "zx", "er", "df", "cv", "ty", "gh", "bn", "ui", "jk", "op")
+_KEYS = ("qw", "as", "zx", "er", "df", "cv", "ty", "gh", "bn", "ui", "jk", "op", "lm", "12", "34", "56", "78", "90")
 _AXES = (0, 1, 2, 3)
 _BUTTONS = ((4, 5), (6, 7), (14, 15), (13, 12), (0, 3), (2, 1))
 _STEP = 0.1  # of the range, per key press

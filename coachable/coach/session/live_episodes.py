@@ -14,16 +14,13 @@ from coachable.styles import StyleSpace
 from coachable.training.collection import simulation_env
 from coachable.training.rollout import Rollout
 
-TIME_IS_UP = "time is up"
-
 
 class LiveEpisodes(Rollout):
-    """Rollout in one environment that counts how episodes end.
+    """Rollout in one environment without a time limit that counts how episodes end.
 
     Args:
         domain: Domain that makes the environment.
         space: The agent's style space.
-        endless: Whether to continue when the domain's time limit is reached.
         terminated: Reason to report for a terminated episode, such as "fell".
 
     Attributes:
@@ -34,8 +31,8 @@ class LiveEpisodes(Rollout):
         endings: Number of episodes that ended, by reason.
     """
 
-    def __init__(self, domain: Domain, space: StyleSpace, *, endless: bool, terminated: str) -> None:
-        self.endless, self._terminated = endless, terminated
+    def __init__(self, domain: Domain, space: StyleSpace, *, terminated: str) -> None:
+        self._terminated = terminated
         self.ended: str | None = None
         self.number = self.steps = 0
         self.endings: Counter[str] = Counter()
@@ -71,12 +68,8 @@ class LiveEpisodes(Rollout):
         """
         transition = super().step(policy, style[None])
         self.steps += 1
-        after = transition.get("next")
-        if after.get("terminated").any():
+        if transition["next", "terminated"].any():
             self.ended = self._terminated
-        elif after.get("done").any() and not self.endless:
-            self.ended = TIME_IS_UP
-        if self.ended is not None:
             self.endings[self.ended] += 1
         return transition
 

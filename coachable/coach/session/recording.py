@@ -17,7 +17,7 @@ from torch import Tensor
 from coachable.domain import Control, Push
 from coachable.styles import Choice, Parameter, StyleSpace
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 
 class ReplayMismatch(RuntimeError):
@@ -34,7 +34,6 @@ class Recording:
         seed: Seed of the initial states.
         style: Request at the start, by parameter name.
         controls: Live controls at the start, by name.
-        endless: Whether time limits were ignored.
         events: `{"step": k, ...}` in order, each applied before step k (from 0), with one of `style` (changed
             parameters), `controls` (changed controls), `push` (forward and left) and `reset` (true).
         steps: Number of steps.
@@ -46,7 +45,6 @@ class Recording:
     seed: int
     style: dict[str, float | str]
     controls: dict[str, float]
-    endless: bool = True
     events: list[dict[str, Any]] = field(default_factory=list)
     steps: int = 0
     checks: list[tuple[int, int]] = field(default_factory=list)
@@ -144,9 +142,10 @@ def is_trained(parameter: Parameter, value: float | str) -> bool:
     """
     if isinstance(parameter, Choice):
         return value in parameter.options
-    return not isinstance(value, str) and bool(
-        np.float32(parameter.low) <= np.float32(value) <= np.float32(parameter.high)
-    )
+    with np.errstate(over="ignore"):  # a larger number becomes infinite, which no range holds
+        return not isinstance(value, str) and bool(
+            np.float32(parameter.low) <= np.float32(value) <= np.float32(parameter.high)
+        )
 
 
 def _is_count(value: Any) -> bool:
@@ -185,7 +184,6 @@ _SCHEMA = {
     **_SHARED,
     **dict.fromkeys(("domain", "source"), lambda value: isinstance(value, str)),
     **dict.fromkeys(("seed", "steps"), _is_count),
-    "endless": lambda value: isinstance(value, bool),
     "events": _are_events,
     "checks": _are_checks,
 }

@@ -21,7 +21,7 @@ from coachable.coach.session.readout import MeasuredWindow, StyleReport
 from coachable.coach.session.recording import Recording, check_seed, is_trained
 from coachable.coach.session.timeline import Timeline
 from coachable.domain import Domain
-from coachable.styles import StyleSpace, Weight
+from coachable.styles import Choice, StyleSpace, Weight
 from coachable.training.weights import domain_of, load_policy
 
 
@@ -30,7 +30,7 @@ class CoachSession:
 
     A request applies from the next observation on: the policy reads the style given to `set` in the following `step`.
     While `hold` is true, the request stays in force when an episode begins; otherwise each episode draws a style as in
-    training. After an episode has ended, the next `step` begins a new one.
+    training. After an episode has ended, the next `step` begins a new one; the domain's time limit is ignored.
 
     Args:
         policy: Policy that reads `observation` and `style` and writes `action`.
@@ -40,7 +40,6 @@ class CoachSession:
         seed: Seed of the initial states and drawn styles.
         style: First request, by parameter name; other parameters have the space's default.
         strict: Whether to raise for a request outside the trained range instead of clamping it with a warning.
-        endless: Whether to continue when the domain's time limit is reached.
         window: Length of the measured window [s]; by default the domain's.
 
     Attributes:
@@ -68,7 +67,6 @@ class CoachSession:
         seed: int = 0,
         style: Mapping[str, float | str] | None = None,
         strict: bool = False,
-        endless: bool = True,
         window: float | None = None,
     ) -> None:
         self.policy, self.space, self.domain, self.source = policy, space, domain, source
@@ -76,7 +74,7 @@ class CoachSession:
         words = fitting(domain.words, parameters)
         self.strict, self.hold = strict, True
         self.window = window = domain.window if window is None else window
-        self._episodes = LiveEpisodes(domain, space, endless=endless, terminated=words.terminated)
+        self._episodes = LiveEpisodes(domain, space, terminated=words.terminated)
         self.presets: dict[str, dict[str, Any]] = {"default": space.describe(space.default)}
         self.presets |= {name: dict(style) for name, style in words.presets.items()}
         self._influences = Influences(domain)
@@ -234,7 +232,7 @@ class CoachSession:
             return
         check_seed(seed)
         self._influences.values |= self._influences.wanted
-        start = Recording(self.domain.name, self.source, seed, self.style, self.controls, self._episodes.endless)
+        start = Recording(self.domain.name, self.source, seed, self.style, self.controls)
         self._timeline = Timeline(start)
         self._steps_at_request, self._complied_at, self.seed = 0, None, seed
         self._generator = torch.Generator().manual_seed(seed)
@@ -348,7 +346,6 @@ class CoachSession:
         recording.check(self.domain.name, self.space, self._influences.controls, self._influences.push)
         self._theta, self._outside = self.space.make(strict=True, **recording.style), {}
         self._influences.change(recording.controls, settled=True)
-        self._episodes.endless = recording.endless
         self.reset(recording.seed)
         self._timeline.repeat(recording)
 
@@ -379,7 +376,8 @@ class CoachSession:
 
     def _request(self, theta: Tensor, asked: Mapping[str, Any]) -> None:
         """Put a style in force and record it; `asked` are the requested values before clamping."""
-        values = {**self._outside, **asked}.items()
+        numbers = {name: float(v) for name, v in asked.items() if not isinstance(self.space[name], Choice)}
+        values = {**self._outside, **numbers}.items()
         self._outside = {name: value for name, value in values if not is_trained(self.space[name], value)}
         before, self._theta = self.style, theta
         changed = {name: value for name, value in self.style.items() if value != before[name]}

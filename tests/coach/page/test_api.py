@@ -130,6 +130,13 @@ def test_set_is_clamped_as_the_session_does(echo):
         assert ask(connection, do="set", style={"target": 0, "mood": "calm"})["outside"] == {}
 
 
+def test_a_state_that_is_read_after_the_answer_has_the_change(echo):
+    with connect(echo) as connection:
+        for target in (0.1, 0.2, 0.3, 0.4, 0.5):
+            style = ask(connection, do="set", style={"target": target})["style"]
+            assert ask(connection, do="read")["state"]["requested"] == style
+
+
 @pytest.mark.parametrize(
     ("message", "error"),
     [

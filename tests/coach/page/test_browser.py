@@ -232,6 +232,17 @@ def test_charts_are_not_blank(visit, echo_page):
         tab.context.close()
 
 
+@pytest.mark.parametrize("width", [400, 600, 720, 900])
+def test_the_gauges_do_not_cover_the_panel(visit, page, width):
+    if page.session.domain.name != "humanoid":
+        pytest.skip("pictures have no gauges")
+    tab = visit(page, width=width)
+    tab.locator(".gauge").first.wait_for()
+    place = "selector => document.querySelector(selector).getBoundingClientRect().toJSON()"
+    gauges, panel = tab.evaluate(place, ".gauges"), tab.evaluate(place, "[role=tab]")
+    assert gauges["right"] <= panel["left"] or gauges["bottom"] <= panel["top"]
+
+
 def test_in_a_narrow_window_the_agent_is_above_the_panel(visit, page):
     if page.session.domain.name != "humanoid":
         pytest.skip("pictures are tested without a browser")

@@ -1,7 +1,10 @@
 """`coachable coach` on the command line."""
 
+import json
+import re
 import socket
 import sys
+import urllib.request
 
 import pytest
 
@@ -18,8 +21,23 @@ def test_a_missing_agent_is_named_without_a_traceback(capsys, tmp_path, monkeypa
     (tmp_path / "empty").mkdir()
     assert main(["coach", "empty", "--port", "18280"]) == 2
     output = capsys.readouterr()
-    assert "coaching empty at http://127.0.0.1:18280" in output.out
+    assert output.out == ""
     assert "coachable coach: no checkpoint at empty" in output.err
+
+
+def test_the_printed_address_answers(monkeypatch):
+    pytest.importorskip("viser")
+    monkeypatch.setattr(CoachSession, "open", lambda *_, **__: echo_session())
+    monkeypatch.setattr(command, "wait", lambda: None)
+    answers = []
+
+    def say(text):
+        if address := re.search(r"http://[\d.:]+", text):
+            with urllib.request.urlopen(f"{address[0]}/api/space") as answer:
+                answers.append((json.load(answer)["domain"], "in use" in text))
+
+    command.serve("echo", say=say, port=0)
+    assert answers == [("echo", False)]
 
 
 def test_a_missing_extra_is_named(monkeypatch, capsys):

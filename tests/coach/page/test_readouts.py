@@ -60,6 +60,12 @@ def test_what_is_shown_is_measured_or_says_that_it_is_not(page):
     assert "not measured yet" in page.measured["target"].handle.content, "0.5 m belongs to the request before"
 
 
+def test_the_measure_without_a_name_comes_first(page):
+    text = page.measured["target"]
+    text.update(report(measured={"target": 0.5, "pace": 0.25}), ["pace", "target"])
+    assert text.handle.content.startswith("measured **0.5 m**, pace **0.25 m/step** in 2.0 s")
+
+
 def report(**changes):
     """Of a request that was met, with changes."""
     values = {

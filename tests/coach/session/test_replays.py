@@ -95,7 +95,8 @@ def test_a_replay_with_other_weights_is_noticed(session):
 def test_bad_recordings(session):
     good = json.loads(session.recording().to_json())
     for change, message in [
-        ({"version": 2}, "schema version 2"),
+        ({"version": 1, "endless": True}, "schema version 1: this release reads version 2"),
+        ({"endless": True}, "unknown entries"),
         ({"colour": 1}, "unknown entries"),
         ({"domain": "racing"}, "belongs to 'racing'"),
         ({"style": {"speed": 1.0}}, "unknown style parameter 'speed'"),
