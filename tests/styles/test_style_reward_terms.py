@@ -27,7 +27,7 @@ from coachable.styles import (
     weighted_sum,
 )
 
-SIGMOIDS = ["gaussian", "hyperbolic", "long_tail", "reciprocal", "cosine", "linear", "quadratic", "tanh_squared"]
+SIGMOIDS = ["linear", "long_tail"]
 
 
 @pytest.mark.parametrize("sigmoid", SIGMOIDS)
@@ -39,18 +39,16 @@ def test_tolerance_equals_dm_control(sigmoid, bounds, dtype, atol):
     x = torch.cat([torch.linspace(-5, 5, 401, dtype=dtype), torch.tensor([-0.5, 0.25, 0.7, 1e3, -1e3], dtype=dtype)])
     for margin in (0.0, 0.05, 0.5, 3.0):
         for value in (0.1, 0.5, 0.95):
-            with np.errstate(over="ignore"):  # dm_control's cosh, far from the bounds
-                expected = rewards.tolerance(x.numpy(), bounds, margin, sigmoid, value)
+            expected = rewards.tolerance(x.numpy(), bounds, margin, sigmoid, value)
             got = tolerance(x, *bounds, margin, sigmoid, value)
             assert got.dtype == dtype
             np.testing.assert_allclose(got.numpy(), expected, rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize("sigmoid", ["cosine", "linear", "quadratic"])
-def test_tolerance_may_reach_zero_at_the_margin(sigmoid):
+def test_tolerance_may_reach_zero_at_the_margin():
     x = torch.linspace(-2, 2, 81, dtype=torch.float64)
-    expected = rewards.tolerance(x.numpy(), (-0.5, 0.5), 0.6, sigmoid, 0.0)
-    np.testing.assert_allclose(tolerance(x, -0.5, 0.5, 0.6, sigmoid, 0.0).numpy(), expected, rtol=0, atol=1e-12)
+    expected = rewards.tolerance(x.numpy(), (-0.5, 0.5), 0.6, "linear", 0.0)
+    np.testing.assert_allclose(tolerance(x, -0.5, 0.5, 0.6, "linear", 0.0).numpy(), expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("sigmoid", SIGMOIDS)
@@ -93,9 +91,9 @@ def test_tolerance_has_the_same_bits_in_every_layout(sigmoid):
     [
         ({"lower": 1.0, "upper": 0.0}, "expected lower <= upper"),
         ({"margin": -1.0}, "margin = -1.0"),
-        ({"margin": 1.0, "sigmoid": "step"}, "unknown sigmoid 'step'.*'long_tail'"),
+        ({"margin": 1.0, "sigmoid": "step"}, "unknown sigmoid 'step': expected one of linear, long_tail"),
         ({"margin": 1.0, "value_at_margin": 1.0}, "value_at_margin is 1.0"),
-        ({"margin": 1.0, "value_at_margin": 0.0}, "value_at_margin is 0.0 for sigmoid 'gaussian'"),
+        ({"margin": 1.0, "value_at_margin": 0.0}, "value_at_margin is 0.0 for sigmoid 'long_tail'"),
     ],
 )
 def test_tolerance_rejects(arguments, message):
