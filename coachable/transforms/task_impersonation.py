@@ -1,7 +1,6 @@
 """`TaskImpersonation`, which relabels sampled transitions with further styles (paper, Task Impersonation)."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -113,9 +112,7 @@ class TaskImpersonation(Transform):
             rows = (table == number).nonzero(as_tuple=True)
             drawn[(*rows, 0)] = sampler.sample((len(rows[0]),), self.generator, stored.device)
         dim = len(shape)
-        features = features.unsqueeze(dim)
-        features = features.expand(*shape, self.n, *features.shape[dim + 1 :])
-        style_reward = self.style_reward(features, drawn)
+        style_reward = self.style_reward(features.unsqueeze(dim).expand(*shape, self.n, -1), drawn)
 
         columns = self.n + 1
         out = tensordict.apply(
@@ -149,7 +146,7 @@ class TaskImpersonation(Transform):
                 "features (n_steps, discounted_keys)"
             )
 
-    def _entries(self, tensordict: TensorDictBase) -> tuple[Tensor, Any, Tensor, Tensor]:
+    def _entries(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         wanted = (STYLE, ("next", STYLE_FEATURES), ("next", TASK_REWARD), ("next", "reward"))
         found = [tensordict.get(key, None) for key in wanted]
         missing = [key for key, value in zip(wanted, found, strict=True) if value is None]

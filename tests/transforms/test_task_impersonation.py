@@ -343,21 +343,6 @@ def test_the_loss_is_the_same_for_any_order_of_labels():
     torch.testing.assert_close(loss.mean(), again.mean())
 
 
-def test_nested_features():
-    space = StyleSpace([Weight("a", 0.0, 1.0)])
-    reward = StyleReward(space, {"a": Term(lambda f, s: s["a"] * f["x"].squeeze(-1) + f["y", "z"][..., 1], ("a",))})
-    features = TensorDict({"x": torch.randn(6, 1), "y": {"z": torch.randn(6, 2)}}, [6])
-    one = torch.ones(6, 1)
-    td = TensorDict({"style": one, "next": {"reward": one, "task_reward": one, "style_features": features}}, [6])
-    longer = td.clone()
-    longer["next", "style_features", "y"].auto_batch_size_(2)
-    assert longer["next", "style_features", "y"].batch_size == (6, 2)
-    for batch in (td, td.clone().auto_batch_size_(1), longer):
-        out = TaskImpersonation(reward, n=2)(batch)
-        expected = 1 + out["style"][:, 1:] * features["x"].unsqueeze(1) + features["y", "z"][:, None, 1:]
-        torch.testing.assert_close(out["next", "reward"][:, 1:], expected)
-
-
 def test_style_of_the_next_state_is_added_where_it_is_not_stored():
     td = transitions(8).exclude(("next", "style"), ("next", "style_reward"))
     out = TaskImpersonation(REWARD, n=2)(td)
