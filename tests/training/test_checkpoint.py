@@ -250,6 +250,15 @@ def test_a_file_cannot_choose_what_is_called(make_train, tmp_path):
         load_policy(tmp_path / "harmful.pt")
 
 
+def test_a_policy_with_other_bounds_of_actions_is_refused(make_train, tmp_path):
+    make_train(total_frames=80).run()
+    state = torch.load(find_checkpoint(tmp_path / "run") / "state.pt", weights_only=True)
+    state["network"]["actor"] |= {"low": -2.0, "high": 2.0}
+    torch.save(state, tmp_path / "wide.pt")
+    with pytest.raises(CheckpointError, match=r"a network that cannot be used: .*'low'"):
+        load_policy(tmp_path / "wide.pt")
+
+
 def test_weights_name_no_path_of_the_machine_that_trained(make_train, tmp_path):
     train = make_train(total_frames=120)
     describe, paths = (
