@@ -107,7 +107,7 @@ class RewardMeasures:
         for name, term in self._reward.terms.items():
             if isinstance(term, SetpointTolerance):
                 parameter = self._reward.space[term.parameter]
-                slack = term.half_width + _SLACK * (parameter.high - parameter.low)
+                slack = _SLACK * (parameter.high - parameter.low)
                 limits.append((f"{term.parameter}_error", slack, True))
             elif isinstance(term, ChoiceTolerance):
                 limits.append((f"{name}_reward", _MET, False))

@@ -172,7 +172,7 @@ class WeightedSum(_OfNumbers):
 
 @dataclass(frozen=True)
 class SetpointTolerance(_OfNumbers):
-    """Term that is the `tolerance` of a feature around a set-point: 1 within `half_width` of the requested value.
+    """Term that is the `tolerance` of a feature around a set-point: 1 at the requested value.
 
     Args:
         parameter: Name of the `Setpoint`.
@@ -180,7 +180,6 @@ class SetpointTolerance(_OfNumbers):
         margin: Distance at which the reward is `value_at_margin`, in the same unit.
         sigmoid: Shape of the decline, see `tolerance`.
         value_at_margin: See `tolerance`.
-        half_width: Half width of the interval in which the reward is 1, in the same unit.
         gate: Column of a feature that multiplies the term, such as a "step completed" flag, or None.
     """
 
@@ -189,7 +188,6 @@ class SetpointTolerance(_OfNumbers):
     margin: float
     sigmoid: str = "long_tail"
     value_at_margin: float = 0.1
-    half_width: float = 0.0
     gate: int | None = None
 
     @property
@@ -201,9 +199,7 @@ class SetpointTolerance(_OfNumbers):
         """Return the reward `(...,)`."""
         target = style[self.parameter]
         measured = feature(features, self.key)
-        half = self.half_width
-        lower, upper = (target - half, target + half) if half else (target, target)
-        value = tolerance(measured, lower, upper, self.margin, self.sigmoid, self.value_at_margin)
+        value = tolerance(measured, target, target, self.margin, self.sigmoid, self.value_at_margin)
         return value if self.gate is None else value * feature(features, self.gate).to(value.dtype)
 
 
