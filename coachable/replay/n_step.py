@@ -89,21 +89,14 @@ class NStep:
         row = np.arange(len(steps))
         last = cut.last[cut.number]
         full = row + self.n_steps - 1
-        # A piece is closed by its own end, by another episode of the same stream, or by having been abandoned.
-        followed = np.zeros(len(cut.last), dtype=bool)
-        followed[:-1] = cut.stream[cut.last[:-1]] == cut.stream[cut.start[1:]]
+        # A piece is closed by its own end, or by having been abandoned.
         abandoned = steps.arrival[cut.order[cut.last]] < steps.arrival.max() - self.patience
-        closed = cut.ends[cut.last] | followed | abandoned | finish
+        closed = cut.ends[cut.last] | abandoned | finish
         complete = (full <= last) | closed[cut.number]
         last = np.minimum(full, last)
 
-        # Order of completion: by the step that completes a sum. A piece cut by the next episode completes with its
-        # first step.
-        by = cut.order[last]
-        ended_short = (full > last) & ~cut.ends[last]
-        completing = np.where(ended_short & followed[cut.number], cut.order[np.minimum(last + 1, len(row) - 1)], by)
         emitted = np.flatnonzero(complete)
-        emitted = emitted[np.lexsort((emitted, completing[emitted]))]
+        emitted = emitted[np.lexsort((emitted, cut.order[last[emitted]]))]  # by the step that completes the sum
 
         transitions = self._sum(data, cut.order, emitted, last[emitted])
         held = np.sort(cut.order[~complete])

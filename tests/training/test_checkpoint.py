@@ -167,6 +167,17 @@ def test_replay_files_hold_only_what_is_filled(tmp_path):
         read_replay(_buffer(10), tmp_path / "replay")
 
 
+@pytest.mark.parametrize("version", [None, 1, 3])
+def test_records_of_another_version_are_refused(tmp_path, version):
+    replay = _buffer(10)
+    replay.extend(_records(0, 5))
+    write_replay(replay, tmp_path)
+    index = json.loads((tmp_path / "index.json").read_text())
+    (tmp_path / "index.json").write_text(json.dumps({**index, "version": version}))
+    with pytest.raises(CheckpointError, match=f"it has version {version}, expected 2"):
+        read_replay(_buffer(10), tmp_path)
+
+
 def test_generators_are_restored_without_pickle(tmp_path):
     import random
 
