@@ -123,7 +123,8 @@ class NStep:
             total = value[first_row].clone()
             for lag in range(1, self.n_steps):
                 at = torch.from_numpy(order[np.minimum(start + lag, last)]).to(device)
-                _add(total, value[at], self.gamma**lag, count > lag)
+                mask = (count > lag).reshape(-1, *[1] * (total.ndim - 1))
+                total += torch.where(mask, self.gamma**lag * value[at], 0.0)
             out.set(key, total)
         out.set("steps_to_next_obs", count.unsqueeze(-1))
         discount = torch.as_tensor(self.gamma, dtype=torch.float64).pow(count.cpu()).float()
@@ -152,12 +153,3 @@ class NStep:
             self._steps = Steps.from_state_dict(state["steps"])
             data = TensorDict(state["data"], batch_size=[len(self._steps)], device=device)
             self._data = data.apply(torch.clone)  # TensorDict.clone adds 0, which turns -0.0 into 0.0
-
-
-def _add(total: Any, value: Any, factor: float, where: torch.Tensor) -> None:
-    if isinstance(total, TensorDictBase):
-        for key in total.keys(include_nested=True, leaves_only=True):
-            _add(total.get(key), value.get(key), factor, where)
-    else:
-        mask = where.reshape(-1, *[1] * (total.ndim - 1))
-        total += torch.where(mask, factor * value, torch.zeros_like(value))
