@@ -41,7 +41,7 @@ class TaskImpersonation(Transform):
 
     Examples:
         >>> from tensordict import TensorDict
-        >>> from coachable.styles import Weight, WeightedFeature
+        >>> from coachable.styles import StyleSpace, Weight, WeightedFeature
         >>> space = StyleSpace([Weight("fuel", 0.0, 1.0)])
         >>> relabel = TaskImpersonation(StyleReward(space, {"fuel": WeightedFeature("fuel", 0)}), n=2)
         >>> one = torch.ones(8, 1)
