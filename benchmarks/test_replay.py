@@ -84,7 +84,7 @@ def transitions(n: int) -> TensorDict:
 def stratified(prioritized: bool = False, **kwargs) -> EventTableBuffer:
     """20 tables: default, one per style, one for kills."""
     return EventTableBuffer.for_events(
-        StyleEvents.of(SPACE, extra=["kill"]),
+        StyleEvents(SPACE, extra=["kill"]),
         capacity=40_000,
         event_capacity=1_000,
         event_horizon=10,

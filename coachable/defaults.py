@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from itertools import product
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,7 +25,6 @@ from coachable.styles import (
     WeightedFeature,
     WeightedSum,
     feature,
-    scalar_feature,
 )
 
 __all__ = ["EnvPictures", "RewardMeasures", "simulation_of", "steps_per_episode", "style_grid", "time_per_step"]
@@ -66,15 +65,14 @@ class RewardMeasures:
         for name, term in self._reward.terms.items():
             if isinstance(term, SetpointTolerance):
                 target = style[term.parameter]
-                value = scalar_feature(features, term.key, target)
+                value = feature(features, term.key)
                 if term.gate is not None:
-                    value = torch.where(scalar_feature(features, term.gate, target) != 0, value, torch.nan)
+                    value = torch.where(feature(features, term.gate) != 0, value, torch.nan)
                 found |= {term.parameter: value, f"{term.parameter}_error": (value - target).abs()}
             elif isinstance(term, WeightedFeature):
-                found[term.parameter] = scalar_feature(features, term.key, style[term.parameter])
+                found[term.parameter] = feature(features, term.key)
             elif isinstance(term, WeightedSum):
-                values = cast(Tensor, features) if term.key is None else feature(features, term.key)
-                found |= dict(zip(term.parameters, values.unbind(-1), strict=True))
+                found |= dict(zip(term.parameters, feature(features, term.key).unbind(-1), strict=True))
             else:
                 found[f"{name}_reward"] = paid[name]
         return found
@@ -109,7 +107,7 @@ class RewardMeasures:
         for name, term in self._reward.terms.items():
             if isinstance(term, SetpointTolerance):
                 parameter = self._reward.space[term.parameter]
-                slack = term.half_width + _SLACK * (parameter.high - parameter.low)
+                slack = _SLACK * (parameter.high - parameter.low)
                 limits.append((f"{term.parameter}_error", slack, True))
             elif isinstance(term, ChoiceTolerance):
                 limits.append((f"{name}_reward", _MET, False))

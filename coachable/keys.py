@@ -11,7 +11,7 @@ TASK_REWARD = "task_reward"
 """Reward of the task alone, independent of the style, `(..., 1)`."""
 
 STYLE_FEATURES = "style_features"
-"""Inputs of the style terms, independent of the style: one tensor `(..., F)`, or a nested tensordict."""
+"""Inputs of the style terms, independent of the style, `(..., F)`."""
 
 STYLE_REWARD = "style_reward"
 """Style part of the reward, `(..., 1)`; logged only, `reward = task_reward + style_reward`."""

@@ -189,8 +189,10 @@ def test_bad_requests_change_nothing(env):
     np.testing.assert_array_equal(env.reset()[0]["style"], [1, 1, 0])
 
 
-def test_another_sampler(env):
-    env = StyleWrapper(Walk(), style_reward(), moved, sampler=PointMass([0.5, 0, 1]))
+def test_styles_are_drawn_from_the_sampler_of_the_space():
+    reward = style_reward()
+    reward.space = reward.space.with_sampler(PointMass([0.5, 0, 1]))
+    env = StyleWrapper(Walk(), reward, moved)
     np.testing.assert_array_equal(env.reset()[0]["style"], [0.5, 0, 1])
 
 

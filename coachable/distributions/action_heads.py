@@ -103,19 +103,17 @@ class ActionHeads:
         self,
         batch_shape: Sequence[int] = (),
         device: torch.device | str | None = None,
-        dtype: torch.dtype = torch.float32,
     ) -> TensorSpec:
         """Return the action spec `(*batch_shape, action_dim)`: `Bounded` for axes only, else `MixedActionSpec`.
 
         Args:
             batch_shape: Shape before the action's dimension.
             device: Device of the spec.
-            dtype: Dtype of actions.
         """
         shape = torch.Size((*batch_shape, self.action_dim))
         if not self.categorical:
-            return Bounded(-1.0, 1.0, shape=shape, device=device, dtype=dtype)
-        return MixedActionSpec(self, shape, device=device, dtype=dtype)
+            return Bounded(-1.0, 1.0, shape=shape, device=device, dtype=torch.float32)
+        return MixedActionSpec(self, shape, device=device)
 
 
 class MixedActionSpec(TensorSpec):

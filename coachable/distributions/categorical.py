@@ -144,7 +144,7 @@ def exponential_noise(like: Tensor) -> Tensor:
     return torch.empty_like(like).exponential_().clamp_min_(_SMALLEST_EXPONENTIAL)
 
 
-def relaxed_one_hots(pi: Tensor, layout: HeadLayout, noise: Tensor | None = None) -> Tensor:
+def relaxed_one_hots(pi: Tensor, layout: HeadLayout) -> Tensor:
     """Draw Gumbel-softmax samples at temperature 1, differentiable in `pi`.
 
     They are `softmax(log pi + Z)` with Z = -log E, computed as `(pi_i / E_i) / sum_j (pi_j / E_j)`. This form and its
@@ -153,23 +153,20 @@ def relaxed_one_hots(pi: Tensor, layout: HeadLayout, noise: Tensor | None = None
     Args:
         pi: Probabilities (..., layout.total).
         layout: Layout of the heads.
-        noise: Standard exponential numbers (..., layout.total); None draws them.
 
     Returns:
         Relaxed one-hots (..., layout.total); the sum of each head is 1.
     """
-    noise = exponential_noise(pi) if noise is None else noise
-    weights = layout.pad(pi / noise)
+    weights = layout.pad(pi / exponential_noise(pi))
     return layout.concatenate(weights / weights.sum(-1, keepdim=True))
 
 
-def hard_one_hots(pi: Tensor, layout: HeadLayout, noise: Tensor | None = None) -> Tensor:
+def hard_one_hots(pi: Tensor, layout: HeadLayout) -> Tensor:
     """Draw exact samples without gradient: `argmax(log pi + Z)` of each head as one-hots (Gumbel-max).
 
     Args:
         pi: Probabilities (..., layout.total).
         layout: Layout of the heads.
-        noise: Standard exponential numbers (..., layout.total); None draws them.
 
     Returns:
         One-hots (..., layout.total) of the dtype of `pi`.
@@ -179,8 +176,7 @@ def hard_one_hots(pi: Tensor, layout: HeadLayout, noise: Tensor | None = None) -
         [0.0, 1.0, 1.0, 0.0, 0.0]
     """
     pi = pi.detach()
-    noise = exponential_noise(pi) if noise is None else noise
-    return most_likely_one_hots(pi / noise, layout)
+    return most_likely_one_hots(pi / exponential_noise(pi), layout)
 
 
 def most_likely_one_hots(weights: Tensor, layout: HeadLayout) -> Tensor:

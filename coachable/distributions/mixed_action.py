@@ -37,8 +37,6 @@ class MixedAction(Distribution):
         loc: Location of the axes before the tanh (..., heads.axes); None without axes.
         scale: Standard deviation of the axes before the tanh (..., heads.axes); None without axes.
         heads: Components of the action.
-        low: Lower bound of the axes, a number or (axes,).
-        high: Upper bound of the axes.
 
     Example:
         >>> heads = ActionHeads((2,), axes=1)
@@ -56,8 +54,6 @@ class MixedAction(Distribution):
         scale: Tensor | None = None,
         *,
         heads: ActionHeads,
-        low: Tensor | float = -1.0,
-        high: Tensor | float = 1.0,
     ) -> None:
         if (probs is None) != (not heads.categorical) or (loc is None) != (not heads.axes):
             raise ValueError(f"give probs for categorical heads and loc and scale for axes, and only then: {heads}")
@@ -65,8 +61,6 @@ class MixedAction(Distribution):
         self.probs = None if probs is None else at_least_float32(probs)
         self.loc = None if loc is None else at_least_float32(loc)
         self.scale = None if scale is None else at_least_float32(scale)
-        self._unit_box = isinstance(low, (int, float)) and isinstance(high, (int, float)) and (low, high) == (-1, 1)
-        self._low, self._high = low, high
         leading = self.probs if self.probs is not None else self.loc
         assert leading is not None  # ActionHeads has at least one component
         super().__init__(leading.shape[:-1], torch.Size((heads.action_dim,)), validate_args=False)
@@ -75,20 +69,6 @@ class MixedAction(Distribution):
     def has_rsample(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Whether `rsample` is defined, which it is without categorical heads."""
         return not self.heads.categorical
-
-    def _join(self, one_hots: Tensor | None, axes: Tensor | None) -> Tensor:
-        if axes is not None and not self._unit_box:
-            low = torch.as_tensor(self._low, device=axes.device, dtype=axes.dtype)
-            high = torch.as_tensor(self._high, device=axes.device, dtype=axes.dtype)
-            axes = torch.lerp(low.expand_as(axes), high.expand_as(axes), 0.5 * (axes + 1.0))
-        return torch.cat([part for part in (one_hots, axes) if part is not None], -1)
-
-    def _log_volume(self, like: Tensor) -> Tensor | float:
-        """Return the logarithm of the volume of the axes' bounds over that of [-1, 1]^axes."""
-        if self._unit_box:
-            return 0.0
-        half = 0.5 * (torch.as_tensor(self._high) - torch.as_tensor(self._low)).to(like)
-        return half.expand(self.heads.axes).log().sum()
 
     def relaxed_action(self) -> Tensor:
         """Draw a differentiable action (..., action_dim), with Gumbel-softmax one-hots at temperature 1."""
@@ -115,7 +95,7 @@ class MixedAction(Distribution):
         axes = None
         if self.loc is not None and self.scale is not None:
             axes = torch.tanh(self.loc + self.scale * torch.randn_like(self.loc))
-        return self._join(one_hots, axes)
+        return _joined(one_hots, axes)
 
     def _draw_and_score(self, one_hots_of: Callable[[Tensor, HeadLayout], Tensor]) -> tuple[Tensor, Tensor]:
         one_hots, axes = None, None
@@ -125,8 +105,8 @@ class MixedAction(Distribution):
             log_prob = (one_hots * log_probabilities(self.probs)).sum(-1)
         if self.loc is not None and self.scale is not None:
             axes, density = sample_tanh_gaussian(self.loc, self.scale)
-            log_prob = log_prob + density.sum(-1) - self._log_volume(density)
-        return self._join(one_hots, axes), torch.as_tensor(log_prob)
+            log_prob = log_prob + density.sum(-1)
+        return _joined(one_hots, axes), torch.as_tensor(log_prob)
 
     def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Draw hard actions `(*sample_shape, ..., action_dim)` without gradient."""
@@ -172,7 +152,7 @@ class MixedAction(Distribution):
         if not len(sample_shape):
             return self
         parts = (None if p is None else p.expand(*sample_shape, *p.shape) for p in (self.probs, self.loc, self.scale))
-        return MixedAction(*parts, heads=self.heads, low=self._low, high=self._high)
+        return MixedAction(*parts, heads=self.heads)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log-density (...,) of a given action with hard one-hots."""
@@ -181,11 +161,7 @@ class MixedAction(Distribution):
         if self.probs is not None:
             log_prob = (one_hots * log_probabilities(self.probs)).sum(-1)
         if self.loc is not None and self.scale is not None:
-            if not self._unit_box:
-                low = torch.as_tensor(self._low, device=axes.device, dtype=axes.dtype)
-                axes = 2.0 * (axes - low) / (torch.as_tensor(self._high).to(low) - low) - 1.0
-            density = tanh_gaussian_log_prob(axes, self.loc, self.scale)
-            log_prob = log_prob + density.sum(-1) - self._log_volume(density)
+            log_prob = log_prob + tanh_gaussian_log_prob(axes, self.loc, self.scale).sum(-1)
         return torch.as_tensor(log_prob)
 
     def entropy_estimate(self, num_samples: int = 1000, shared_noise: bool = True) -> Tensor:
@@ -203,16 +179,20 @@ class MixedAction(Distribution):
             entropy = categorical_entropy(self.probs)
         if self.loc is not None and self.scale is not None:
             axes = tanh_gaussian_entropy(self.loc, self.scale, num_samples, shared_noise=shared_noise)
-            entropy = entropy + axes.sum(-1) + self._log_volume(axes)
+            entropy = entropy + axes.sum(-1)
         return torch.as_tensor(entropy)
 
     @property
     def deterministic_sample(self) -> Tensor:
         """Deterministic action: the most likely value of every head and the tanh of every axis's location."""
         one_hots = None if self.probs is None else most_likely_one_hots(self.probs, self.heads.layout)
-        return self._join(one_hots, None if self.loc is None else torch.tanh(self.loc))
+        return _joined(one_hots, None if self.loc is None else torch.tanh(self.loc))
 
     @property
     def mode(self) -> Tensor:
         """Deterministic action `(..., action_dim)`, under the name that torch uses."""
         return self.deterministic_sample
+
+
+def _joined(one_hots: Tensor | None, axes: Tensor | None) -> Tensor:
+    return torch.cat([part for part in (one_hots, axes) if part is not None], -1)

@@ -246,9 +246,8 @@ def _readable(plan: Plan) -> bool:
     own, low = plan.members[0].parameters[0], plan.members[0].products[0]
     return (
         load_sac(low.dtype) is not None
-        and plan.head
         and len(plan.layers) <= _MOST
-        and all(layer.norm and layer.out_features % 2 == 0 for layer in plan.layers)
+        and all(layer.out_features % 2 == 0 for layer in plan.layers)
         and own.dtype == torch.float32
     )
 

@@ -32,8 +32,7 @@ def layers_of(network: ResidualMLP) -> tuple[Layer, ...]:
             in_features=block.linear.in_features,
             out_features=block.linear.out_features,
             side=block.side,
-            eps=block.norm.eps if block.norm is not None else 0.0,
-            norm=block.norm is not None,
+            eps=block.norm.eps,
         )
         for block in network.blocks
         if isinstance(block, ResidualBlock)
@@ -79,7 +78,7 @@ def make_plan(network: ResidualMLP, name: str, tensors: Mapping[str, Triple], me
         )
 
     every = [member(k) for k in range(members)] if members else [member(None)]
-    return Plan(layers_of(network), network.head is not None, every, stacked=members > 0)
+    return Plan(layers_of(network), every, stacked=members > 0)
 
 
 def planned_copy(module: nn.Module, plans: Mapping[str, Plan]) -> nn.Module:

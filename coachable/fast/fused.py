@@ -31,14 +31,12 @@ class Plan:
 
     Args:
         layers: The residual layers.
-        head: Whether a linear head follows.
         members: The networks' tensors.
         stacked: Whether the output has a leading dimension for the members.
     """
 
-    def __init__(self, layers: Sequence[Layer], head: bool, members: Sequence[Member], stacked: bool) -> None:
+    def __init__(self, layers: Sequence[Layer], members: Sequence[Member], stacked: bool) -> None:
         self.layers = tuple(layers)
-        self.head = head
         self.members = tuple(members)
         self.stacked = stacked
         # Represents the parameters in autograd's graph, so that outputs require a gradient even if no input does.
@@ -46,13 +44,13 @@ class Plan:
         self.written = False
         self._spaces: dict[tuple[int, ...], list[Workspace]] = {}
         own = members[0].parameters[0]
-        suits = own.device.type == "cpu" and own.dtype == torch.float32 and all(layer.norm for layer in layers)
+        suits = own.device.type == "cpu" and own.dtype == torch.float32
         self._kernel_threads = KERNEL_THREADS if suits else 0
 
     @property
     def out_features(self) -> int:
         """Width of the output."""
-        return self.members[0].parameters[-1].shape[0] if self.head else self.layers[-1].out_features
+        return self.members[0].parameters[-1].shape[0]
 
     def begin(self) -> None:
         """Start new gradients: the next backward pass overwrites the old ones, and later passes add to it."""
@@ -98,7 +96,7 @@ def residual_network(plan: Plan, inputs: Sequence[Tensor]) -> Tensor:
         inputs: Tensors `(..., d_i)` whose widths add up to the first layer's.
 
     Returns:
-        `(..., out)`, or `(K, ..., out)` for an ensemble; float32 with a head.
+        `(..., out)`, or `(K, ..., out)` for an ensemble; float32.
     """
     return _Residual.apply(plan, plan.anchor if torch.is_grad_enabled() else None, *inputs)  # pyright: ignore[reportReturnType]
 
@@ -109,8 +107,7 @@ class _Residual(torch.autograd.Function):
         lead, widths = inputs[0].shape[:-1], [t.shape[-1] for t in inputs]
         rows, keep = lead.numel(), any(ctx.needs_input_grad)
         passes = plan.acquire(widths, rows, keep)
-        own = plan.members[0]
-        dtype = own.parameters[-1].dtype if plan.head else own.products[0].dtype
+        dtype = plan.members[0].parameters[-1].dtype
         out = torch.empty(len(plan.members), rows, plan.out_features, dtype=dtype, device=inputs[0].device)
         passes.forward([t.reshape(rows, -1) for t in inputs], out.unbind())
         if keep:

@@ -9,6 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+_TENSORS = 4  # of a layer: weight, bias, and the layer norm's scale and shift
 _ROWS = 32  # granularity of the row-sparse backward with oneDNN, whose cache of kernels few distinct sizes keep small
 
 
@@ -20,12 +21,6 @@ class Layer:
     out_features: int
     side: str
     eps: float
-    norm: bool
-
-    @property
-    def tensors(self) -> int:
-        """Return the number of parameters, which are weight, bias, and the layer norm's scale and shift."""
-        return 4 if self.norm else 2
 
     @property
     def skip_columns(self) -> tuple[int, int, int]:
@@ -70,8 +65,8 @@ class Member:
     """Tensors of one network, without autograd.
 
     Args:
-        parameters: Per layer weight `(o, i)`, bias `(o,)`, and with layer norm scale and shift `(o,)`; then weight and
-            bias of the head.
+        parameters: Per layer weight `(o, i)`, bias `(o,)`, and scale and shift `(o,)` of the layer norm; then weight
+            and bias of the head.
         products: The same list in the dtype of the matrix products (only weights and biases of the layers are read).
         grads: Where the parameters' gradients go; empty if they are not needed.
     """
@@ -134,34 +129,34 @@ class TorchPasses:
         """Return the gradient of the inputs of member `k` in `rows`; meaningless without `columns`."""
         member, kept = self._members[k], self._kept[k]
         own, low, into = member.parameters, member.products, member.grads
-        i = len(own)
         if rows is not None:
             grad = grad.index_select(0, rows)
-        if len(kept) > len(self._layers):
-            i -= 2
-            if trained:
-                _write(into[i], torch.mm(grad.t(), kept[-1][0]), add)
-                _write(into[i + 1], grad.sum(0), add)
-            grad = torch.mm(grad, own[i])
-        grad = grad.to(low[0].dtype)
+        if trained:
+            _write(into[-2], torch.mm(grad.t(), kept[-1][0]), add)
+            _write(into[-1], grad.sum(0), add)
+        grad = torch.mm(grad, own[-2]).to(low[0].dtype)
         for index in reversed(range(len(self._layers))):
             layer = self._layers[index]
-            i -= layer.tensors
+            i = _TENSORS * index
             x, z, mean, rstd, y = kept[index]
             if rows is not None:
                 y, z = y.index_select(0, rows), z.index_select(0, rows)
-                mean, rstd = (mean.index_select(0, rows), rstd.index_select(0, rows)) if layer.norm else (z, z)
-            dz = _relu_backward(grad, y)
-            if layer.norm:
-                dz, dscale, dshift = torch.ops.aten.native_layer_norm_backward(
-                    dz, z, (layer.out_features,), mean, rstd, own[i + 2], own[i + 3], (True, trained, trained)
-                )
-                if trained:
-                    _write(into[i + 2], dscale, add)
-                    _write(into[i + 3], dshift, add)
+                mean, rstd = mean.index_select(0, rows), rstd.index_select(0, rows)
+            dz, dscale, dshift = torch.ops.aten.native_layer_norm_backward(
+                _relu_backward(grad, y),
+                z,
+                (layer.out_features,),
+                mean,
+                rstd,
+                own[i + 2],
+                own[i + 3],
+                (True, trained, trained),
+            )
             if trained:
                 _write(into[i], torch.mm(dz.t(), x), add)
                 _write(into[i + 1], dz.sum(0), add)
+                _write(into[i + 2], dscale, add)
+                _write(into[i + 3], dshift, add)
             if index:
                 grad = torch.addmm(layer.skip_adjoint(grad), dz, low[i])
             elif columns is not None:
@@ -170,23 +165,18 @@ class TorchPasses:
 
     def _forward(self, x: Tensor, member: Member, into: Tensor) -> list[tuple[Tensor, ...]]:
         kept: list[tuple[Tensor, ...]] = []
-        own, low, i = member.parameters, member.products, 0
-        for layer in self._layers:
+        own, low = member.parameters, member.products
+        for index, layer in enumerate(self._layers):
+            i = _TENSORS * index
             z = torch.addmm(low[i + 1], x, low[i].t())
-            y, mean, rstd = z, z, z
-            if layer.norm:
-                y, mean, rstd = torch.native_layer_norm(z, (layer.out_features,), own[i + 2], own[i + 3], layer.eps)
+            y, mean, rstd = torch.native_layer_norm(z, (layer.out_features,), own[i + 2], own[i + 3], layer.eps)
             _relu_(y)
             if self._keep:
                 kept.append((x, z, mean, rstd, y))
             x = layer.skip(x, y, inplace=not self._keep)
-            i += layer.tensors
-        if i == len(own):
-            into.copy_(x)
-            return kept
-        hidden = x.to(own[i].dtype)
+        hidden = x.to(own[-2].dtype)
         kept.append((hidden,))
-        torch.addmm(own[i + 1], hidden, own[i].t(), out=into)
+        torch.addmm(own[-1], hidden, own[-2].t(), out=into)
         return kept
 
 

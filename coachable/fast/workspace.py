@@ -28,7 +28,7 @@ class Workspace:
 
     Args:
         kernels: The compiled kernels.
-        layers: The residual layers, all with layer norm.
+        layers: The residual layers.
         members: The networks' tensors, products in the kernels' dtype.
         widths: Widths of the inputs.
         rows: Number of rows of a batch.
@@ -172,12 +172,10 @@ class _MemberSpace:
                 self._product_steps.append((factors, target, addresses, (start, to, width)))
             x, i = out, i + 4
         self._features = x
-        self._head = (self._own[i], self._own[i].t(), self._own[i + 1]) if i < len(self._own) else None
+        weight, bias = self._own[i:]
+        self._head = (weight, weight.t(), bias)
         self._head_grads = self._grads[i:]
         self._head_kernels: tuple[Any, Any] | None = None
-        if self._head is None:
-            return
-        weight, _, bias = self._head
         self._head_sizes = x.shape[1], weight.shape[0]
         self._head_addresses = x.data_ptr(), weight.data_ptr(), bias.data_ptr()
         self._head_targets: list[int | None] = [g.data_ptr() for g in self._head_grads] or [None] * 2
@@ -203,9 +201,6 @@ class _MemberSpace:
             for x, weight, z, _, _, arguments in self._forward_steps:
                 torch.mm(x, weight, out=z)
                 self._layer_forward(*arguments)
-        if self._head is None:
-            out.copy_(self._features)
-            return
         if not self._small_head:  # the backward pass follows this choice
             self._head_kernels = products and (products.wide_head_forward, products.wide_head_backward)
         if self._head_kernels is not None:
@@ -223,7 +218,7 @@ class _MemberSpace:
             grad = grad.contiguous()
             arguments = (grad.data_ptr(), *self._head_addresses[:2], count, *self._head_sizes, trained, add)
             self._head_kernels[1](*arguments, top.data_ptr(), *self._head_targets)
-        elif self._head is not None:
+        else:
             if trained:
                 weight, bias = self._head_grads
                 if add:
@@ -233,8 +228,6 @@ class _MemberSpace:
                     torch.mm(grad.t(), self._hidden, out=weight)
                     torch.sum(grad, 0, out=bias)
             top[:count].copy_(torch.mm(grad, self._head[0], out=self._head_gradient[:count]))
-        else:
-            top[:count].copy_(grad)
         kernel, products = self._layer_backward, self.products()
         address = None if rows is None else rows.data_ptr()
         for index in reversed(range(len(self._layers))):

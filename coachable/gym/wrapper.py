@@ -15,7 +15,7 @@ from torch import Tensor
 
 from coachable.gym.checked_features import Features, checked_features, flat_observation
 from coachable.keys import STYLE, STYLE_REWARD, TASK_REWARD
-from coachable.styles import Sampler, StyleReward
+from coachable.styles import StyleReward
 from coachable.transforms.style_sampler import derive_seed
 
 __all__ = ["StyleWrapper"]
@@ -33,7 +33,6 @@ class StyleWrapper(gymnasium.Wrapper, RecordConstructorArgs):
             read a Dict inside a Dict.
         style_reward: Reward for following a style, with its `StyleSpace`.
         features: Function that computes the inputs of the reward's terms, see `Features`.
-        sampler: Distribution of styles; the space's own if None.
         flat: Whether to observe one vector, `cat(flattened observation, style)`, instead of the Dict
             `{observation, style}`.
 
@@ -58,18 +57,16 @@ class StyleWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         style_reward: StyleReward,
         features: Features,
         *,
-        sampler: Sampler | None = None,
         flat: bool = False,
     ) -> None:
         _check_observation(env.observation_space, flat)
         RecordConstructorArgs.__init__(
-            self, _disable_deepcopy=True, style_reward=style_reward, features=features, sampler=sampler, flat=flat
+            self, _disable_deepcopy=True, style_reward=style_reward, features=features, flat=flat
         )
         gymnasium.Wrapper.__init__(self, env)
         self.space = style_reward.space
         self.style_reward = style_reward
         self.features = features
-        self.sampler = self.space.sampler if sampler is None else self.space.with_sampler(sampler).sampler
         self.flat = flat
         style = spaces.Box(self.space.low.numpy(), self.space.high.numpy(), dtype=np.float32)
         if flat:
@@ -119,7 +116,9 @@ class StyleWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         observation, info = self.env.reset(seed=seed, options=options)
         if seed is not None:
             self._generator.manual_seed(derive_seed(seed, STYLE))
-        drawn = self.sampler.sample((), self._generator)  # also where one is held, so that seeded draws stay aligned
+        drawn = self.space.sampler.sample(
+            (), self._generator
+        )  # also where one is held, so that seeded draws stay aligned
         self._style = drawn if self._held is None else self._held
         return self._shown(observation), {**info, STYLE: self._style.numpy().copy()}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -19,16 +19,15 @@ from coachable.losses.functional import bootstrap_target
 from coachable.losses.policy import PolicyReader
 from coachable.ranges import POSITIVE, SHARE
 
-Reduction = Literal["none", "mean", "sum"]
-
 
 class ActorCriticLoss(SACLoss):
     """Soft actor-critic loss with a fixed entropy weight, whose policy sample and critic a subclass defines.
 
     `actor_loss(td)` and `qvalue_loss(td)` return `(loss, metadata)`. If you step them one after the other, the target
     uses the updated policy. `forward` computes both from the same parameters. All three accept any batch shape, such as
-    `[B]` or `[B, n + 1]`. Rewards with `steps_to_next_obs` are n-step returns and are discounted accordingly.
-    Everything after the networks is computed in float32 or wider, also under autocast.
+    `[B]` or `[B, n + 1]`, and average over it, weighted by `priority_weight` if the batch has it. Rewards with
+    `steps_to_next_obs` are n-step returns and are discounted accordingly. Everything after the networks is computed in
+    float32 or wider, also under autocast.
 
     Subclasses define `_sample` (action and negative entropy), `_values` (critic output to scalars), `_next_value`
     (target critics' output to the successor's value) and `_errors` (regression of the critics on the target).
@@ -40,12 +39,9 @@ class ActorCriticLoss(SACLoss):
         num_qvalue_nets: Number of critics, checked against the list.
         alpha: Weight of the entropy, fixed.
         action_spec: The environment's action spec, which is checked against the actor; None for no check.
-        reduction: `"mean"`, `"sum"` or `"none"`, over the batch.
-        deactivate_vmap: Whether to evaluate the critics one after the other.
-        use_prioritized_weights: Whether `priority_weight` weights the losses; `"auto"` means if it is present.
 
     Raises:
-        ValueError: If a number is out of range, an option is unknown, or the loss does not support the actions.
+        ValueError: If a number is out of range, or the loss does not support the actions.
     """
 
     SUPPORTED_VALUE_ESTIMATORS = (ValueEstimators.TD0,)
@@ -60,9 +56,6 @@ class ActorCriticLoss(SACLoss):
         num_qvalue_nets: int = 2,
         alpha: float = 0.01,
         action_spec: TensorSpec | None = None,
-        reduction: Reduction = "mean",
-        deactivate_vmap: bool = False,
-        use_prioritized_weights: bool | Literal["auto"] = "auto",
     ) -> None:
         name = type(self).__name__
         critics = [qvalue_network] if isinstance(qvalue_network, nn.Module) else list(qvalue_network)
@@ -72,8 +65,6 @@ class ActorCriticLoss(SACLoss):
                 "each built separately"
             )
         POSITIVE.check("alpha", alpha)
-        if reduction not in ("none", "mean", "sum"):
-            raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
         policy = PolicyReader(actor_network, name, continuous_only=self._continuous_only, action_spec=action_spec)
         # TorchRL makes buffers of a list of one, and draws new weights for a single critic, so they are restored below.
         single = cast(TensorDict, TensorDict.from_module(critics[0])).data.clone() if len(critics) == 1 else None
@@ -85,10 +76,6 @@ class ActorCriticLoss(SACLoss):
             alpha_init=alpha,
             fixed_alpha=True,
             target_entropy=0.0,  # not used; "auto" would need an action spec
-            reduction=reduction,
-            deactivate_vmap=deactivate_vmap,
-            use_prioritized_weights=use_prioritized_weights,
-            scalar_output_mode="exclude",
         )
         if single is not None:
             for params in (self.qvalue_network_params, self.target_qvalue_network_params):
@@ -181,21 +168,18 @@ class ActorCriticLoss(SACLoss):
             tensordict: Batch, into which only the priority (`td_error`) is written.
 
         Returns:
-            `loss_actor`, `loss_qvalue`, and, unless the reduction is "none", `alpha` and `entropy`.
+            `loss_actor`, `loss_qvalue`, `alpha`, `entropy`, and the loss's own metrics.
         """
         loss_qvalue, critic = self.qvalue_loss(tensordict)
         loss_actor, actor = self.actor_loss(tensordict)
         tensordict.set(self.tensor_keys.priority, critic.pop("td_error"))
-        losses = {"loss_actor": loss_actor, "loss_qvalue": loss_qvalue}
-        if self.reduction == "none":
-            return TensorDict(losses, batch_size=tensordict.batch_size)
-        return TensorDict({**losses, "alpha": self._alpha, "entropy": -actor["log_prob"].mean(), **critic})
+        losses = {"loss_actor": loss_actor, "loss_qvalue": loss_qvalue, "alpha": self._alpha}
+        return TensorDict({**losses, "entropy": -actor["log_prob"].mean(), **critic})
 
     @property
     def out_keys(self) -> list[str]:
         """Keys of the result of `forward`."""
-        scalars = [] if self.reduction == "none" else ["alpha", "entropy"]
-        return ["loss_actor", "loss_qvalue", *scalars]
+        return ["loss_actor", "loss_qvalue", "alpha", "entropy"]
 
     @out_keys.setter
     def out_keys(self, values: list[str]) -> None:

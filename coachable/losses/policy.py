@@ -28,7 +28,7 @@ class PolicyReader:
         action_spec: Spec of the environment's action, which is checked against the actor; None for no check.
 
     Raises:
-        ValueError: If the loss does not support the actor's distribution or the action spec.
+        ValueError: If the loss does not support the actor's distribution, its bounds or the action spec.
     """
 
     def __init__(
@@ -47,6 +47,12 @@ class PolicyReader:
                 "make_gaussian_actor or make_mixed_actor"
             )
         options: dict[str, Any] = dict(head.distribution_kwargs)
+        for name, bound in (("low", -1.0), ("high", 1.0)):
+            if bool((torch.as_tensor(options.get(name, bound)) != bound).any()):
+                raise ValueError(
+                    f"{loss_name} serves actions in [-1, 1], but the actor has {name}={options[name]}: rescale actions "
+                    "in the environment instead (torchrl.envs.ActionScaling)"
+                )
         if issubclass(kind, MixedAction):
             heads = options.get("heads")
         elif issubclass(kind, TanhNormal) and not options.get("tanh_loc", False):
@@ -64,9 +70,6 @@ class PolicyReader:
             )
         _check_spec(action_spec, loss_name, heads)
         self._heads: ActionHeads | None = heads
-        self._bounds = {
-            name: _number_or_tensor(options.get(name, sign)) for name, sign in (("low", -1.0), ("high", 1.0))
-        }
         names = getattr(head, "dist_keys", head.in_keys)
         self._parameters = list(zip(names, head.in_keys, strict=True))
         # Shares the actor's modules, so that parameters replaced in the actor are used here.
@@ -78,14 +81,7 @@ class PolicyReader:
         parameters = {name: outputs.get(key) for name, key in self._parameters}
         if self._heads is None:
             self._heads = ActionHeads(axes=parameters["loc"].shape[-1])
-        return MixedAction(**parameters, heads=self._heads, **self._bounds)
-
-
-def _number_or_tensor(bound: Any) -> Any:
-    """Return a bound as a number if all its entries are equal, otherwise as a tensor."""
-    tensor = torch.as_tensor(bound, dtype=torch.float32)
-    first = tensor.flatten()[0].item()
-    return first if bool((tensor == first).all()) else tensor
+        return MixedAction(**parameters, heads=self._heads)
 
 
 def _check_spec(spec: TensorSpec | None, loss_name: str, heads: ActionHeads | None) -> None:

@@ -54,16 +54,13 @@ class ResidualBlock(nn.Module):
         in_features: Width of the input.
         out_features: Width of the output.
         side: Padding side of the identity path, see :func:`fit_features`.
-        layer_norm: Whether to apply the layer norm.
         dropout: Probability with which a unit is dropped after the ReLU, in training mode with gradients enabled.
     """
 
-    def __init__(
-        self, in_features: int, out_features: int, *, side: Side = "end", layer_norm: bool = True, dropout: float = 0.0
-    ) -> None:
+    def __init__(self, in_features: int, out_features: int, *, side: Side = "end", dropout: float = 0.0) -> None:
         super().__init__()
         self.linear = nn.Linear(in_features, out_features)
-        self.norm = nn.LayerNorm(out_features) if layer_norm else None
+        self.norm = nn.LayerNorm(out_features)
         self.side: Side = side
         self.dropout = nn.Dropout(dropout) if dropout else None
         self.reset_parameters()
@@ -72,15 +69,11 @@ class ResidualBlock(nn.Module):
         """Initialise as in the paper: Glorot-uniform weight, zero bias, identity layer norm."""
         nn.init.xavier_uniform_(self.linear.weight)
         nn.init.zeros_(self.linear.bias)
-        if self.norm is not None:
-            self.norm.reset_parameters()
+        self.norm.reset_parameters()
 
     def forward(self, x: Tensor) -> Tensor:
         """Map `(..., in_features)` to `(..., out_features)`."""
-        hidden = self.linear(x)
-        if self.norm is not None:
-            hidden = self.norm(hidden)
-        hidden = F.relu(hidden)
+        hidden = F.relu(self.norm(self.linear(x)))
         if self.dropout is not None and torch.is_grad_enabled():
             hidden = self.dropout(hidden)
         return hidden + fit_features(x, hidden.shape[-1], self.side)
@@ -97,9 +90,8 @@ class ResidualMLP(nn.Module):
 
     Args:
         in_features: Width of the input.
-        out_features: Width of the head; None for no head.
+        out_features: Width of the head.
         widths: Widths of the layers. The paper uses three of 512 (humanoid), 4096, 2048, 1024, 512 (combat).
-        layer_norm: Whether every layer has a layer norm.
         head_gain: Factor on the head's initial weights. With 1 (paper) and inputs of unit size, the outputs have a
             standard deviation of about 2, where tanh is almost flat, so that policies may need less.
         dropout: Probability with which a layer's unit is dropped while learning, see the module.
@@ -115,10 +107,9 @@ class ResidualMLP(nn.Module):
     def __init__(
         self,
         in_features: int,
-        out_features: int | None,
+        out_features: int,
         widths: Sequence[int] = (512, 512, 512),
         *,
-        layer_norm: bool = True,
         head_gain: float = 1.0,
         dropout: float = 0.0,
     ) -> None:
@@ -131,25 +122,22 @@ class ResidualMLP(nn.Module):
         ins = (in_features, *widths[:-1])
         self.blocks = nn.Sequential(
             *(
-                ResidualBlock(ins[k], o, side="beginning" if k % 2 else "end", layer_norm=layer_norm, dropout=dropout)
+                ResidualBlock(ins[k], o, side="beginning" if k % 2 else "end", dropout=dropout)
                 for k, o in enumerate(widths)
             )
         )
-        self.head = None if out_features is None else nn.Linear(widths[-1], out_features)
-        if self.head is not None:
-            nn.init.xavier_uniform_(self.head.weight, gain=head_gain)
-            nn.init.zeros_(self.head.bias)
+        self.head = nn.Linear(widths[-1], out_features)
+        nn.init.xavier_uniform_(self.head.weight, gain=head_gain)
+        nn.init.zeros_(self.head.bias)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Map inputs `(..., d_i)`, concatenated to `in_features`, to `(..., out_features)`.
 
         The head runs in float32, also under autocast, because values and log-probabilities need more precision than
-        bfloat16. Without a head, this returns the last layer's features.
+        bfloat16.
         """
         x = inputs[0] if len(inputs) == 1 else torch.cat(inputs, -1)
         hidden = self.blocks(x)
-        if self.head is None:
-            return hidden
         with torch.autocast(x.device.type, enabled=False):
             return self.head(hidden.to(self.head.weight.dtype))
 

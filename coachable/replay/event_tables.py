@@ -196,11 +196,6 @@ class EventTableBuffer(TensorDictReplayBuffer):
         """Return numbers per table, see `TableWriter.statistics`."""
         return self._writer.statistics()
 
-    def stats(self) -> dict[str, int | float | bool]:
-        """Return TorchRL's statistics, and those of `statistics` as `tables/NAME/...`."""
-        tables = {f"tables/{name}/{key}": v for name, row in self.statistics().items() for key, v in row.items()}
-        return {**super().stats(), **tables}
-
     def extend(self, tensordicts: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
         """Add steps; the input is not changed.
 

@@ -89,21 +89,14 @@ class NStep:
         row = np.arange(len(steps))
         last = cut.last[cut.number]
         full = row + self.n_steps - 1
-        # A piece is closed by its own end, by another episode of the same stream, or by having been abandoned.
-        followed = np.zeros(len(cut.last), dtype=bool)
-        followed[:-1] = cut.stream[cut.last[:-1]] == cut.stream[cut.start[1:]]
+        # A piece is closed by its own end, or by having been abandoned.
         abandoned = steps.arrival[cut.order[cut.last]] < steps.arrival.max() - self.patience
-        closed = cut.ends[cut.last] | followed | abandoned | finish
+        closed = cut.ends[cut.last] | abandoned | finish
         complete = (full <= last) | closed[cut.number]
         last = np.minimum(full, last)
 
-        # Order of completion: by the step that completes a sum. A piece cut by the next episode completes with its
-        # first step.
-        by = cut.order[last]
-        ended_short = (full > last) & ~cut.ends[last]
-        completing = np.where(ended_short & followed[cut.number], cut.order[np.minimum(last + 1, len(row) - 1)], by)
         emitted = np.flatnonzero(complete)
-        emitted = emitted[np.lexsort((emitted, completing[emitted]))]
+        emitted = emitted[np.lexsort((emitted, cut.order[last[emitted]]))]  # by the step that completes the sum
 
         transitions = self._sum(data, cut.order, emitted, last[emitted])
         held = np.sort(cut.order[~complete])
@@ -130,7 +123,8 @@ class NStep:
             total = value[first_row].clone()
             for lag in range(1, self.n_steps):
                 at = torch.from_numpy(order[np.minimum(start + lag, last)]).to(device)
-                _add(total, value[at], self.gamma**lag, count > lag)
+                mask = (count > lag).reshape(-1, *[1] * (total.ndim - 1))
+                total += torch.where(mask, self.gamma**lag * value[at], 0.0)
             out.set(key, total)
         out.set("steps_to_next_obs", count.unsqueeze(-1))
         discount = torch.as_tensor(self.gamma, dtype=torch.float64).pow(count.cpu()).float()
@@ -159,12 +153,3 @@ class NStep:
             self._steps = Steps.from_state_dict(state["steps"])
             data = TensorDict(state["data"], batch_size=[len(self._steps)], device=device)
             self._data = data.apply(torch.clone)  # TensorDict.clone adds 0, which turns -0.0 into 0.0
-
-
-def _add(total: Any, value: Any, factor: float, where: torch.Tensor) -> None:
-    if isinstance(total, TensorDictBase):
-        for key in total.keys(include_nested=True, leaves_only=True):
-            _add(total.get(key), value.get(key), factor, where)
-    else:
-        mask = where.reshape(-1, *[1] * (total.ndim - 1))
-        total += torch.where(mask, factor * value, torch.zeros_like(value))

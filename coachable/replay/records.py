@@ -14,7 +14,7 @@ from coachable.files import CheckpointError, refusing, write_text
 
 __all__ = ["read_records", "record_bytes", "write_records"]
 
-_VERSION = 2  # files of version 1 have neither a version nor checksums
+_VERSION = 2
 _INDEX = "index.json"
 _CHUNK = 65_536  # records per copy, which limits the extra memory
 
@@ -73,16 +73,16 @@ def read_records(storage: Any, folder: Path) -> int:
         raise CheckpointError(f"no such file: {folder / _INDEX}, which lists the records of the replay buffer")
     with refusing(folder / _INDEX, "a list of records"):
         index = json.loads((folder / _INDEX).read_text(encoding="utf-8"))
-        version, filled, capacity = index.get("version", 1), index["filled"], index["capacity"]
-        if version not in (1, _VERSION):
-            raise ValueError(f"it has version {version!r}, expected {_VERSION}")
+        if index.get("version") != _VERSION:
+            raise ValueError(f"it has version {index.get('version')!r}, expected {_VERSION}")
+        filled, capacity = index["filled"], index["capacity"]
     if capacity != storage.max_size:
         raise CheckpointError(
             f"the replay buffer in {folder} holds {capacity} records, this run's {storage.max_size}: set the same "
             f"capacity (replay_capacity), or remove {folder} to resume without it"
         )
     with refusing(folder, "records"):
-        arrays = {tuple(entry["key"]): _array(folder, entry, filled, version) for entry in index["entries"]}
+        arrays = {tuple(entry["key"]): _array(folder, entry, filled) for entry in index["entries"]}
         if bool(arrays) != bool(filled):
             raise ValueError(f"there are {len(arrays)} entries of {filled} records")
         found = dict.fromkeys(arrays, 0)
@@ -95,7 +95,7 @@ def read_records(storage: Any, folder: Path) -> int:
                 chunk.set(key, torch.from_numpy(values))
             storage.set(torch.arange(start, stop), chunk)
     for entry in index["entries"]:
-        if version > 1 and found[tuple(entry["key"])] != entry["crc32"]:
+        if found[tuple(entry["key"])] != entry["crc32"]:
             raise CheckpointError(
                 f"{folder / _file(entry['key'])} is damaged: its content does not agree with its checksum in {_INDEX}. "
                 f"Resume from another checkpoint, or remove {folder} to resume without the replay buffer"
@@ -111,7 +111,7 @@ def record_bytes(storage: Any) -> int:
     return len(storage) * sum(v.numel() * v.element_size() for v in first.values(True, True))
 
 
-def _array(folder: Path, entry: dict[str, Any], filled: int, version: int) -> np.ndarray:
+def _array(folder: Path, entry: dict[str, Any], filled: int) -> np.ndarray:
     file = folder / _file(entry["key"])
     if not file.is_file():
         raise CheckpointError(f"no such file: {file}, which {_INDEX} names")
@@ -119,7 +119,7 @@ def _array(folder: Path, entry: dict[str, Any], filled: int, version: int) -> np
         array = np.lib.format.open_memmap(file, mode="r")  # refuses arrays of objects, which would need pickle
     except ValueError as error:
         raise CheckpointError(f"{file} is damaged or no array of numbers: {error}") from error
-    expected = (entry["dtype"], tuple(entry["shape"])) if version > 1 else (array.dtype.str, (filled, *array.shape[1:]))
+    expected = entry["dtype"], tuple(entry["shape"])
     if (np.lib.format.dtype_to_descr(array.dtype), array.shape) != expected or array.shape[0] != filled:
         raise CheckpointError(
             f"{file} holds {array.dtype.str} of shape {array.shape}: {_INDEX} says {expected[0]} of shape {expected[1]}"

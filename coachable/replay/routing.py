@@ -13,6 +13,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from coachable.keys import EVENTS, SCENARIO, STYLE
+from coachable.styles import StyleSpace, Weight
 
 __all__ = ["EventPredicate", "KeyEvents", "KeyRoute", "PredicateEvents", "Route", "StyleEvents"]
 
@@ -43,41 +44,26 @@ class StyleEvents:
     """Event predicate that admits event i if it fired and the style's weight w_i is not 0 (paper, Appendix B).
 
     Args:
-        names: Names of the styles and their tables, in the order of the event columns.
-        columns: Entry of theta that holds each weight.
+        space: Style space. Its weights, in its order, name the first event columns and their tables.
         extra: Names of further event columns, which are admitted in every style, such as kills.
 
     Raises:
-        ValueError: If lengths differ or a name repeats.
+        ValueError: If a name repeats.
 
     Examples:
         >>> from tensordict import TensorDict
-        >>> events = StyleEvents(["melee", "traps"], [0, 1])
+        >>> from coachable.styles import Weight
+        >>> events = StyleEvents(StyleSpace([Weight("melee", -1.0, 1.0), Weight("traps", 0.0, 1.0)]))
         >>> fired = torch.tensor([[True, True]])
         >>> steps = TensorDict({"style": torch.tensor([[1.0, 0.0]]), "next": {"events": fired}}, [1])
         >>> events(steps)
         tensor([[ True, False]])
     """
 
-    def __init__(self, names: Sequence[str], columns: Sequence[int], extra: Sequence[str] = ()) -> None:
-        if len(names) != len(columns):
-            raise ValueError(
-                f"StyleEvents got {len(names)} names for {len(columns)} columns of theta: expected one each"
-            )
-        self.names = _distinct((*names, *extra))
-        self.columns = torch.tensor(list(columns), dtype=torch.long)
-
-    @classmethod
-    def of(cls, space: "object", extra: Sequence[str] = ()) -> "StyleEvents":
-        """Return the event predicate for the weights of a `StyleSpace`, in the space's order.
-
-        Args:
-            space: A `coachable.styles.StyleSpace`.
-            extra: See the class.
-        """
-        slices = space.slices  # type: ignore[attr-defined]
-        weights = [p.name for p in space.parameters if p.kind == "weight"]  # type: ignore[attr-defined]
-        return cls(weights, [slices[name].start for name in weights], extra)
+    def __init__(self, space: StyleSpace, extra: Sequence[str] = ()) -> None:
+        weights = [parameter.name for parameter in space.parameters if isinstance(parameter, Weight)]
+        self.names = _distinct((*weights, *extra))
+        self.columns = torch.tensor([space.slices[name].start for name in weights], dtype=torch.long)
 
     def __call__(self, steps: TensorDictBase) -> Tensor:
         """Return booleans `(steps, len(names))`."""
@@ -85,7 +71,7 @@ class StyleEvents:
         if fired.shape[-1] != len(self.names):
             raise ValueError(
                 f"('next', 'events') has shape {tuple(fired.shape)}: expected {len(self.names)} events, one for each "
-                f"of {', '.join(self.names)} (names and extra of StyleEvents)"
+                f"of {', '.join(self.names)} (weights and extra of StyleEvents)"
             )
         weight = steps.get(STYLE).index_select(-1, self.columns.to(fired.device))
         admitted = fired.clone()

@@ -22,7 +22,6 @@ class Steps:
     """
 
     stream: np.ndarray  # (steps,) int64
-    begins: np.ndarray  # (steps,) bool, first step of an episode according to `is_init`
     ends: np.ndarray  # (steps,) bool, last step of an episode, terminated or truncated
     fired: np.ndarray  # (steps, event tables) bool
     route: np.ndarray  # (steps,) int64, routed table of the step
@@ -38,7 +37,7 @@ class Steps:
     def unrelated(n: int) -> "Steps":
         """Return the bookkeeping of `n` steps whose order does not matter."""
         yes_no, number = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
-        return Steps(number, yes_no, yes_no, np.zeros((n, 0), dtype=bool), number, number)
+        return Steps(number, yes_no, np.zeros((n, 0), dtype=bool), number, number)
 
     @staticmethod
     def cat(parts: "Sequence[Steps]") -> "Steps":
@@ -60,7 +59,7 @@ class Steps:
         stream, ends = self.stream[order], self.ends[order]
         first_of_stream = np.ones(len(order), dtype=bool)
         first_of_stream[1:] = stream[1:] != stream[:-1]
-        first = first_of_stream | self.begins[order]
+        first = first_of_stream.copy()
         first[1:] |= ends[:-1]
         starts = np.flatnonzero(first)
         return Episodes(
@@ -148,11 +147,6 @@ def read_steps(data: TensorDictBase, num_envs: int | None, arrived: int) -> Step
         stream = np.arange(n) % num_envs
     steps = Steps.unrelated(n)
     steps.stream = stream
-    steps.begins = _flag(data.get("is_init", None), n)
-    steps.ends = _flag(done, n)
+    steps.ends = done.reshape(n, -1).any(-1).cpu().numpy()
     steps.arrival = arrived + np.arange(n)
     return steps
-
-
-def _flag(value: Tensor | None, n: int) -> np.ndarray:
-    return np.zeros(n, dtype=bool) if value is None else value.reshape(n, -1).any(-1).cpu().numpy()

@@ -67,11 +67,10 @@ class WindowHistory:
         cut = steps.in_episodes()
         first = np.flatnonzero(cut.first_of_stream)
         known = self._find(cut.stream[first])
-        continues = (known >= 0) & ~steps.begins[cut.order[first]]
 
         # Rows of continued episodes, and their lengths before this batch.
         kept = np.full(len(cut.start), -1)
-        kept[cut.number[first[continues]]] = known[continues]
+        kept[cut.number[first]] = known
         before = np.where(kept >= 0, self.length[kept], 0)
         position = np.arange(len(steps)) - cut.start[cut.number] + before[cut.number]
 

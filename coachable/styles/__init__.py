@@ -22,7 +22,6 @@ from coachable.styles.terms import (
     WeightedFeature,
     WeightedSum,
     feature,
-    scalar_feature,
     weighted_sum,
 )
 from coachable.styles.tolerance import tolerance
@@ -54,7 +53,6 @@ __all__ = [
     "WeightedFeature",
     "WeightedSum",
     "feature",
-    "scalar_feature",
     "tolerance",
     "weighted_sum",
 ]

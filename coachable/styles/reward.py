@@ -6,7 +6,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from coachable.styles.space import StyleSpace
-from coachable.styles.terms import Features, StyleTerm
+from coachable.styles.terms import StyleTerm
 
 __all__ = ["StyleReward"]
 
@@ -52,11 +52,11 @@ class StyleReward(nn.Module):
         """Whether the reward is known to be linear in the features, so that features of several steps may be summed."""
         return all(getattr(term, "is_linear", False) for term in self.terms.values())
 
-    def forward(self, features: Features, theta: Tensor) -> Tensor:
+    def forward(self, features: Tensor, theta: Tensor) -> Tensor:
         """Return the style part of the reward.
 
         Args:
-            features: Features `(..., F)`, or a tensordict of batch shape `(...)`, which may broadcast against theta.
+            features: Features `(..., F)`, which may broadcast against theta.
             theta: Style `(..., dim)`, not encoded.
 
         Returns:
@@ -73,11 +73,11 @@ class StyleReward(nn.Module):
         assert total is not None  # a space has parameters, and each has a term
         return total.to(theta.dtype).unsqueeze(-1)
 
-    def terms_of(self, features: Features, theta: Tensor) -> dict[str, Tensor]:
+    def terms_of(self, features: Tensor, theta: Tensor) -> dict[str, Tensor]:
         """Return each term of the reward before it is scaled.
 
         Args:
-            features: Features `(..., F)`, or a tensordict of batch shape `(...)`, which may broadcast against theta.
+            features: Features `(..., F)`, which may broadcast against theta.
             theta: Style `(..., dim)`, not encoded.
 
         Returns:

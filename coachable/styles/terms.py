@@ -1,7 +1,7 @@
 """Terms of the style reward: small callables with the names of the style parameters that they read.
 
-A term maps `(features, style)` to a reward `(...,)`. `features` is what the environment emitted (one tensor `(..., F)`,
-or a nested tensordict), `style` a mapping from parameter name to its block of theta.
+A term maps `(features, style)` to a reward `(...,)`. `features` is the tensor `(..., F)` that the environment emitted,
+`style` a mapping from parameter name to its block of theta.
 
 The terms here use only elementwise operations, in a fixed order. A reduction such as `Tensor.sum` may add in another
 order for another batch shape or memory layout, and the relabelled reward would differ in its last bits from the
@@ -13,23 +13,17 @@ import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias, runtime_checkable
+from typing import ClassVar, Protocol, TypeAlias, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 
 from coachable.styles.parameters import Choice
+from coachable.styles.space import StyleSpace
 from coachable.styles.tolerance import tolerance
 from coachable.styles.view import StyleView
 
-if TYPE_CHECKING:  # this package also runs without tensordict
-    from tensordict import TensorDictBase
-
-    from coachable.styles.space import StyleSpace
-
-Features: TypeAlias = "Tensor | TensorDictBase"
 Style: TypeAlias = Mapping[str, Tensor]
-FeatureKey: TypeAlias = int | slice | str | tuple[Any, ...]
 
 
 @runtime_checkable
@@ -45,7 +39,7 @@ class StyleTerm(Protocol):
         """Names of the style parameters that it reads."""
         ...
 
-    def __call__(self, features: Features, style: Style) -> Tensor:
+    def __call__(self, features: Tensor, style: Style) -> Tensor:
         """Return the reward of the term, `(...,)`, before its scale."""
         ...
 
@@ -64,69 +58,35 @@ class Term:
         tensor([6.])
     """
 
-    function: Callable[[Any, Style], Tensor]
+    function: Callable[[Tensor, Style], Tensor]
     parameters: tuple[str, ...]
 
     def __post_init__(self) -> None:
         parameters = (self.parameters,) if isinstance(self.parameters, str) else tuple(self.parameters)
         object.__setattr__(self, "parameters", parameters)
 
-    def __call__(self, features: Features, style: Style) -> Tensor:
+    def __call__(self, features: Tensor, style: Style) -> Tensor:
         """Call the function."""
         return self.function(features, style)
 
 
-def feature(features: Features, key: FeatureKey) -> Tensor:
-    """Return one feature or several columns.
+def feature(features: Tensor, key: int | slice) -> Tensor:
+    """Return one feature or several.
 
     Args:
-        features: Tensor `(..., F)` or tensordict.
-        key: For a tensor, an index or a slice. For a tensordict, a key, which may be nested and end in an index or
-            slice into the entry: `"speed"`, `("gait", "length")`, `("arms", 0)`.
+        features: Tensor `(..., F)`.
+        key: Column, or a slice of columns.
 
     Returns:
-        The feature `(...,)` for an index, columns `(..., k)` for a slice, and otherwise the entry in its own shape.
+        The feature `(...,)` for a column, and features `(..., k)` for a slice.
 
     Raises:
-        KeyError: If there is no such column or key, or the features are a tensor and the key is a name.
+        KeyError: If there is no such column.
     """
-    if isinstance(key, int | slice):
-        try:
-            return features[..., key]
-        except IndexError:
-            raise KeyError(_no_such_feature(features, key)) from None
-    name, column = key, None
-    if isinstance(key, tuple) and isinstance(key[-1], int | slice):
-        name, column = key[:-1], key[-1]
-    entry = None if isinstance(features, Tensor) else features.get(name, None)
-    if entry is None:
-        raise KeyError(_no_such_feature(features, name))
-    return entry if column is None else entry[..., column]
-
-
-def _no_such_feature(features: Features, name: Any) -> str:
-    if isinstance(features, Tensor):
-        return (
-            f"no style feature named {name}: the environment emits one tensor of {features.shape[-1]} columns, "
-            "to be read by index or slice."
-        )
-    paths = (key if isinstance(key, str) else ".".join(key) for key in features.keys(True, True))
-    return f"no style feature named {name}: the environment emits {', '.join(sorted(paths))}."
-
-
-def scalar_feature(features: Features, key: FeatureKey, like: Tensor) -> Tensor:
-    """Return a feature without the last dimension of an entry `(..., 1)` that `like` lacks.
-
-    Args:
-        features: Features `(..., F)`, or a tensordict of batch shape `(...)`.
-        key: Column of the features, or key of the tensordict.
-        like: Tensor `(...,)` with the wanted number of dimensions.
-
-    Returns:
-        The feature `(...,)`.
-    """
-    value = feature(features, key)
-    return value.squeeze(-1) if value.ndim == like.ndim + 1 and value.shape[-1] == 1 else value
+    try:
+        return features[..., key]
+    except IndexError:
+        raise KeyError(f"no style feature {key}: the environment emits {features.shape[-1]} columns.") from None
 
 
 def weighted_sum(weights: Tensor, values: Tensor) -> Tensor:
@@ -148,7 +108,7 @@ class _OfNumbers:
 
     parameters: tuple[str, ...]
 
-    def mismatch(self, space: "StyleSpace") -> str | None:
+    def mismatch(self, space: StyleSpace) -> str | None:
         """Return what is wrong if a parameter of the term is a choice."""
         if not any(isinstance(space[name], Choice) for name in self.parameters):
             return None
@@ -161,11 +121,11 @@ class WeightedFeature(_OfNumbers):
 
     Args:
         parameter: Name of the `Weight`.
-        key: Key of the feature, see `feature`.
+        key: Column of the feature.
     """
 
     parameter: str
-    key: FeatureKey
+    key: int
     is_linear: ClassVar[bool] = True
 
     @property
@@ -173,10 +133,10 @@ class WeightedFeature(_OfNumbers):
         """Name of the weight, as a tuple."""
         return (self.parameter,)
 
-    def __call__(self, features: Features, style: Style) -> Tensor:
+    def __call__(self, features: Tensor, style: Style) -> Tensor:
         """Return the reward `(...,)`."""
         weight = style[self.parameter]
-        return weight * scalar_feature(features, self.key, weight)
+        return weight * feature(features, self.key)
 
 
 class WeightedSum(_OfNumbers):
@@ -186,22 +146,22 @@ class WeightedSum(_OfNumbers):
 
     Args:
         parameters: Names of the weights, in the order of the features.
-        key: Key of the features `(..., len(parameters))`, see `feature`; None for all.
+        key: Columns of the features, as many as parameters; all by default.
     """
 
     is_linear = True
 
-    def __init__(self, parameters: Sequence[str], key: FeatureKey | None = None) -> None:
+    def __init__(self, parameters: Sequence[str], key: slice = slice(None)) -> None:
         self.parameters = tuple(parameters)
         self.key = key
 
-    def __call__(self, features: Features, style: Style) -> Tensor:
+    def __call__(self, features: Tensor, style: Style) -> Tensor:
         """Return the reward `(...,)`."""
         if isinstance(style, StyleView):
             weights = style.block(self.parameters)
         else:
             weights = torch.stack([style[name] for name in self.parameters], dim=-1)
-        values = features if self.key is None else feature(features, self.key)
+        values = feature(features, self.key)
         if values.shape[-1] != len(self.parameters):
             raise ValueError(
                 f"WeightedSum reads {values.shape[-1]} features for {len(self.parameters)} weights {self.parameters}: "
@@ -212,39 +172,35 @@ class WeightedSum(_OfNumbers):
 
 @dataclass(frozen=True)
 class SetpointTolerance(_OfNumbers):
-    """Term that is the `tolerance` of a feature around a set-point: 1 within `half_width` of the requested value.
+    """Term that is the `tolerance` of a feature around a set-point: 1 at the requested value.
 
     Args:
         parameter: Name of the `Setpoint`.
-        key: Key of the measured feature, in the unit of the set-point; see `feature`.
+        key: Column of the measured feature, in the unit of the set-point.
         margin: Distance at which the reward is `value_at_margin`, in the same unit.
         sigmoid: Shape of the decline, see `tolerance`.
         value_at_margin: See `tolerance`.
-        half_width: Half width of the interval in which the reward is 1, in the same unit.
-        gate: Key of a feature that multiplies the term, such as a "step completed" flag, or None.
+        gate: Column of a feature that multiplies the term, such as a "step completed" flag, or None.
     """
 
     parameter: str
-    key: FeatureKey
+    key: int
     margin: float
     sigmoid: str = "long_tail"
     value_at_margin: float = 0.1
-    half_width: float = 0.0
-    gate: FeatureKey | None = None
+    gate: int | None = None
 
     @property
     def parameters(self) -> tuple[str, ...]:
         """Name of the set-point, as a tuple."""
         return (self.parameter,)
 
-    def __call__(self, features: Features, style: Style) -> Tensor:
+    def __call__(self, features: Tensor, style: Style) -> Tensor:
         """Return the reward `(...,)`."""
         target = style[self.parameter]
-        measured = scalar_feature(features, self.key, target)
-        half = self.half_width
-        lower, upper = (target - half, target + half) if half else (target, target)
-        value = tolerance(measured, lower, upper, self.margin, self.sigmoid, self.value_at_margin)
-        return value if self.gate is None else value * scalar_feature(features, self.gate, target).to(value.dtype)
+        measured = feature(features, self.key)
+        value = tolerance(measured, target, target, self.margin, self.sigmoid, self.value_at_margin)
+        return value if self.gate is None else value * feature(features, self.gate).to(value.dtype)
 
 
 class ChoiceTolerance:
@@ -252,7 +208,7 @@ class ChoiceTolerance:
 
     Args:
         parameter: Name of the `Choice`.
-        key: Key of the features `(..., k)`, see `feature`; a slice also if k is 1.
+        key: Columns of the k features, a slice also if k is 1.
         lower: Lower bounds `(n_options, k)`, in the unit of the features.
         upper: Upper bounds `(n_options, k)`.
         margin: Distance at which the value is `value_at_margin`, in the same unit.
@@ -267,7 +223,7 @@ class ChoiceTolerance:
     def __init__(
         self,
         parameter: str,
-        key: FeatureKey,
+        key: slice,
         lower: Tensor,
         upper: Tensor,
         margin: float,
@@ -280,10 +236,10 @@ class ChoiceTolerance:
                 f"ChoiceTolerance for {parameter!r} has bounds of shapes {tuple(lower.shape)}, {tuple(upper.shape)}: "
                 "expected two (n_options, k) matrices with lower <= upper."
             )
-        if isinstance(key[-1] if isinstance(key, tuple) else key, int):
+        if isinstance(key, int):
             raise ValueError(
-                f"ChoiceTolerance for {parameter!r} has the key {key}, an index: expected a slice or a name, such as "
-                "slice(0, 1) for the first feature."
+                f"ChoiceTolerance for {parameter!r} has the key {key}, an index: expected a slice, such as slice(0, 1) "
+                "for the first feature."
             )
         self.parameters, self.num_options = (parameter,), len(lower)
         self.key, self.margin, self.sigmoid, self.value_at_margin = key, margin, sigmoid, value_at_margin
@@ -291,13 +247,13 @@ class ChoiceTolerance:
         self._bounds = {lower.device: torch.cat([lower, upper], dim=-1)}
         self._mean = {lower.device: torch.full((lower.shape[1],), 1.0 / lower.shape[1], device=lower.device)}
 
-    def mismatch(self, space: "StyleSpace") -> str | None:
+    def mismatch(self, space: StyleSpace) -> str | None:
         """Return what is wrong if the parameter has another number of options than the bounds."""
         [name] = self.parameters
         width = space[name].width
         return f"has bounds for {self.num_options} options, {name} has {width}" if width != self.num_options else None
 
-    def __call__(self, features: Features, style: Style) -> Tensor:
+    def __call__(self, features: Tensor, style: Style) -> Tensor:
         """Return the reward `(...,)`."""
         measured, option = feature(features, self.key), style[self.parameters[0]].argmax(-1)
         table, mean = _on(self._bounds, option.device), _on(self._mean, option.device)

@@ -178,7 +178,7 @@ def widths_of(agent: LoadedPolicy) -> tuple[int, int]:
     if isinstance(agent.actor, OnnxPolicy):
         return agent.actor.contract.widths
     policy = policy_network(agent.actor)
-    actions = policy.heads.action_dim if isinstance(policy, MixedPolicy) else (policy.trunk.out_features or 0) // 2
+    actions = policy.heads.action_dim if isinstance(policy, MixedPolicy) else policy.trunk.out_features // 2
     return policy.trunk.in_features - agent.space.dim, actions
 
 

@@ -28,6 +28,7 @@ class StyleRewardTransform(Transform):
     Raises:
         KeyError: If the environment declares no `task_reward`, or a step emits no `task_reward`, `style_features` or
             style.
+        ValueError: If the environment declares nested `style_features`.
     """
 
     def __init__(self, style_reward: StyleReward) -> None:
@@ -63,10 +64,16 @@ class StyleRewardTransform(Transform):
 
         Raises:
             KeyError: If the environment declares no task reward.
+            ValueError: If the style features are nested.
         """
-        declared = [*output_spec["full_observation_spec"].keys(), *output_spec["full_reward_spec"].keys()]
+        declared = {**output_spec["full_observation_spec"], **output_spec["full_reward_spec"]}
         if TASK_REWARD not in declared:
             raise KeyError(f"the specs of the environment declare {_listed(declared)}: {_EXPECTED}")
+        if isinstance(features := declared.get(STYLE_FEATURES), Composite):
+            raise ValueError(
+                f"the specs of the environment declare {STYLE_FEATURES} with the entries {_listed(features.keys())}: "
+                "expected one tensor (..., F); concatenate them (torchrl.envs.CatTensors)."
+            )
         return super().transform_output_spec(output_spec)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:

@@ -12,7 +12,6 @@ from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv
 
 from coachable.keys import STYLE
 from coachable.styles.reward import StyleReward
-from coachable.styles.samplers import Sampler
 from coachable.styles.space import StyleSpace
 from coachable.transforms.style_reward import StyleRewardTransform
 
@@ -45,19 +44,14 @@ class StyleSampler(Transform):
     (`env.reset(TensorDict({"style": theta}, [N]))`), or otherwise the one set by `hold`, or otherwise a new draw.
 
     Args:
-        space: Style space.
-        sampler: Distribution to draw from; None for the space's own.
+        space: Style space, from whose sampler the styles are drawn.
         seed: Seed of this transform's generator; None for one from the operating system, so that workers differ.
             `CoachableEnv.set_seed` also sets it.
-
-    Raises:
-        ValueError: If the sampler does not fit the space.
     """
 
-    def __init__(self, space: StyleSpace, sampler: Sampler | None = None, seed: int | None = None) -> None:
+    def __init__(self, space: StyleSpace, seed: int | None = None) -> None:
         super().__init__(in_keys=[], out_keys=[STYLE])
         self.space = space
-        self.sampler = space.sampler if sampler is None else space.with_sampler(sampler).sampler
         self.generator = torch.Generator()
         self._held: Tensor | None = None
         self._seeded = False
@@ -94,7 +88,7 @@ class StyleSampler(Transform):
         elif self._held is not None:
             style = self._held.to(device).expand(*shape, self.space.dim).clone()
         else:
-            style = self.sampler.sample(shape, self.generator, device)
+            style = self.space.sampler.sample(shape, self.generator, device)
         return tensordict_reset.set(STYLE, style)
 
     def _checked(self, given: Tensor) -> Tensor:
@@ -202,7 +196,6 @@ def coachable_env(
     space: StyleSpace,
     style_reward: StyleReward,
     *transforms: Transform,
-    sampler: Sampler | None = None,
     seed: int | None = None,
     **kwargs: Any,
 ) -> CoachableEnv:
@@ -210,17 +203,16 @@ def coachable_env(
 
     Args:
         base_env: Environment that emits `task_reward` and `style_features` and does not use theta.
-        space: Style space.
+        space: Style space, from whose sampler the styles are drawn.
         style_reward: Style reward.
         *transforms: Further transforms, such as `StepCounter` or `RewardSum`.
-        sampler: Distribution of styles; None for the space's own.
         seed: Seed of the environment and its transforms; None does not seed them.
         **kwargs: Further arguments of `TransformedEnv`.
 
     Returns:
         The environment, ready for a collector.
     """
-    styles = StyleSampler(space, sampler, seed=seed)
+    styles = StyleSampler(space, seed=seed)
     chain = Compose(styles, StyleRewardTransform(style_reward), *transforms)  # pyright: ignore[reportCallIssue]
     env = CoachableEnv(base_env=base_env, transform=chain, **kwargs)
     if seed is not None:

@@ -1,7 +1,6 @@
 """`TaskImpersonation`, which relabels sampled transitions with further styles (paper, Task Impersonation)."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -12,7 +11,6 @@ from coachable.keys import STYLE, STYLE_FEATURES, STYLE_REWARD, TABLE, TASK_REWA
 from coachable.ranges import AMOUNT
 from coachable.styles.reward import StyleReward
 from coachable.styles.samplers import Sampler
-from coachable.styles.space import StyleSpace
 
 
 class TaskImpersonation(Transform):
@@ -31,21 +29,19 @@ class TaskImpersonation(Transform):
     buffer must then sum the features as well (`discounted_keys` of `EventTableBuffer`).
 
     Args:
-        style_reward: The environment's style reward.
-        space: Style space; None for that of `style_reward`.
+        style_reward: The environment's style reward, from the sampler of whose space the styles are drawn.
         n: Number of further styles per transition (paper: 4).
-        sampler: Distribution of styles; None for the space's own.
         seed: Seed of the transform's own generator, whose state is in the state dict.
         tables: Samplers by the number of a table of `EventTableBuffer` (ours). Column 1 of a transition from such a
             table is drawn from the table's sampler, so that what led to an event is relabelled with a style that asks
             for the event. Without it, with 18 styles one label in 20 asks for it.
 
     Raises:
-        ValueError: If n is negative, or a sampler draws styles of another size.
+        ValueError: If n is negative, or a sampler of a table draws styles of another size.
 
     Examples:
         >>> from tensordict import TensorDict
-        >>> from coachable.styles import Weight, WeightedFeature
+        >>> from coachable.styles import StyleSpace, Weight, WeightedFeature
         >>> space = StyleSpace([Weight("fuel", 0.0, 1.0)])
         >>> relabel = TaskImpersonation(StyleReward(space, {"fuel": WeightedFeature("fuel", 0)}), n=2)
         >>> one = torch.ones(8, 1)
@@ -58,30 +54,23 @@ class TaskImpersonation(Transform):
     def __init__(
         self,
         style_reward: StyleReward,
-        space: StyleSpace | None = None,
         n: int = 4,
-        sampler: Sampler | None = None,
         seed: int = 0,
         tables: Mapping[int, Sampler] | None = None,
     ) -> None:
         super().__init__(in_keys=[], out_keys=[])
         AMOUNT.check("n of TaskImpersonation", n)
         self.style_reward = style_reward
-        self.space = style_reward.space if space is None else space
+        self.space = style_reward.space
         self.n = int(n)
-        self.sampler = self.space.sampler if sampler is None else sampler
         self.tables = dict(tables or {})
-        for each in (self.sampler, *self.tables.values()):
+        for each in self.tables.values():
             if each.dim != self.space.dim:
                 raise ValueError(
-                    f"the sampler of TaskImpersonation draws styles of {each.dim} numbers: expected "
+                    f"a sampler of TaskImpersonation's tables draws styles of {each.dim} numbers: expected "
                     f"{self.space.dim} ({', '.join(self.space.names)})"
                 )
         self.generator = torch.Generator().manual_seed(seed)
-
-    def set_seed(self, seed: int) -> None:
-        """Set the seed of the generator."""
-        self.generator.manual_seed(seed)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Relabel a sample.
@@ -103,7 +92,7 @@ class TaskImpersonation(Transform):
         stored, features, task_reward, reward = self._entries(tensordict)
         shape = tensordict.batch_size
         # Batches of one, because `Shared` gives several rows of a batch the same style.
-        drawn = self.sampler.sample((*shape, self.n, 1), self.generator, stored.device).squeeze(-2)
+        drawn = self.space.sampler.sample((*shape, self.n, 1), self.generator, stored.device).squeeze(-2)
         table = tensordict.get(TABLE, None)
         if self.tables and table is None:
             raise KeyError(
@@ -113,9 +102,7 @@ class TaskImpersonation(Transform):
             rows = (table == number).nonzero(as_tuple=True)
             drawn[(*rows, 0)] = sampler.sample((len(rows[0]),), self.generator, stored.device)
         dim = len(shape)
-        features = features.unsqueeze(dim)
-        features = features.expand(*shape, self.n, *features.shape[dim + 1 :])
-        style_reward = self.style_reward(features, drawn)
+        style_reward = self.style_reward(features.unsqueeze(dim).expand(*shape, self.n, -1), drawn)
 
         columns = self.n + 1
         out = tensordict.apply(
@@ -149,7 +136,7 @@ class TaskImpersonation(Transform):
                 "features (n_steps, discounted_keys)"
             )
 
-    def _entries(self, tensordict: TensorDictBase) -> tuple[Tensor, Any, Tensor, Tensor]:
+    def _entries(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         wanted = (STYLE, ("next", STYLE_FEATURES), ("next", TASK_REWARD), ("next", "reward"))
         found = [tensordict.get(key, None) for key in wanted]
         missing = [key for key, value in zip(wanted, found, strict=True) if value is None]

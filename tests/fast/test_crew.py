@@ -22,7 +22,7 @@ def two_threads():
 
 @pytest.mark.parametrize("low", [None, torch.bfloat16])
 @pytest.mark.parametrize("members", [0, 1, 2, 3])
-@pytest.mark.parametrize("kind", [kind for kind in SHAPES if kind != "no_norm"])
+@pytest.mark.parametrize("kind", SHAPES)
 def test_passes_give_the_same_numbers(kind, members, low, two_threads):
     results = []
     for largest in (1, 2):

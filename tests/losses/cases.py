@@ -81,8 +81,6 @@ class Case:
                 "target_entropy": 0.0,
                 **options,
             }
-            if options.get("reduction") == "none":
-                options["scalar_output_mode"] = "exclude"
         else:
             options = {"alpha": alpha, **options}
         loss = self.build(actor, critics, **{**self.options, **options})

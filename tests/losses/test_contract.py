@@ -183,28 +183,11 @@ def test_labels_are_more_batch(case: Case, heads: Any) -> None:
 
 
 @ALL
-def test_reductions(case: Case) -> None:
-    heads, values = HEADS[case.heads[-1]], {}
-    source = case.loss(heads)
-    batch = end_all(make_batch(heads, (5, 2)))
-    for reduction in ("none", "sum", "mean"):
-        loss = case.loss(heads, reduction=reduction)
-        loss.load_state_dict(source.state_dict())
-        values[reduction] = critic_loss(loss, batch)[0]
-        out = loss(batch)
-        assert out["loss_actor"].shape == out["loss_qvalue"].shape == ((5, 2) if reduction == "none" else ())
-    assert values["none"].shape == (5, 2)
-    torch.testing.assert_close(values["none"].sum(), values["sum"])
-    torch.testing.assert_close(values["none"].mean(), values["mean"])
-
-
-@ALL
 def test_priority_weights(case: Case) -> None:
     heads = HEADS[case.heads[-1]]
     loss, batch = case.loss(heads), end_all(make_batch(heads, (5, 2)))
-    plain = case.loss(heads, reduction="none")
-    plain.load_state_dict(loss.state_dict())
-    losses = critic_loss(plain, batch)[0]
+    losses = torch.stack([critic_loss(loss, one)[0] for one in batch.reshape(10, 1).unbind(0)]).view(5, 2)
+    torch.testing.assert_close(critic_loss(loss, batch)[0], losses.mean())
     weights = torch.rand(5, 2)
     batch["priority_weight"] = weights
     expected = (losses * weights).sum() / weights.sum()  # TorchRL's weighted mean
@@ -221,9 +204,6 @@ def test_one_priority_weight_per_record(case: Case) -> None:
     expected = critic_loss(loss, batch)[0]
     batch["priority_weight"] = weights.expand(5, 2).unsqueeze(-1)
     torch.testing.assert_close(critic_loss(loss, batch)[0], expected)
-    ignored = case.loss(heads, use_prioritized_weights=False)
-    ignored.load_state_dict(loss.state_dict())
-    torch.testing.assert_close(critic_loss(ignored, batch)[0], critic_loss(loss, batch.exclude("priority_weight"))[0])
 
 
 @ALL
@@ -273,20 +253,6 @@ def test_renamed_and_nested_keys(case: Case) -> None:
     for key in ("loss_actor", "loss_qvalue"):
         torch.testing.assert_close(out[key], expected[key])
     torch.testing.assert_close(renamed["surprise"], batch["td_error"])
-
-
-@WITH_HEADS
-def test_loop_over_critics_equals_vmap(case: Case, heads: Any) -> None:
-    vmapped, looped = case.loss(heads), case.loss(heads, deactivate_vmap=True)
-    looped.load_state_dict(vmapped.state_dict())
-    outputs = []
-    for loss in (vmapped, looped):
-        batch = make_batch(heads, (6,), seed=3)
-        torch.manual_seed(4)
-        out = loss(batch)
-        (out["loss_actor"] + out["loss_qvalue"]).backward()
-        outputs.append((out["loss_actor"], out["loss_qvalue"], batch["td_error"], gradients(loss, "")))
-    torch.testing.assert_close(outputs[0], outputs[1], rtol=1e-4, atol=1e-5)
 
 
 @ALL

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 from torchrl.objectives import LossModule, SACLoss
@@ -16,14 +16,14 @@ from coachable.losses import CategoricalSACLoss, CatRACLoss, QRSACLoss, RACLoss
 from coachable.networks import make_critic
 from coachable.networks.hl_gauss_critic import make_hl_gauss_critic
 from coachable.networks.mixed import make_mixed_actor
+from coachable.networks.residual import ResidualBlock
 from coachable.training import Learner
 from tests.style_echo import HEADS, LEVELS, echo_space, levels_and_axes, make_style_echo_env
 
 # A relaxed policy query follows the critic's slope at a corner of the simplex, where hard actions alone have trained
 # it. In layers this narrow layer norm bends the slope of scalar critics away from the difference between corners;
 # with categorical critics it is the entropy that keeps the policy off a corner until they know better.
-SCALAR: dict[str, Any] = {"widths": (64, 64), "layer_norm": False}
-BINNED: dict[str, Any] = {"widths": (32, 32), "layer_norm": True}
+SCALAR, BINNED = (64, 64), (32, 32)
 BINS: dict[str, Any] = {"v_min": -6.0, "v_max": 2.0, "num_atoms": 41}
 # name: loss, critics, options, update order
 LOSSES: dict[str, tuple[Callable[..., LossModule], Callable[..., Any], dict[str, Any], str]] = {
@@ -52,13 +52,16 @@ def train(name: str, heads: ActionHeads, updates: int, seed: int = 0) -> Any:
     kind, make, options, order = LOSSES[name]
     space = echo_space(heads)
     critic_options: dict[str, Any] = {}
-    network, rate = SCALAR, 3e-3
+    widths, rate = SCALAR, 3e-3
     if make is make_hl_gauss_critic:
-        critic_options, network, rate = BINS, BINNED, 5e-3
+        critic_options, widths, rate = BINS, BINNED, 5e-3
     elif "num_quantiles" in options:
         critic_options = {"num_outputs": options["num_quantiles"]}
-    actor = make_mixed_actor(1, heads, space, **network)
-    critics = [make(1, heads.action_dim, space, **network, **critic_options) for _ in range(2)]
+    actor = make_mixed_actor(1, heads, space, widths)
+    critics = [make(1, heads.action_dim, space, widths, **critic_options) for _ in range(2)]
+    if widths is SCALAR:
+        for block in [part for net in (actor, *critics) for part in net.modules() if isinstance(part, ResidualBlock)]:
+            block.norm = nn.Identity()
     loss = kind(actor, critics, **options)
     loss.make_value_estimator(gamma=0.5)
     learner = Learner(

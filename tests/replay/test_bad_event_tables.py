@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from coachable.replay import EventTableBuffer, KeyEvents, PredicateEvents, StyleEvents
+from coachable.styles import StyleSpace, Weight
 from tests.replay.one_event import one_event_buffer, steps
 
 BAD_CONSTRUCTIONS = {
@@ -76,7 +77,7 @@ def test_route_of_wrong_shape_or_range_is_reported(value):
 
 
 def test_wrong_event_columns_name_the_tables():
-    events = StyleEvents(["melee", "traps"], [0, 1])
+    events = StyleEvents(StyleSpace([Weight("melee", -1.0, 1.0), Weight("traps", 0.0, 1.0)]))
     capacities = {"default": 9, "melee": 5, "traps": 5}
     buffer = EventTableBuffer(capacities, events=events, event_horizon=1, num_envs=1)
     with pytest.raises(ValueError, match="melee, traps"):

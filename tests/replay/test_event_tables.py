@@ -34,8 +34,6 @@ class Reference:
     def step(self, stream, row) -> None:
         row = {**row, "arrival": self.arrived}
         self.arrived += 1
-        if row["init"]:
-            self.close(stream)
         self.held[stream].append(row)
         if row["done"]:
             self.close(stream)
@@ -85,9 +83,9 @@ class Reference:
 class Source:
     """Random episodes of several workers with several environments each, every step with a number of its own."""
 
-    def __init__(self, seed: int, workers: int, envs: int, events: int, routed: int, init: bool) -> None:
+    def __init__(self, seed: int, workers: int, envs: int, events: int, routed: int) -> None:
         self.rng = np.random.default_rng(seed)
-        self.envs, self.events, self.routed, self.init = envs, events, routed, init
+        self.envs, self.events, self.routed = envs, events, routed
         self.count = 0
         self.trajectory = np.arange(workers * envs).reshape(workers, envs)
         self.next_trajectory = workers * envs
@@ -99,7 +97,6 @@ class Source:
         rng = self.rng
         terminated = rng.random(n) < self.chance[0] / 2
         truncated = rng.random(n) < self.chance[0] / 2
-        init = (rng.random(n) < 0.1) if self.init else np.zeros(n, bool)
         fired = rng.random((n, self.events)) < self.chance[1]
         route = rng.integers(0, self.routed, n)
         reward = rng.normal(size=n).astype(np.float32)
@@ -111,8 +108,6 @@ class Source:
             rows.append([])
             for t in range(time):
                 i = e * time + t
-                if init[i]:
-                    self._renew(worker, e)
                 trajectory[i] = self.trajectory[worker, e]
                 done = bool(terminated[i] or truncated[i])
                 rows[-1].append(
@@ -122,7 +117,6 @@ class Source:
                         "next": int(number[i]) + 10**6,
                         "terminated": bool(terminated[i]),
                         "done": done,
-                        "init": bool(init[i]),
                         "fired": fired[i],
                         "route": int(route[i]),
                         "trajectory": int(trajectory[i]),
@@ -134,7 +128,6 @@ class Source:
             {
                 "id": torch.from_numpy(number),
                 "scenario": torch.from_numpy(route),
-                "is_init": torch.from_numpy(init).unsqueeze(-1),
                 "collector": {"traj_ids": torch.from_numpy(trajectory)},
                 "next": {
                     "reward": torch.from_numpy(reward).unsqueeze(-1),
@@ -206,8 +199,7 @@ def test_tables_equal_the_reference(seed, workers, envs, events, routed, horizon
     buffer, reference = make_buffer(routed, events, horizon, 2000, 9, n, num_envs=envs if flat else None)
     by_trajectory = layout.startswith("trajectories")
     workers = workers if by_trajectory else 1  # only trajectory numbers tell workers apart
-    # Without trajectory numbers only `is_init` can tell that an episode was cut short.
-    source = Source(seed, workers, envs, events, routed, init=not by_trajectory)
+    source = Source(seed, workers, envs, events, routed)
     for call, time in enumerate(calls):
         worker = int(source.rng.integers(workers))
         data, rows = source.batch(worker, time)
@@ -238,7 +230,7 @@ def test_tables_equal_the_reference(seed, workers, envs, events, routed, horizon
 def test_small_tables_keep_the_newest(seed, envs, time, n):
     """Batches larger than a table, in one call or many, leave its last records."""
     buffer, reference = make_buffer(1, 0, 1, 7, 1, n)
-    source = Source(seed, 1, envs, 0, 1, init=False)
+    source = Source(seed, 1, envs, 0, 1)
     for _ in range(4):
         data, rows = source.batch(0, time)
         buffer.extend(data)

@@ -133,14 +133,14 @@ def test_style_events_admit_by_weight_and_extra_events_always():
         },
         [3],
     )
-    events = StyleEvents(["melee", "traps"], [0, 1], extra=["kill"])
+    events = StyleEvents(StyleSpace([Weight("melee", -1.0, 1.0), Weight("traps", 0.0, 2.0)]), extra=["kill"])
     assert events(td).int().tolist() == [[0, 1, 1], [1, 0, 1], [1, 1, 1]]
     assert td["next", "events"].all()
 
 
 def test_events_of_a_space_make_a_table_per_weight_with_original_labels():
     space = StyleSpace([Weight("melee", -1.0, 1.0), Setpoint("gap", 0.0, 1.0), Weight("traps", 0.0, 1.0)])
-    events = StyleEvents.of(space, extra=["kill"])
+    events = StyleEvents(space, extra=["kill"])
     buffer = EventTableBuffer.for_events(
         events, capacity=50, event_capacity=10, event_horizon=2, num_envs=1, batch_size=8
     )
@@ -162,7 +162,7 @@ def test_predicates_of_other_domains():
     assert found == {"default": [0, 1, 2, 3], "fast": [0, 3], "slow": [1]}
 
 
-def test_statistics_and_stats():
+def test_statistics():
     buffer = one_event_buffer(2, base=4, fed=3)
     buffer.extend(steps(range(6), [i in (1, 4) for i in range(6)]))
     assert buffer.statistics()["default"] == {
@@ -171,9 +171,7 @@ def test_statistics_and_stats():
     assert buffer.statistics()["hit"] == {
         "size": 3, "capacity": 3, "fill": 1.0, "written": 4, "evicted": 1, "events": 2, "lost": 0,
     }  # fmt: skip
-    stats = buffer.stats()
-    assert stats["size"] == len(buffer) == 7 and stats["write_count"] == buffer.write_count == 6
-    assert stats["tables/hit/events"] == 2
+    assert len(buffer) == 7 and buffer.write_count == 6
 
 
 def test_indexing_and_emptying():

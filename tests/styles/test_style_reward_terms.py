@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from dm_control.utils import rewards
-from tensordict import TensorDict, lazy_stack
 
 from coachable.styles import (
     Choice,
@@ -22,12 +21,11 @@ from coachable.styles import (
     WeightedFeature,
     WeightedSum,
     feature,
-    scalar_feature,
     tolerance,
     weighted_sum,
 )
 
-SIGMOIDS = ["gaussian", "hyperbolic", "long_tail", "reciprocal", "cosine", "linear", "quadratic", "tanh_squared"]
+SIGMOIDS = ["linear", "long_tail"]
 
 
 @pytest.mark.parametrize("sigmoid", SIGMOIDS)
@@ -39,18 +37,16 @@ def test_tolerance_equals_dm_control(sigmoid, bounds, dtype, atol):
     x = torch.cat([torch.linspace(-5, 5, 401, dtype=dtype), torch.tensor([-0.5, 0.25, 0.7, 1e3, -1e3], dtype=dtype)])
     for margin in (0.0, 0.05, 0.5, 3.0):
         for value in (0.1, 0.5, 0.95):
-            with np.errstate(over="ignore"):  # dm_control's cosh, far from the bounds
-                expected = rewards.tolerance(x.numpy(), bounds, margin, sigmoid, value)
+            expected = rewards.tolerance(x.numpy(), bounds, margin, sigmoid, value)
             got = tolerance(x, *bounds, margin, sigmoid, value)
             assert got.dtype == dtype
             np.testing.assert_allclose(got.numpy(), expected, rtol=0, atol=atol)
 
 
-@pytest.mark.parametrize("sigmoid", ["cosine", "linear", "quadratic"])
-def test_tolerance_may_reach_zero_at_the_margin(sigmoid):
+def test_tolerance_may_reach_zero_at_the_margin():
     x = torch.linspace(-2, 2, 81, dtype=torch.float64)
-    expected = rewards.tolerance(x.numpy(), (-0.5, 0.5), 0.6, sigmoid, 0.0)
-    np.testing.assert_allclose(tolerance(x, -0.5, 0.5, 0.6, sigmoid, 0.0).numpy(), expected, rtol=0, atol=1e-12)
+    expected = rewards.tolerance(x.numpy(), (-0.5, 0.5), 0.6, "linear", 0.0)
+    np.testing.assert_allclose(tolerance(x, -0.5, 0.5, 0.6, "linear", 0.0).numpy(), expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("sigmoid", SIGMOIDS)
@@ -93,9 +89,9 @@ def test_tolerance_has_the_same_bits_in_every_layout(sigmoid):
     [
         ({"lower": 1.0, "upper": 0.0}, "expected lower <= upper"),
         ({"margin": -1.0}, "margin = -1.0"),
-        ({"margin": 1.0, "sigmoid": "step"}, "unknown sigmoid 'step'.*'long_tail'"),
+        ({"margin": 1.0, "sigmoid": "step"}, "unknown sigmoid 'step': expected one of linear, long_tail"),
         ({"margin": 1.0, "value_at_margin": 1.0}, "value_at_margin is 1.0"),
-        ({"margin": 1.0, "value_at_margin": 0.0}, "value_at_margin is 0.0 for sigmoid 'gaussian'"),
+        ({"margin": 1.0, "value_at_margin": 0.0}, "value_at_margin is 0.0 for sigmoid 'long_tail'"),
     ],
 )
 def test_tolerance_rejects(arguments, message):
@@ -115,21 +111,12 @@ def test_weighted_sum_adds_first_to_last(width):
     assert weighted_sum(weights, values).equal(torch.stack(expected))
 
 
-def test_features_by_index_name_and_path():
+def test_features_by_index_and_slice():
     tensor = torch.arange(6.0).reshape(2, 3)
     assert feature(tensor, 1).tolist() == [1, 4]
     assert feature(tensor, slice(1, 3)).shape == (2, 2)
-    nested = TensorDict({"speed": torch.ones(2, 1), "gait": {"length": torch.zeros(2), "arms": tensor}}, [2])
-    assert feature(nested, "speed").shape == (2, 1)
-    assert scalar_feature(nested, "speed", like=torch.zeros(2)).shape == (2,)
-    assert scalar_feature(nested, ("gait", "length"), like=torch.zeros(2)).shape == (2,)
-    assert feature(nested, ("gait", "arms", 2)).tolist() == [2, 5]
-    assert feature(nested, ("speed", 0)).shape == (2,)
-    with pytest.raises(KeyError, match=r"no style feature named sped: .* emits gait\.arms, gait\.length, speed\."):
-        feature(nested, "sped")
-    for missing in ("speed", 3):
-        with pytest.raises(KeyError, match=f"no style feature named {missing}: .* one tensor of 3 columns"):
-            feature(tensor, missing)
+    with pytest.raises(KeyError, match="no style feature 3: the environment emits 3 columns"):
+        feature(tensor, 3)
 
 
 def test_terms_closed_form():
@@ -140,8 +127,6 @@ def test_terms_closed_form():
     # long tail: 0.1 at a margin's distance
     at_margin = SetpointTolerance("length", 2, margin=0.05)
     torch.testing.assert_close(at_margin(features, style), torch.tensor([1.0, 0.1]), atol=1e-6, rtol=0)
-    inside = SetpointTolerance("length", 2, margin=0.05, half_width=0.06)
-    assert inside(features, style).tolist() == [1.0, 1.0]
     gated = SetpointTolerance("length", 2, margin=0.05, gate=1)
     torch.testing.assert_close(gated(features, style), torch.tensor([4.0, 0.6]), atol=1e-5, rtol=0)
     with pytest.raises(ValueError, match=r"reads 3 features for 2 weights \('w', 'v'\)"):
@@ -163,9 +148,8 @@ def test_choice_tolerance_uses_the_bounds_of_the_option():
     torch.testing.assert_close(term(features, style), torch.tensor([(1 + 0.55) / 2, 0.0, 1.0]))
     with pytest.raises(ValueError, match="lower <= upper"):
         ChoiceTolerance("pose", 0, lower=[[1.0]], upper=[[0.0]], margin=1.0)
-    for index in (0, ("arms", 0)):
-        with pytest.raises(ValueError, match=r"'pose' has the key .*, an index: expected a slice or a name"):
-            ChoiceTolerance("pose", index, lower=[[0.0]], upper=[[1.0]], margin=1.0)
+    with pytest.raises(ValueError, match=r"'pose' has the key 0, an index: expected a slice"):
+        ChoiceTolerance("pose", 0, lower=[[0.0]], upper=[[1.0]], margin=1.0)
     with pytest.raises(ValueError, match=r"'pose' reads 1 features by key slice\(0, 2, None\): expected 2"):
         term(features[:, :1], style)
     poses = StyleSpace([Choice("pose", ("a", "b", "c"))])
@@ -237,19 +221,6 @@ def test_same_bits_in_every_shape_and_layout(name):
         assert out.shape == (len(batch), labels, 1)
         assert out[:, 0].equal(collected.reshape(-1, 1))
         assert out[:, 2].equal(reward(batch, relabelled[:, 2]))
-
-
-def test_nested_features_give_the_same_bits_as_stored_and_stacked():
-    space = StyleSpace([Setpoint("length", 0.3, 0.65), Weight("fuel", -3, 105)])
-    reward = StyleReward(
-        space,
-        {"length": SetpointTolerance("length", ("gait", "length"), 0.05), "fuel": WeightedFeature("fuel", "burnt")},
-    )
-    steps = [TensorDict({"gait": {"length": torch.rand(4)}, "burnt": torch.rand(4, 1)}, [4]) for _ in range(6)]
-    theta = space.sample((6, 4))
-    collected = torch.stack([reward(f, t) for f, t in zip(steps, theta, strict=True)])
-    assert reward(lazy_stack(steps), theta).equal(collected)
-    assert reward(torch.stack(steps).reshape(-1), theta.reshape(-1, 2)).equal(collected.reshape(-1, 1))
 
 
 def test_reward_is_the_scaled_sum_of_its_terms():

@@ -167,6 +167,17 @@ def test_replay_files_hold_only_what_is_filled(tmp_path):
         read_replay(_buffer(10), tmp_path / "replay")
 
 
+@pytest.mark.parametrize("version", [None, 1, 3])
+def test_records_of_another_version_are_refused(tmp_path, version):
+    replay = _buffer(10)
+    replay.extend(_records(0, 5))
+    write_replay(replay, tmp_path)
+    index = json.loads((tmp_path / "index.json").read_text())
+    (tmp_path / "index.json").write_text(json.dumps({**index, "version": version}))
+    with pytest.raises(CheckpointError, match=f"it has version {version}, expected 2"):
+        read_replay(_buffer(10), tmp_path)
+
+
 def test_generators_are_restored_without_pickle(tmp_path):
     import random
 
@@ -248,6 +259,15 @@ def test_a_file_cannot_choose_what_is_called(make_train, tmp_path):
     torch.save(state, tmp_path / "harmful.pt")
     with pytest.raises(CheckpointError, match=r"names 'os\.system' as its network: expected coachable\.networks\."):
         load_policy(tmp_path / "harmful.pt")
+
+
+def test_a_policy_with_other_bounds_of_actions_is_refused(make_train, tmp_path):
+    make_train(total_frames=80).run()
+    state = torch.load(find_checkpoint(tmp_path / "run") / "state.pt", weights_only=True)
+    state["network"]["actor"] |= {"low": -2.0, "high": 2.0}
+    torch.save(state, tmp_path / "wide.pt")
+    with pytest.raises(CheckpointError, match=r"a network that cannot be used: .*'low'"):
+        load_policy(tmp_path / "wide.pt")
 
 
 def test_weights_name_no_path_of_the_machine_that_trained(make_train, tmp_path):

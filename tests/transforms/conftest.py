@@ -15,14 +15,15 @@ from coachable.styles import Choice, Setpoint, SetpointTolerance, StyleReward, S
 class FeaturesEnv(EnvBase):
     """N independent streams of random features; an episode ends with probability `p_done` per step.
 
-    With `rewards_apart` the task reward is declared as a reward (absent at reset), otherwise as an observation.
+    With `rewards_apart` the task reward is declared as a reward (absent at reset), otherwise as an observation. With
+    `nested` the style features are declared as a nested entry, which is refused before anything is emitted.
     """
 
     def __init__(
         self, num_envs: int = 4, p_done: float = 0.2, rewards_apart: bool = False, nested: bool = False
     ) -> None:
         super().__init__(batch_size=[num_envs])
-        self.p_done, self.rewards_apart, self.nested = p_done, rewards_apart, nested
+        self.p_done, self.rewards_apart = p_done, rewards_apart
         shape = (num_envs,)
         features = Unbounded((num_envs, 3))
         if nested:
@@ -48,10 +49,7 @@ class FeaturesEnv(EnvBase):
         return torch.rand(*self.batch_size, width, generator=self.generator)
 
     def _emit(self) -> TensorDict:
-        features = self._rand(3)
-        if self.nested:
-            features = TensorDict({"values": features}, self.batch_size)
-        return TensorDict({"observation": self._rand(2), "style_features": features}, self.batch_size)
+        return TensorDict({"style_features": self._rand(3), "observation": self._rand(2)}, self.batch_size)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
         out = self._emit()
@@ -78,20 +76,16 @@ def space() -> StyleSpace:
 
 @pytest.fixture
 def make_style_reward() -> Callable[..., StyleReward]:
-    """Makes the reward of `space` for `FeaturesEnv(nested=...)`."""
+    """Makes the reward of `space` for `FeaturesEnv`."""
 
-    def make(space: StyleSpace, nested: bool = False) -> StyleReward:
-        def key(index: int) -> Any:
-            return ("values", index) if nested else index
-
-        def pose(features: Any, style: Any) -> torch.Tensor:
-            picked = features["values"] if nested else features
-            return style["pose"][..., 0] * picked[..., 0] + style["pose"][..., 1] * picked[..., 2].sqrt()
+    def make(space: StyleSpace) -> StyleReward:
+        def pose(features: torch.Tensor, style: Any) -> torch.Tensor:
+            return style["pose"][..., 0] * features[..., 0] + style["pose"][..., 1] * features[..., 2].sqrt()
 
         terms = {
             "pose": Term(pose, parameters=("pose",)),
-            "length": SetpointTolerance("length", key(1), margin=0.05),
-            "fuel": WeightedFeature("fuel", key(2)),
+            "length": SetpointTolerance("length", 1, margin=0.05),
+            "fuel": WeightedFeature("fuel", 2),
         }
         return StyleReward(space, terms, scales={"length": 1 / 3, "fuel": -0.01})
 

@@ -20,17 +20,16 @@ from coachable.transforms import StyleRewardTransform, StyleSampler, coachable_e
 
 @pytest.fixture
 def make_env(space, make_style_reward, make_base_env):
-    def make(num_envs=4, seed=0, nested=False, rewards_apart=False, transforms=()):
-        base = make_base_env(num_envs, nested=nested, rewards_apart=rewards_apart)
-        return coachable_env(base, space, make_style_reward(space, nested), *transforms, seed=seed)
+    def make(num_envs=4, seed=0, rewards_apart=False, transforms=()):
+        base = make_base_env(num_envs, rewards_apart=rewards_apart)
+        return coachable_env(base, space, make_style_reward(space), *transforms, seed=seed)
 
     return make
 
 
-@pytest.mark.parametrize("nested", [False, True])
 @pytest.mark.parametrize("rewards_apart", [False, True])
-def test_specs(make_env, nested, rewards_apart):
-    env = make_env(nested=nested, rewards_apart=rewards_apart)
+def test_specs(make_env, rewards_apart):
+    env = make_env(rewards_apart=rewards_apart)
     check_env_specs(env)
     # the task reward is bounded by [0, 1], the sum is not
     assert isinstance(env.full_reward_spec["reward"], Unbounded)
@@ -38,11 +37,10 @@ def test_specs(make_env, nested, rewards_apart):
     assert {"style_reward", "task_reward"} <= set(home.keys())
 
 
-@pytest.mark.parametrize("nested", [False, True])
 @pytest.mark.parametrize("rewards_apart", [False, True])
-def test_reward_of_stored_transitions_is_bitwise_equal(make_env, space, make_style_reward, nested, rewards_apart):
-    rollout = make_env(num_envs=8, nested=nested, rewards_apart=rewards_apart).rollout(40, break_when_any_done=False)
-    reward = make_style_reward(space, nested)  # another instance, as the learner's process has
+def test_reward_of_stored_transitions_is_bitwise_equal(make_env, space, make_style_reward, rewards_apart):
+    rollout = make_env(num_envs=8, rewards_apart=rewards_apart).rollout(40, break_when_any_done=False)
+    reward = make_style_reward(space)  # another instance, as the learner's process has
     for stored in (rollout, rollout.contiguous(), rollout.contiguous().reshape(-1)):
         style_reward = reward(stored["next", "style_features"], stored["style"])
         assert stored["next", "style_reward"].equal(style_reward)
@@ -51,14 +49,13 @@ def test_reward_of_stored_transitions_is_bitwise_equal(make_env, space, make_sty
     assert rollout["next", "style_reward"].abs().min() > 0
 
 
-@pytest.mark.parametrize("nested", [False, True])
-def test_reward_of_expanded_samples_is_bitwise_equal(make_env, space, make_style_reward, nested):
+def test_reward_of_expanded_samples_is_bitwise_equal(make_env, space, make_style_reward):
     """[B] to [B, n+1] with the original style in column 0, as relabelling does."""
-    rollout = make_env(num_envs=8, nested=nested).rollout(40, break_when_any_done=False)
+    rollout = make_env(num_envs=8).rollout(40, break_when_any_done=False)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(320), batch_size=64)
     buffer.extend(rollout.contiguous().reshape(-1))
     sample = buffer.sample()
-    reward = make_style_reward(space, nested)
+    reward = make_style_reward(space)
     wide = sample.unsqueeze(1).expand(64, 5)
     for batch in (wide, wide.clone()):
         batch = batch.clone(recurse=False)
@@ -131,3 +128,9 @@ def test_an_environment_without_task_reward_is_told_how_to_add_it(space, make_st
     base = TransformedEnv(make_base_env(), ExcludeTransform("task_reward", "style_features"))
     with pytest.raises(KeyError, match=r"declare observation, reward, style: .* expects task_reward and .*; add"):
         coachable_env(base, space, make_style_reward(space)).rollout(2)
+
+
+def test_nested_features_are_refused_when_the_specs_are_read(space, make_style_reward, make_base_env):
+    env = coachable_env(make_base_env(nested=True), space, make_style_reward(space))
+    with pytest.raises(ValueError, match=r"declare style_features with the entries values: expected one tensor"):
+        _ = env.observation_spec

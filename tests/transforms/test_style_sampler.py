@@ -95,20 +95,18 @@ def test_unseeded_environments_differ(make_env):
 
 def test_styles_are_not_the_numbers_of_the_environment(space):
     """An environment seeded with the same number draws its start states from the same stream: not the styles."""
-    sampler = StyleSampler(space, Product([UniformChoice(2), Uniform([0.3, 0.0], [0.65, 1.0])]), seed=11)
+    sampler = StyleSampler(space, seed=11)
     assert sampler.generator.initial_seed() != 11
-    assert StyleSampler(space, seed=11).generator.initial_seed() == sampler.generator.initial_seed()
+    other = space.with_sampler(Product([UniformChoice(2), Uniform([0.3, 0.0], [0.65, 1.0])]))
+    assert StyleSampler(other, seed=11).generator.initial_seed() == sampler.generator.initial_seed()
     seeds = {StyleSampler(space, seed=seed).generator.initial_seed() for seed in range(-5, 200)}
     assert len(seeds) == 205
 
 
-def test_own_sampler(make_env):
-    corner = PointMass([0.0, 1.0, 0.65, 105.0])
-    assert make_env(sampler=corner).reset()["style"].unique(dim=0).shape[0] == 1
-    with pytest.raises(ValueError, match=r"the sampler draws 1 numbers, .* need 4"):
-        make_env(sampler=PointMass(0.0))
-    with pytest.raises(ValueError, match="the sampler does not fit the parameters"):
-        make_env(sampler=PointMass([0.0, 1.0, 99.0, 105.0]))
+def test_styles_are_drawn_from_the_sampler_of_the_space(space, make_style_reward, make_base_env):
+    corner = space.with_sampler(PointMass([0.0, 1.0, 0.65, 105.0]))
+    env = coachable_env(make_base_env(), corner, make_style_reward(corner))
+    assert env.reset()["style"].equal(torch.tensor([0.0, 1.0, 0.65, 105.0]).expand(4, 4))
 
 
 def test_imposed_at_reset(make_env, space):

@@ -23,4 +23,4 @@ def combat_events(
     """
     space = combat_style_space(styles, reward_scale)
     extra = ["kill"] if kill_event else []
-    return KeyEvents([*space.names, *extra]) if every_style else StyleEvents.of(space, extra=extra)
+    return KeyEvents([*space.names, *extra]) if every_style else StyleEvents(space, extra)
