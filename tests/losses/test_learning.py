@@ -34,7 +34,7 @@ LOSSES: dict[str, tuple[Callable[..., LossModule], Callable[..., Any], dict[str,
     "sac_categorical": (CategoricalSACLoss, make_hl_gauss_critic, {"alpha": 0.2, **BINS}, "policy_first"),
 }
 ONLY_AXES = ("sac", "qr_sac")
-UPDATES = {"sac": 90, "qr_sac": 90, "rac": 200, "cat_rac": 180, "sac_categorical": 180}
+UPDATES = {"sac": 90, "qr_sac": 90, "rac": 200, "cat_rac": 300, "sac_categorical": 300}
 # Mixed actions have both kinds of component: where a loss serves them, actions of one kind are left to the slow tests.
 SERVED = [
     pytest.param(loss, kind, marks=() if loss in ONLY_AXES or kind == "mixed" else pytest.mark.slow)
