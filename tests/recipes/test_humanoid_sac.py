@@ -157,10 +157,16 @@ def test_a_training_too_short_for_an_update_says_so(tmp_path, capsys):
 
 def test_hydras_options_pass_through():
     arguments = checked_arguments("humanoid_sac", ["preset=cpu", "--cfg", "job", "train.total_frames=1e6"])
-    assert arguments == ["--cfg", "job", "train.total_frames=1e6", "preset=humanoid_sac/cpu"]
+    assert arguments == ["train.total_frames=1e6", "preset=humanoid_sac/cpu", "--cfg", "job"]
     assert _compose("+note=mine")["note"] == "mine"
-    arguments = checked_arguments("humanoid_sac", ["--multirun", "preset=smoke,cpu", "seed=0,1"])
-    assert arguments == ["--multirun", "seed=0,1", "preset=humanoid_sac/smoke,humanoid_sac/cpu"]
+    assert checked_arguments("humanoid_sac", ["preset=cpu", "--info"]) == ["preset=humanoid_sac/cpu", "--info"]
+    assert checked_arguments("humanoid_sac", ["--hydra-help"]) == ["--hydra-help"]
+
+
+@pytest.mark.parametrize("arguments", [["--multirun"], ["-m", "seed=0,1"], ["seed=0,1"], ["preset=smoke,cpu"]])
+def test_sweeps_are_refused(arguments):
+    with pytest.raises(SystemExit, match=r"expected coachable train humanoid_sac seeds=0,1,2 for several seeds"):
+        checked_arguments("humanoid_sac", arguments)
 
 
 def test_resumed_runs_equal_uninterrupted_ones(tmp_path):
