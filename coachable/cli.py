@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from coachable import __version__
-from coachable.coach.sources import SOURCE_HELP, require_agent
 from coachable.gl import RenderingError, choose_gl_backend
+from coachable.shipped import SOURCE_HELP, require_agent
 
 __all__ = ["main"]
 
@@ -267,10 +267,11 @@ def _export(options: argparse.Namespace) -> int:
         from coachable.export.web.simulated_page import export_page
         from coachable.training.weights import domain_of, load_policy
 
-        out = options.out or Path("site")
-        acts = domain_of(load_policy(options.source)).make_web is not None
-        write = export_page if acts else export_recordings
-        size = write(options.source, out, options.assets, env_options=env_options)
+        out, agent = options.out or Path("site"), load_policy(options.source)
+        domain = domain_of(agent)
+        domain = domain.with_options(domain.read_options(env_options))
+        write = export_recordings if domain.make_web is None else export_page
+        size = write(agent, domain, out, options.assets)
         print(f"wrote {out} ({size / 1e6:.1f} MB); see it with: python3 -m http.server --directory {out}")
         return 0
     if of_pages := [*(["assets"] if options.assets else []), *env_options]:
