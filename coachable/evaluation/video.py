@@ -27,7 +27,6 @@ from coachable.training.rollout import Rollout
 from coachable.training.weights import domain_of, load_policy
 
 VIDEO_SUFFIXES = (".mp4", ".gif", ".webp", ".png")
-_IMAGE_FPS = 20  # of recorded sessions that are not mp4
 _FPS = (1.0, 60.0)  # least and most
 _WEBP_QUALITY = 50  # of 100
 _MOST, _FEWEST = 3, 2  # measures in a caption, as many as fit, and in that of a narrow film
@@ -110,7 +109,7 @@ def render(
         if sheet:
             Image.fromarray(tiled(list(bar))).save(unfinished)
         else:
-            write_video(bar, unfinished, fps, every=1)
+            write_video(bar, unfinished, fps)
     return out
 
 
@@ -138,21 +137,20 @@ def default_tour(domain: Domain, space: StyleSpace) -> list[dict[str, Any]]:
     ]
 
 
-def write_video(frames: Iterable[np.ndarray], out: Path, fps: float, every: int | None = None) -> None:
+def write_video(frames: Iterable[np.ndarray], out: Path, fps: float) -> None:
     """Write frames (height, width, 3) uint8 as mp4 (H.264), gif or animated WebP.
 
     Args:
         frames: The frames.
         out: File to write, `.mp4`, `.gif` or `.webp`.
         fps: Frames per second.
-        every: Of gif and WebP, every which frame is written; by default as many as make about 20 per second.
     """
     if out.suffix != ".mp4":
-        stride = every or max(1, int(fps) // _IMAGE_FPS)
-        images = [Image.fromarray(frame) for frame in itertools.islice(frames, 0, None, stride)]
-        options: dict[str, Any] = {"append_images": images[1:], "duration": round(1000 * stride / fps), "loop": 0}
-        options |= {"quality": _WEBP_QUALITY} if out.suffix == ".webp" else {}
-        images[0].save(out, save_all=True, **options)
+        images = [Image.fromarray(frame) for frame in frames]
+        ends = np.round(np.arange(len(images) + 1) * 100 / fps) * 10  # [ms], in the hundredths of a second of a gif
+        options: dict[str, Any] = {"quality": _WEBP_QUALITY} if out.suffix == ".webp" else {}
+        durations = np.diff(ends).astype(int).tolist()
+        images[0].save(out, save_all=True, append_images=images[1:], duration=durations, loop=0, **options)
         return
     av = _import_av()
     with av.open(str(out), "w") as container:
