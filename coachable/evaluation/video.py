@@ -50,7 +50,6 @@ def render(
     fps: float = 20.0,
     seed: int = 0,
     together: bool = False,
-    progress: bool = True,
 ) -> Path:
     """Film one agent, with the requested and the measured style in the picture.
 
@@ -65,7 +64,6 @@ def render(
         fps: Pictures per second, from 1 to 60. A domain with a scene is drawn between its control steps as well.
         seed: Seed of the initial state and of sampled actions.
         together: Whether to show all styles at once, side by side in rows of three, instead of one after the other.
-        progress: Whether to show a progress bar.
 
     Returns:
         `out`.
@@ -104,7 +102,7 @@ def render(
         panels = [film([request]) for request in requests]
         frames = (tiled(row) for row in zip(*panels, strict=True))
     total = len(requests) if sheet else math.floor(steps * domain.control_step * fps + _ROUNDING)
-    bar = tqdm(frames, total=total, desc="drawing", unit="frame", disable=None if progress else True, leave=False)
+    bar = tqdm(frames, total=total, desc="drawing", unit="frame", disable=None, leave=False)
     with complete_file(out) as unfinished:
         if sheet:
             Image.fromarray(tiled(list(bar))).save(unfinished)

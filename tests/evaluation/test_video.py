@@ -59,7 +59,7 @@ def test_styles_are_filmed_together_or_in_turn(tmp_path, monkeypatch, suffix, to
     monkeypatch.setattr(video, "domain_of", lambda agent: replace(domain_of(agent), make_renderer=GreyRenderer))
     styles = [{"step_length": length} for length in (0.3, 0.4, 0.5, 0.6)]
     settings = {"styles": styles, "seconds_per_style": 0.2, "size": (160, 100), "together": together}
-    out = render("humanoid", tmp_path / f"film{suffix}", progress=False, **settings)
+    out = render("humanoid", tmp_path / f"film{suffix}", **settings)
     with Image.open(out) as image:
         assert getattr(image, "n_frames", 1) == count and image.size == size
 
