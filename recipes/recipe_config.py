@@ -312,13 +312,16 @@ def announce(config: dict[str, Any], trainer: Trainer) -> None:
     later = sum(hours(stage, stage.train.total_frames) for stage in stages[number:])
     if settings.resume:
         print(f"Resumed {settings.resume} at {trainer.frames:,} env-steps")
-    print(f"Found {detect().describe()}: preset {settings.preset}, {learner.precision} updates")
+    hardware = detect()
+    print(f"Found {hardware.describe()}: preset {settings.preset}, {learner.precision} updates")
     estimate = f"{remaining:,} env-steps to go, about {time_left:.1f} h ({seconds * 1e3:.0f} ms per update)"
     if stages:
         estimate = f"Stage {number} of {len(stages)}, {settings.stage}: {estimate}"
     if later:
         estimate += f"; with the stages that follow about {time_left + later:.1f} h"
     print(estimate)
+    if bf16 and not hardware.bf16:
+        print("warning: this machine has no bf16 in hardware, so that updates take much longer than with fp32 or auto")
     if remaining and settings.train.warmup_frames >= settings.train.total_frames:
         print(
             f"warning: no update will be made, because train.warmup_frames={settings.train.warmup_frames:,} is not "

@@ -10,6 +10,7 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+import recipe_config
 import torch
 from recipe_config import announce, checked_arguments, compose_config
 
@@ -17,6 +18,7 @@ from coachable.domains.humanoid import humanoid_style_reward
 from coachable.envs.humanoid import HumanoidEnv
 from coachable.training import Learner
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
+from coachable.training.hardware import Hardware
 from coachable.training.train_settings import TrainSettings
 from coachable.training.weights import domain_of, load_policy
 
@@ -153,6 +155,16 @@ def test_a_training_too_short_for_an_update_says_so(tmp_path, capsys):
     config = compose_config("rare_targets", ["preset=smoke", "train.total_frames=100", f"run_dir={tmp_path}"])
     announce(config, import_module("rare_targets").build(config))
     assert "warning: no update will be made, because train.warmup_frames=" in capsys.readouterr().out
+
+
+def test_bf16_without_hardware_for_it_says_so(tmp_path, capsys, monkeypatch):
+    settings = ["preset=smoke", "learner.precision=bf16", "train.total_frames=200", f"run_dir={tmp_path}"]
+    config = compose_config("rare_targets", settings)
+    train = import_module("rare_targets").build(config)
+    for has_bf16 in (True, False):
+        monkeypatch.setattr(recipe_config, "detect", lambda bf16=has_bf16: Hardware(2, 0.0, 8.0, None, bf16))
+        announce(config, train)
+        assert ("warning: this machine has no bf16 in hardware" in capsys.readouterr().out) != has_bf16
 
 
 def test_hydras_options_pass_through():
