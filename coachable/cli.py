@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from coachable import __version__
-from coachable.coach.sources import SOURCE_HELP, require_agent
 from coachable.gl import RenderingError, choose_gl_backend
+from coachable.shipped import SOURCE_HELP, require_agent
 
 __all__ = ["main"]
 
 _LARGEST = 2**31 - 1
-_PICTURES = (".png", ".svg", ".pdf")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -135,7 +134,7 @@ def _parser() -> argparse.ArgumentParser:
 
     export = command("export", _export, "write a policy as one ONNX file, or a page on which the agent acts")
     text = "onnx: one file, to run the policy without torch; web: a page for the visitor's browser"
-    export.add_argument("format", type=_format, metavar="FORMAT", help=text)
+    export.add_argument("format", choices=("onnx", "web"), help=text)
     export.add_argument("source", help=SOURCE_HELP)
     export.add_argument("--out", type=Path, help="(default: the file policy.onnx, or the folder site)")
     text = "of a page: folder with the files of other projects, like node_modules (default: npm fetches them)"
@@ -189,6 +188,8 @@ def _train(options: argparse.Namespace) -> int:
 def _train_seeds(file: Path, arguments: list[str], seeds: str) -> int:
     from coachable.evaluation.many_seeds import parse_seeds, seed_table, train_seeds
 
+    if flags := [argument for argument in arguments if argument.startswith("-")]:
+        raise ValueError(f"{seeds} with {flags[0]}: expected KEY=VALUE only")
     given = [argument.partition("=") for argument in arguments]
     for key in ("seed", "resume", "stage"):
         if any(name == key for name, _, _ in given):
@@ -236,8 +237,6 @@ def _render(options: argparse.Namespace) -> int:
 def _curves(options: argparse.Namespace) -> int:
     from coachable.evaluation.curves import draw_learning_curves
 
-    if options.out.suffix.lower() not in _PICTURES:
-        raise ValueError(f"cannot draw {options.out.name}: expected a file ending in one of {', '.join(_PICTURES)}")
     last = draw_learning_curves(dict(options.groups), options.out, x=options.x, y=options.y, smooth=options.smooth)
     for label, value in last.items():
         print(f"{label}: {options.y} {value:.4g} at the end")
@@ -267,10 +266,11 @@ def _export(options: argparse.Namespace) -> int:
         from coachable.export.web.simulated_page import export_page
         from coachable.training.weights import domain_of, load_policy
 
-        out = options.out or Path("site")
-        acts = domain_of(load_policy(options.source)).make_web is not None
-        write = export_page if acts else export_recordings
-        size = write(options.source, out, options.assets, env_options=env_options)
+        out, agent = options.out or Path("site"), load_policy(options.source)
+        domain = domain_of(agent)
+        domain = domain.with_options(domain.read_options(env_options))
+        write = export_recordings if domain.make_web is None else export_page
+        size = write(agent, domain, out, options.assets)
         print(f"wrote {out} ({size / 1e6:.1f} MB); see it with: python3 -m http.server --directory {out}")
         return 0
     if of_pages := [*(["assets"] if options.assets else []), *env_options]:
@@ -328,14 +328,6 @@ def _at_least(lowest: int) -> Callable[[str], int]:
         return value
 
     return number
-
-
-def _format(text: str) -> str:
-    if text not in ("onnx", "web"):
-        raise argparse.ArgumentTypeError(
-            f"{text!r}: expected onnx or web before the agent, as in coachable export onnx {text}"
-        )
-    return text
 
 
 def _style(text: str) -> dict[str, str]:

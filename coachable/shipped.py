@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
-__all__ = ["located", "shipped_agents"]
+__all__ = ["SOURCE_HELP", "located", "require_agent", "shipped_agents"]
+
+SOURCE_HELP = "a run's folder, a checkpoint, a weights file, an exported model, or a domain that ships with weights"
 
 _PRETRAINED = Path(__file__).resolve().parent / "pretrained"
 _OF_RUNS = ("state.pt", "frames_*", "checkpoints", "stages")  # in the folder of a run or a checkpoint
@@ -28,3 +31,22 @@ def located(source: Path | str) -> Path:
     if str(source) not in shipped_agents() or path.is_file() or any(any(path.glob(name)) for name in _OF_RUNS):
         return path
     return _PRETRAINED / str(source) / "weights.pt"
+
+
+def require_agent(source: str) -> None:
+    """Check that a source can be an agent.
+
+    Args:
+        source: What the command line names.
+
+    Raises:
+        ValueError: If it cannot; the message lists the agents that ship with weights.
+    """
+    shipped = shipped_agents()
+    if source in shipped or (source and Path(source).is_dir()):
+        return
+    names = ", ".join(shipped)
+    if not source or not Path(source).exists():
+        raise ValueError(f"there is no agent {source!r}: expected {SOURCE_HELP} ({names})")
+    if not source.endswith(".onnx") and not zipfile.is_zipfile(source):
+        raise ValueError(f"{source} is no weights file: expected {SOURCE_HELP} ({names})")

@@ -18,6 +18,7 @@ from coachable.coach.page.coach_page import CoachPage
 from coachable.coach.page.server import make_server, page_address
 from coachable.coach.session.session import CoachSession
 from coachable.export.web.simulated_page import export_page
+from coachable.training.weights import domain_of, load_policy
 
 IMAGES = Path(__file__).resolve().parent / "images"
 REQUEST = "#pose=t_pose&step_length=0.50"
@@ -46,7 +47,8 @@ class Quiet(http.server.SimpleHTTPRequestHandler):
 def static_page() -> Iterator[str]:
     """Address of the walker's static page."""
     with tempfile.TemporaryDirectory() as folder:
-        export_page("humanoid", Path(folder))
+        agent = load_policy("humanoid")
+        export_page(agent, domain_of(agent), Path(folder))
         handler = functools.partial(Quiet, directory=folder)
         with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
             threading.Thread(target=server.serve_forever, daemon=True).start()

@@ -16,7 +16,7 @@ import recipe_boxes as boxes
 from recipe_config import run_recipe
 from torchrl.envs import Compose, EnvBase
 
-from coachable.domains.racing.families import family_style
+from coachable.domains.racing.families import racing_family
 from coachable.domains.racing.mirror_maps import racing_mirror_maps
 from coachable.fast import accelerate
 from coachable.training.collection import simulation_env
@@ -32,9 +32,10 @@ def build(config: dict[str, Any]) -> Trainer:
     cfg = run.settings
 
     # Styles and their reward
-    space, family_reward = family_style(cfg.family)
+    family = racing_family(cfg.family)
+    space = family.make_space()
     space = space.with_sampler(cfg.sampler.build(space))
-    style_reward = boxes.make_style_reward(run, family_reward, space)
+    style_reward = boxes.make_style_reward(run, family.make_reward, space)
 
     # Environment: styles are drawn at reset, the reward is the sum of the task's and the style's
     def make_env(seed: int, **settings: Any) -> EnvBase:

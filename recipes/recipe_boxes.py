@@ -29,7 +29,7 @@ from coachable.replay.replay_files import replay_bytes
 from coachable.styles import Sampler, StyleReward, StyleSpace
 from coachable.styles.mixtures import single_weight
 from coachable.training.async_collector import AsyncCollector
-from coachable.training.checkpoint import CheckpointStore, check_unused, check_writable
+from coachable.training.checkpoint import CheckpointStore, check_unused, check_writable, claim_folder
 from coachable.training.collection import evaluate_policy, simulation_env
 from coachable.training.hardware import pick_device, share_threads
 from coachable.training.learner import Learner
@@ -241,13 +241,15 @@ def open_run_dir(run: Run, env: EnvBase, replay: ReplayBuffer) -> None:
         replay: The replay buffer that is saved in checkpoints.
 
     Raises:
-        CheckpointError: If the folder holds another run, cannot be written to, or its disk is too small.
+        CheckpointError: If the folder holds another run, another process writes to it, it cannot be written to, or its
+            disk is too small.
     """
     settings = run.settings
     run_dir = Path(settings.run_dir)
     if not settings.resume or not Path(settings.resume).resolve().is_relative_to(run_dir.resolve()):
         check_unused(run_dir)
     check_writable(run_dir)
+    claim_folder(run_dir)
     if settings.checkpoint.replay:  # two at a time: the old one is removed when the new one is complete
         size = replay_bytes(replay, env, stored_keys(run, env, replay))
         kept = sum(file.stat().st_size for file in run_dir.glob("checkpoints/*/replay/*"))

@@ -13,12 +13,10 @@ from typing import Any
 
 import hydra
 from configs.schema import register_schema
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -133,7 +131,7 @@ def compose_config(config_name: str, arguments: list[str]) -> dict[str, Any]:
     Returns:
         The configuration as plain containers.
     """
-    _, given, _ = _hydra_arguments(config_name, arguments)
+    _, given = _hydra_arguments(config_name, arguments)
     return plain_config(_composed(config_name, given), given, config_name)
 
 
@@ -152,38 +150,37 @@ def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
     """
     if any(argument.startswith("seeds=") for argument in arguments):
         raise SystemExit(f"error: several seeds are trained with coachable train {config_name} seeds=0,1,2")
-    options, given, overrides = _hydra_arguments(config_name, arguments)
-    jobs = [given]
-    if options.multirun:
-        ((*jobs,),) = BasicSweeper.split_arguments(overrides, max_batch_size=None)
+    options, given = _hydra_arguments(config_name, arguments)
+    if options.hydra_help or options.shell_completion:
+        return arguments
     folder = [f"hydra.searchpath=[file://{Path(options.config_dir).absolute()}]"] if options.config_dir else []
     if not options.config_path:
-        for job in jobs:
-            _composed(options.config_name or config_name, [*job, *folder])
+        _composed(options.config_name or config_name, [*given, *folder])
     flags = [argument for argument in _quoted_paths(arguments) if argument not in options.overrides]
-    return [*flags, *given]  # Hydra's parser does not accept overrides both before and after its options
+    return [*given, *flags]  # Hydra's parser does not accept overrides both before and after its options
 
 
-def _hydra_arguments(config_name: str, arguments: list[str]) -> tuple[Namespace, list[str], list[Override]]:
+def _hydra_arguments(config_name: str, arguments: list[str]) -> tuple[Namespace, list[str]]:
     """Return Hydra's options, and the overrides with the preset that was given or that fits this machine."""
     options = get_args_parser().parse_intermixed_args(_quoted_paths(arguments))
-    parser = OverridesParser.create()
     try:
-        overrides = parser.parse_overrides(options.overrides)
+        overrides = OverridesParser.create().parse_overrides(options.overrides)
     except HydraException as error:
         raise SystemExit(f"error: {error}\nexpected KEY=VALUE, for example loss=sac or train.batch_size=256") from None
+    sweeps = ["--multirun"] * options.multirun + [o.input_line or "" for o in overrides if o.is_sweep_override()]
+    if sweeps:
+        raise SystemExit(
+            f"error: {sweeps[0]} asks for several trainings: expected coachable train {config_name} seeds=0,1,2 for "
+            "several seeds, one command for each other training, and KEY=[VALUE,VALUE] for a list"
+        )
     chosen = [o for o in overrides if o.key_or_group == "preset"]
-    presets = [
-        choice for o in chosen for choice in (o.sweep_string_iterator() if o.is_sweep_override() else [o.value()])
-    ]
-    if presets in ([], ["auto"]):
+    preset = chosen[-1].value() if chosen else "auto"
+    if preset == "auto":
         automatic = OmegaConf.load(CONFIGS / "preset" / config_name / "auto.yaml")
-        presets = [automatic.preset_for[choose_preset(detect())]]
+        preset = automatic.preset_for[choose_preset(detect())]
     elif any(o.key_or_group == "resume" and o.value() for o in overrides):
         raise SystemExit("error: a resumed run keeps its preset: leave preset= out, or start anew with init_from=PATH")
-    preset = "preset=" + ",".join(f"{config_name}/{preset}" for preset in presets)
-    given = [*(o.input_line or "" for o in overrides if o not in chosen), preset]
-    return options, given, parser.parse_overrides(given)
+    return options, [*(o.input_line or "" for o in overrides if o not in chosen), f"preset={config_name}/{preset}"]
 
 
 def _composed(config_name: str, overrides: list[str]) -> DictConfig:
@@ -315,13 +312,16 @@ def announce(config: dict[str, Any], trainer: Trainer) -> None:
     later = sum(hours(stage, stage.train.total_frames) for stage in stages[number:])
     if settings.resume:
         print(f"Resumed {settings.resume} at {trainer.frames:,} env-steps")
-    print(f"Found {detect().describe()}: preset {settings.preset}, {learner.precision} updates")
+    hardware = detect()
+    print(f"Found {hardware.describe()}: preset {settings.preset}, {learner.precision} updates")
     estimate = f"{remaining:,} env-steps to go, about {time_left:.1f} h ({seconds * 1e3:.0f} ms per update)"
     if stages:
         estimate = f"Stage {number} of {len(stages)}, {settings.stage}: {estimate}"
     if later:
         estimate += f"; with the stages that follow about {time_left + later:.1f} h"
     print(estimate)
+    if bf16 and not hardware.bf16:
+        print("warning: this machine has no bf16 in hardware, so that updates take much longer than with fp32 or auto")
     if remaining and settings.train.warmup_frames >= settings.train.total_frames:
         print(
             f"warning: no update will be made, because train.warmup_frames={settings.train.warmup_frames:,} is not "
@@ -332,8 +332,6 @@ def announce(config: dict[str, Any], trainer: Trainer) -> None:
 
 def _quoted_paths(arguments: list[str]) -> list[str]:
     """Quote paths, so that Hydra does not parse them: a folder may be called `a=b` or `a, b`."""
-    if {"-m", "--multirun"} & set(arguments):
-        return arguments
     quoted = []
     for argument in arguments:
         key, equals, value = argument.partition("=")

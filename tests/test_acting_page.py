@@ -28,7 +28,7 @@ import acting_page
 extensions = ["myst_nb", "acting_page"]
 myst_enable_extensions = ["colon_fence"]
 
-def export_page(agent, out, *, home):
+def export_page(agent, domain, out, *, home):
     out.mkdir(parents=True)
     (out / "index.html").write_text(f'<a href="{{home}}">home</a>')
     if {missing!r}:

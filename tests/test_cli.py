@@ -83,8 +83,7 @@ def test_a_missing_agent_is_named_without_a_traceback(arguments, capsys, tmp_pat
         ("explain x --episodes 1", "--episodes: '1': expected a whole number of at least 2"),
         ("explain x --states 0", "--states: '0': expected a whole number of at least 1"),
         ("curves a=nowhere* --smooth 0", "--smooth: '0': expected a whole number of at least 1"),
-        ("export humanoid", "'humanoid': expected onnx or web before the agent, as in coachable export onnx humanoid"),
-        ("export humanoid --web site", "'humanoid': expected onnx or web before the agent"),
+        ("export humanoid", "invalid choice: 'humanoid' (choose from 'onnx', 'web')"),
         ("export web", "required: source"),
         ("dance", "invalid choice: 'dance'"),
         ("", "required: COMMAND"),
@@ -195,7 +194,8 @@ def test_curves_are_drawn_as_pictures_only(capsys, tmp_path):
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "metrics.csv").write_text("updates,episode/return\n1,2\n")
     assert main(["curves", f"a={tmp_path / 'run'}", "--out", str(tmp_path / "curves.txt")]) == 2
-    assert "cannot draw curves.txt: expected a file ending in one of .png" in capsys.readouterr().err
+    assert "Format 'txt' is not supported (supported formats: " in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["run"]
 
 
 def test_the_version_is_printed(capsys):

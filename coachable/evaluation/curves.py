@@ -12,12 +12,13 @@ import numpy as np
 from coachable.evaluation.figures import drawing
 from coachable.evaluation.statistics import bootstrap_interval
 from coachable.evaluation.wording import readable
+from coachable.outputs import complete_file
 
 _POINTS = 100
 
 
 def read_metric(run: Path, x: str, y: str) -> tuple[np.ndarray, np.ndarray]:
-    """Read two columns of a run's `metrics.csv`, from the rows that have both.
+    """Read two columns of a run's `metrics.csv`, from the rows in which both are numbers, not NaN.
 
     The stages of a run follow one another: each begins where the one before ended.
 
@@ -52,7 +53,7 @@ def metrics_files(run: Path) -> list[Path]:
 
 
 def _read(table: Path, x: str, y: str) -> tuple[list[tuple[float, float]], float]:
-    """Return the values of both columns from the rows that have both, and the last value of the first column."""
+    """Return the numbers of both columns from the rows that have both, and the last one of the first column."""
     try:
         with table.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
@@ -69,7 +70,7 @@ def _read(table: Path, x: str, y: str) -> tuple[list[tuple[float, float]], float
         raise ValueError(f"{table} is damaged: {error} in {x!r} or {y!r}, expected numbers") from error
     if not all(map(math.isfinite, positions)):
         raise ValueError(f"{table} has values of {x!r} that are not finite: choose another x")
-    return pairs, positions[-1] if positions else 0.0
+    return [pair for pair in pairs if not math.isnan(pair[1])], positions[-1] if positions else 0.0
 
 
 def summarise_runs(runs: Sequence[Path], x: str, y: str, smooth: int = 5) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -113,8 +114,7 @@ def draw_learning_curves(
         Mean at the last common position, by label.
     """
     last = {}
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with drawing(out, size=(5.6, 3.8)) as ((axes,),):
+    with complete_file(out) as unfinished, drawing(unfinished, size=(5.6, 3.8)) as ((axes,),):
         for label, runs in groups.items():
             grid, mean, (low, high) = summarise_runs(runs, x, y, smooth)
             count = "1 seed" if len(runs) == 1 else f"{len(runs)} seeds"

@@ -23,7 +23,7 @@ from coachable.evaluation.style_grid import (
     published,
     write_results,
 )
-from coachable.evaluation.switching import SwitchReport, evaluate_switching
+from coachable.evaluation.switching import SWITCH_PERIOD, SwitchReport, evaluate_switching
 from coachable.evaluation.wording import counted, units_of, with_unit
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
@@ -35,7 +35,7 @@ def evaluate(source: str | Path, out: Path, *, env_options: Mapping[str, str] | 
         source: Checkpoint, run folder, weights file, or the name of a domain that ships with weights.
         out: Folder for the results, created if missing.
         env_options: Options of the domain's environment as texts, see `Domain.env_options`.
-        **settings: Further arguments of `EvaluationSettings`; styles switch every 100 steps.
+        **settings: Further arguments of `EvaluationSettings`.
 
     Returns:
         The report as Markdown.
@@ -194,7 +194,7 @@ def _report(
         return text
     times = switching.comply_seconds
     median = f"{times.median():.2f} s" if len(times) else "never"
-    text += f"\n## Style switched at random every 100 steps ({counted(switch_episodes, 'episode')})\n\n"
+    text += f"\n## Style switched at random every {SWITCH_PERIOD} steps ({counted(switch_episodes, 'episode')})\n\n"
     formats = {name: ".0%" if domain.columns.get(name, "").endswith("%") else ".3f" for name in switching.metrics}
     text += markdown_table([switching.metrics], formats, units_of(domain, agent.space, formats))
     if not switching.switches:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
@@ -22,7 +21,7 @@ from coachable.scene.frame import Frame, Stage
 from coachable.scene.palette import css
 from coachable.scene.recorded import encode_backdrop, encode_frames
 from coachable.styles import Choice, StyleSpace, Weight
-from coachable.training.weights import LoadedPolicy, domain_of, load_policy
+from coachable.training.weights import LoadedPolicy
 
 __all__ = ["Recording", "export_recordings", "record"]
 
@@ -51,39 +50,24 @@ class Recording:
     terminated: bool
 
 
-def export_recordings(
-    source: str | Path,
-    out: Path,
-    assets: Path | None = None,
-    *,
-    env_options: Mapping[str, str] | None = None,
-    seed: int = 0,
-    progress: bool = True,
-) -> int:
+def export_recordings(agent: LoadedPolicy, domain: Domain, out: Path, assets: Path | None = None) -> int:
     """Write a page that plays one recorded episode of an agent in each style of a grid.
 
     Grid and length are the domain's, see `coachable.domain.Recorded`.
 
     Args:
-        source: Checkpoint, run folder, weights file, exported model, or the name of a domain that ships with weights.
+        agent: The agent.
+        domain: Its domain.
         out: Folder to write into; files of the same names are replaced.
         assets: Folder with the files of other projects, see `coachable.export.web.pinned_files.provide`.
-        env_options: Options of the domain's environment as texts, see `Domain.env_options`.
-        seed: Seed of the start and of sampled actions.
-        progress: Whether to show a progress bar.
 
     Returns:
         Size of all files of the page [byte].
 
     Raises:
-        ValueError: If the agent's domain has no scene, more than `MOST` styles, or names an unknown measure; if it has
-            no such option, or not with such a value.
-        CheckpointError: If the source does not hold a usable policy.
+        ValueError: If the domain has no scene, more than `MOST` styles, or names an unknown measure.
         OSError: If the files of other projects cannot be fetched, or writing fails.
     """
-    agent = load_policy(source)
-    domain = domain_of(agent)
-    domain = domain.with_options(domain.read_options(env_options or {}))
     if domain.make_stage is None:
         raise ValueError(
             f"the domain {domain.name} has neither a simulation for the browser nor a scene: expected one that "
@@ -96,9 +80,7 @@ def export_recordings(
     requests = [agent.space.describe(theta) | cell for theta, cell in zip(thetas, cells, strict=True)]
     steps = min(domain.episode_steps, max(1, round(domain.recorded.seconds / domain.control_step)))
     vendored = provide(assets, _NEEDED)
-    recordings = record(
-        domain, agent.actor, thetas, requests, space=agent.space, steps=steps, seed=seed, progress=progress
-    )
+    recordings = record(agent, domain, requests, steps)
     columns = domain.recorded.columns or published(domain, recordings[0].measured, requests[0])
     shown = [_measure(domain, agent.space, *column) for column in columns.items()]
     if unknown := {measure["name"] for measure in shown} - recordings[0].measured.keys():
@@ -127,41 +109,29 @@ def export_recordings(
         return finish_page(folder, manifest, [*backdrops.values(), *(entry["file"] for entry in played)], vendored)
 
 
-def record(
-    domain: Domain,
-    policy: TensorDictModuleBase,
-    theta: Tensor,
-    requests: Sequence[Mapping[str, Any]],
-    *,
-    space: StyleSpace,
-    steps: int,
-    seed: int = 0,
-    progress: bool = False,
-) -> list[Recording]:
+def record(agent: LoadedPolicy, domain: Domain, requests: Sequence[Mapping[str, Any]], steps: int) -> list[Recording]:
     """Record one episode in each style, all of them in one batch.
 
     Args:
-        domain: Domain with a scene.
-        policy: Policy that reads `observation` and `style`.
-        theta: Styles (N, d).
-        requests: The same styles by parameter name.
-        space: Their style space.
+        agent: The agent.
+        domain: Its domain, which has a scene.
+        requests: The styles by parameter name.
         steps: Largest number of steps.
-        seed: Seed of the starts and of sampled actions.
-        progress: Whether to show a progress bar.
     """
     make_stage, alike = domain.make_stage, domain.recorded.alike
     assert make_stage is not None
     options = {**domain.coached, **(alike(len(requests)) if alike else {})}
-    env = domain.styled_env(space, len(requests), seed=seed, **options)
+    env = domain.styled_env(agent.space, len(requests), seed=0, **options)
     cameras = [_Camera(env, row, make_stage(), request) for row, request in enumerate(requests)]
 
     def see(alive: Tensor) -> None:
         for row in alive.nonzero()[:, 0].tolist():
             cameras[row].see()
 
-    label = "recording" if progress else None
-    taken = record_episodes(env, policy, theta, domain.measures, steps=steps, seed=seed, progress=label, watch=see)
+    theta = agent.space.make_all(requests)
+    taken = record_episodes(
+        env, agent.actor, theta, domain.measures, steps=steps, seed=0, progress="recording", watch=see
+    )
     summary = domain.measures.summarise(taken.measures, taken.alive)
     summary = {"survived": taken.survived.float(), "task_return": taken.task_return, **summary}
     return [

@@ -18,7 +18,6 @@ from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.report_figures import draw_metrics, draw_requests, draw_switches, draw_tradeoffs
 from coachable.evaluation.report_page import Page, paragraph, picture, shown, table
 from coachable.evaluation.runs import (
-    SWITCH_PERIOD,
     Run,
     StyleTable,
     estimate,
@@ -28,6 +27,7 @@ from coachable.evaluation.runs import (
     sweep_estimate,
 )
 from coachable.evaluation.style_grid import acting, training_counts, write_csv
+from coachable.evaluation.switching import SWITCH_PERIOD
 from coachable.evaluation.wording import counted, heading_of, readable
 from coachable.outputs import complete_folder
 from coachable.styles import Setpoint, StyleSpace

@@ -17,7 +17,6 @@ from coachable.styles import StyleSpace
 from coachable.training.weights import LoadedPolicy
 
 __all__ = [
-    "SWITCH_PERIOD",
     "Estimate",
     "Run",
     "StyleTable",
@@ -28,9 +27,6 @@ __all__ = [
     "response_rows",
     "sweep_estimate",
 ]
-
-SWITCH_PERIOD = 100
-"""Number of env steps between switches of the style."""
 
 _MOST_COLUMNS = 3  # of style parameters in a table
 
@@ -77,14 +73,14 @@ def evaluate_run(
         domain: Domain in which the agent acts.
         agent: The agent's policy and styles.
         episodes: Number of episodes per style and per value of a weight.
-        switch_episodes: Number of episodes in which the style switches every `SWITCH_PERIOD` steps.
+        switch_episodes: Number of episodes in which the style switches.
         sweep_points: Number of values of each weight.
         **options: See `RolloutOptions`.
     """
     return Run(
         label,
         evaluate_grid(domain, agent.actor, agent.space, episodes=episodes, **options),
-        evaluate_switching(domain, agent.actor, agent.space, episodes=switch_episodes, period=SWITCH_PERIOD, **options),
+        evaluate_switching(domain, agent.actor, agent.space, episodes=switch_episodes, **options),
         sweep_weights(domain, agent, points=sweep_points, episodes=episodes, **options),
     )
 

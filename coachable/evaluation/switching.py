@@ -14,10 +14,13 @@ from coachable.domain import Domain, StyleMeasures
 from coachable.evaluation.episode_records import RolloutOptions, record_styles
 from coachable.styles import StyleSpace
 
+SWITCH_PERIOD = 100
+"""Number of env steps between switches of the style."""
+
 
 @dataclass(frozen=True)
 class SwitchReport:
-    """Results of episodes whose style switched at random every `period` steps.
+    """Results of episodes whose style switched at random every `SWITCH_PERIOD` steps.
 
     Attributes:
         metrics: Mean over episodes of survival and of the domain's measures.
@@ -37,11 +40,10 @@ def evaluate_switching(
     policy: TensorDictModuleBase,
     space: StyleSpace,
     *,
-    episodes: int = 60,
-    period: int = 100,
+    episodes: int,
     **options: Unpack[RolloutOptions],
 ) -> SwitchReport:
-    """Evaluate a policy with a new style from the training distribution every `period` steps.
+    """Evaluate a policy with a new style from the training distribution every `SWITCH_PERIOD` steps.
 
     No switch counts if compliance cannot be judged in any step, such as savings of fuel without a comparison.
 
@@ -50,14 +52,9 @@ def evaluate_switching(
         policy: Policy that reads `observation` and `style`.
         space: Its style space.
         episodes: Number of episodes.
-        period: Number of env steps between switches.
         **options: See `RolloutOptions`.
-
-    Raises:
-        ValueError: If the period is below 1.
     """
-    if period < 1:
-        raise ValueError(f"period must be at least 1 step, got {period}")
+    period = SWITCH_PERIOD
     generator = torch.Generator().manual_seed(options.get("seed", 0))
     steps = options.get("steps") or domain.episode_steps
     styles = space.sample((-(-steps // period), episodes), generator)

@@ -27,7 +27,6 @@ from coachable.training.rollout import Rollout
 from coachable.training.weights import domain_of, load_policy
 
 VIDEO_SUFFIXES = (".mp4", ".gif", ".webp", ".png")
-_IMAGE_FPS = 20  # of recorded sessions that are not mp4
 _FPS = (1.0, 60.0)  # least and most
 _WEBP_QUALITY = 50  # of 100
 _MOST, _FEWEST = 3, 2  # measures in a caption, as many as fit, and in that of a narrow film
@@ -51,7 +50,6 @@ def render(
     fps: float = 20.0,
     seed: int = 0,
     together: bool = False,
-    progress: bool = True,
 ) -> Path:
     """Film one agent, with the requested and the measured style in the picture.
 
@@ -66,7 +64,6 @@ def render(
         fps: Pictures per second, from 1 to 60. A domain with a scene is drawn between its control steps as well.
         seed: Seed of the initial state and of sampled actions.
         together: Whether to show all styles at once, side by side in rows of three, instead of one after the other.
-        progress: Whether to show a progress bar.
 
     Returns:
         `out`.
@@ -105,12 +102,12 @@ def render(
         panels = [film([request]) for request in requests]
         frames = (tiled(row) for row in zip(*panels, strict=True))
     total = len(requests) if sheet else math.floor(steps * domain.control_step * fps + _ROUNDING)
-    bar = tqdm(frames, total=total, desc="drawing", unit="frame", disable=None if progress else True, leave=False)
+    bar = tqdm(frames, total=total, desc="drawing", unit="frame", disable=None, leave=False)
     with complete_file(out) as unfinished:
         if sheet:
             Image.fromarray(tiled(list(bar))).save(unfinished)
         else:
-            write_video(bar, unfinished, fps, every=1)
+            write_video(bar, unfinished, fps)
     return out
 
 
@@ -138,21 +135,20 @@ def default_tour(domain: Domain, space: StyleSpace) -> list[dict[str, Any]]:
     ]
 
 
-def write_video(frames: Iterable[np.ndarray], out: Path, fps: float, every: int | None = None) -> None:
+def write_video(frames: Iterable[np.ndarray], out: Path, fps: float) -> None:
     """Write frames (height, width, 3) uint8 as mp4 (H.264), gif or animated WebP.
 
     Args:
         frames: The frames.
         out: File to write, `.mp4`, `.gif` or `.webp`.
         fps: Frames per second.
-        every: Of gif and WebP, every which frame is written; by default as many as make about 20 per second.
     """
     if out.suffix != ".mp4":
-        stride = every or max(1, int(fps) // _IMAGE_FPS)
-        images = [Image.fromarray(frame) for frame in itertools.islice(frames, 0, None, stride)]
-        options: dict[str, Any] = {"append_images": images[1:], "duration": round(1000 * stride / fps), "loop": 0}
-        options |= {"quality": _WEBP_QUALITY} if out.suffix == ".webp" else {}
-        images[0].save(out, save_all=True, **options)
+        images = [Image.fromarray(frame) for frame in frames]
+        ends = np.round(np.arange(len(images) + 1) * 100 / fps) * 10  # [ms], in the hundredths of a second of a gif
+        options: dict[str, Any] = {"quality": _WEBP_QUALITY} if out.suffix == ".webp" else {}
+        durations = np.diff(ends).astype(int).tolist()
+        images[0].save(out, save_all=True, append_images=images[1:], duration=durations, loop=0, **options)
         return
     av = _import_av()
     with av.open(str(out), "w") as container:

@@ -30,6 +30,8 @@ __all__ = ["TOLERANCE", "contract_of", "export", "largest_difference", "write_on
 TOLERANCE = 1e-5
 """Largest difference between the file's actions and torch's."""
 
+_SAMPLES = 256  # inputs for which they are compared
+
 
 def export(source: str | Path, out: Path) -> float:
     """Write the deterministic policy as ONNX and compare it with torch.
@@ -124,14 +126,13 @@ def contract_of(agent: LoadedPolicy, plain: DeterministicAction, domain: Domain 
     )
 
 
-def largest_difference(file: Path, plain: DeterministicAction, space: StyleSpace, samples: int = 256) -> float:
+def largest_difference(file: Path, plain: DeterministicAction, space: StyleSpace) -> float:
     """Compare the file, run by onnxruntime, with torch on random inputs, in batches of 1 and of all.
 
     Args:
         file: The ONNX file.
         plain: The policy that it was made from.
         space: Style space from whose training distribution styles are drawn.
-        samples: Number of inputs.
 
     Returns:
         Largest absolute difference of actions, axes and probabilities; for choices, by how much the file's choice is
@@ -141,8 +142,8 @@ def largest_difference(file: Path, plain: DeterministicAction, space: StyleSpace
 
     session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
     generator = torch.Generator().manual_seed(0)
-    observation = torch.randn(samples, plain.observation_dim, generator=generator)
-    style = space.sample((samples,), generator)
+    observation = torch.randn(_SAMPLES, plain.observation_dim, generator=generator)
+    style = space.sample((_SAMPLES,), generator)
     largest = 0.0
     for rows in (slice(0, 1), slice(None)):
         inputs = {"observation": observation[rows].numpy(), "style": style[rows].numpy()}

@@ -5,6 +5,7 @@ readable `metadata.json` and, in the newest one, the replay buffer under `replay
 """
 
 import contextlib
+import fcntl
 import itertools
 import json
 import os
@@ -39,6 +40,7 @@ __all__ = [
     "check_fits",
     "check_unused",
     "check_writable",
+    "claim_folder",
     "find_checkpoint",
     "read_state",
 ]
@@ -47,6 +49,7 @@ SCHEMA_VERSION = 1
 _LATEST = "LATEST"
 _STATE = "state.pt"
 _WEIGHTS = ("actor", "critics", "learner")  # parts of a state that must be finite
+_claimed: dict[Path, int] = {}  # descriptors of the folders that this process has locked
 
 
 class CheckpointStore:
@@ -295,6 +298,34 @@ def check_writable(directory: Path | str, required_bytes: int = 0) -> None:
             f"{directory} has {free / 1e6:,.0f} MB free, checkpoints need about {required_bytes / 1e6:,.0f} MB. Choose "
             "another folder with run_dir=PATH, or leave the replay buffer out with checkpoint.replay=false"
         )
+
+
+def claim_folder(directory: Path | str) -> None:
+    """Keep trainings of other processes out of a run's folder until this process ends.
+
+    A file system without locks does not prevent the training.
+
+    Args:
+        directory: The existing folder.
+
+    Raises:
+        CheckpointError: If another process has claimed it.
+    """
+    directory = Path(directory).resolve()
+    if directory in _claimed:
+        return
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise CheckpointError(
+            f"another training is writing to {directory}. Wait until it ends, or choose another folder with "
+            "run_dir=PATH"
+        ) from None
+    except OSError:
+        pass
+    _claimed[directory] = descriptor
 
 
 def _checkpoint_folder(run: Path) -> Path:

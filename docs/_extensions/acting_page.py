@@ -26,6 +26,7 @@ from sphinx.util.docutils import SphinxDirective
 from sphinx.util.osutil import relative_uri
 
 from coachable.export.web.simulated_page import export_page
+from coachable.training.weights import domain_of, load_policy
 
 LOGGER = logging.getLogger(__name__)
 
@@ -55,16 +56,16 @@ def write_pages(app: Sphinx, env: Any) -> None:
     if app.builder.format != "html":
         return
     for agents in [data.get("acting pages", []) for data in env.metadata.values()]:
-        for agent, document in agents:
-            folder = Path(app.outdir) / agent
-            uri = relative_uri(f"{agent}/index.html", app.builder.get_target_uri(document))
+        for name, document in agents:
+            folder, agent = Path(app.outdir) / name, load_policy(name)
+            uri = relative_uri(f"{name}/index.html", app.builder.get_target_uri(document))
             try:
-                size = export_page(agent, folder, home=uri)
+                size = export_page(agent, domain_of(agent), folder, home=uri)
             except OSError as error:  # npm is missing, or has no connection
                 shutil.rmtree(folder, ignore_errors=True)
-                sys.stderr.write(f"The site shows a picture instead of the page of {agent}: {error}\n")
+                sys.stderr.write(f"The site shows a picture instead of the page of {name}: {error}\n")
             else:
-                LOGGER.info("wrote the page of %s (%.1f MB)", agent, size / 1e6)
+                LOGGER.info("wrote the page of %s (%.1f MB)", name, size / 1e6)
 
 
 def is_written(translator: Any, node: Frame) -> bool:

@@ -23,7 +23,6 @@ def test_a_shipped_agent_is_exported_as_a_page(name, tmp_path, monkeypatch):
     code.write_text("export {};")
     monkeypatch.setattr(recorded_page, "provide", lambda *_: {"three/three.js": code})
     short = replace(domain, recorded=replace(domain.recorded, seconds=domain.control_step))
-    monkeypatch.setattr(recorded_page, "domain_of", lambda _: short)
-    recorded_page.export_recordings(name, tmp_path / "site", progress=False)
+    recorded_page.export_recordings(agent, short, tmp_path / "site")
     files = sorted(file.name for file in (tmp_path / "site" / "recordings").iterdir())
     assert f"{len(short.recorded_cells()) - 1}.bin" in files

@@ -82,3 +82,22 @@ def test_a_stage_begins_where_the_one_before_ended_also_if_its_last_rows_lack_th
     at, values = read_metric(tmp_path, "frames", "episode/return")
     assert at.tolist() == [200.0, 400.0, 500.0]
     assert values.tolist() == [1.0, 2.0, 3.0]
+
+
+def test_rows_without_a_number_are_left_out(tmp_path):
+    (tmp_path / "metrics.csv").write_text("frames,eval/step_length\n100,0.4\n200,nan\n300,0.5\n400,nan\n")
+    at, values = read_metric(tmp_path, "frames", "eval/step_length")
+    assert at.tolist() == [100.0, 300.0] and values.tolist() == [0.4, 0.5]
+
+
+def test_a_figure_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatch):
+    def fill_disk(figure, path, **options):
+        path.write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    runs, out = [make_run(tmp_path / "run", 1.0)], tmp_path / "curves.png"
+    out.write_bytes(b"old")
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", fill_disk)
+    with pytest.raises(OSError, match="No space left"):
+        draw_learning_curves({"one": runs}, out)
+    assert out.read_bytes() == b"old" and {file.name for file in tmp_path.iterdir()} == {"curves.png", "run"}

@@ -31,6 +31,9 @@ def test_seeds_are_not_given_twice(capsys):
     assert parse_seeds("2,0") == [2, 0]
     assert main(["train", "rare_targets", "seed=3", "seeds=0,1"]) == 2
     assert "seeds=0,1 with seed=...: expected one of them" in capsys.readouterr().err
+    for flag in ("--help", "-m", "--cfg"):
+        assert main(["train", "rare_targets", "seeds=0,1", flag]) == 2
+        assert f"seeds=0,1 with {flag}: expected KEY=VALUE only" in capsys.readouterr().err
 
 
 def test_finished_trainings_are_shown_and_not_repeated(tmp_path, capsys):

@@ -65,7 +65,7 @@ SMALL = {"seeds": 3, "episodes": 2, "switch_episodes": 4, "progress": False}
 def quick_switches():
     """Switches within episodes of 10 steps."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("runs", "report"):
+        for module in ("switching", "report"):
             patch.setattr(f"coachable.evaluation.{module}.SWITCH_PERIOD", 4)
         yield
 

@@ -9,6 +9,7 @@ import torch
 from tensordict.nn import TensorDictModule
 
 from coachable.domain import Domain, load_domain
+from coachable.evaluation import switching
 from coachable.evaluation.episode_records import record_episodes
 from coachable.evaluation.evaluate import evaluate_styles
 from coachable.evaluation.evaluation_settings import EvaluationSettings
@@ -85,19 +86,22 @@ def test_recorded_styles_follow_the_schedule():
     assert record.style.shape == (6, 2, 3)
 
 
-def test_switches_do_not_count_where_compliance_cannot_be_judged():
+def test_switches_do_not_count_where_compliance_cannot_be_judged(monkeypatch):
+    monkeypatch.setattr(switching, "SWITCH_PERIOD", 2)
+
     class Unjudged(ToyMeasures):
         def judged(self, record):
             return torch.zeros_like(record["error"], dtype=torch.bool)
 
     domain = replace(DOMAIN, measures=Unjudged())
-    report = evaluate_switching(domain, POLICY, SPACE, episodes=20, period=2, steps=4, progress=False)
+    report = evaluate_switching(domain, POLICY, SPACE, episodes=20, steps=4, progress=False)
     assert (report.switches, len(report.comply_seconds)) == (0, 0) and np.isnan(report.complied)
     assert report.metrics["survived"] == 1.0
 
 
-def test_switching_counts_compliance_per_switch():
-    report = evaluate_switching(DOMAIN, POLICY, SPACE, episodes=200, period=2, steps=4, progress=False)
+def test_switching_counts_compliance_per_switch(monkeypatch):
+    monkeypatch.setattr(switching, "SWITCH_PERIOD", 2)
+    report = evaluate_switching(DOMAIN, POLICY, SPACE, episodes=200, steps=4, progress=False)
     # One switch; the half of the styles with a red hat is obeyed at once, i.e. after one step of 0.1 s.
     assert report.switches == 200
     assert report.complied == pytest.approx(0.5, abs=5 * (0.25 / 200) ** 0.5)

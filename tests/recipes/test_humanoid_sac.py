@@ -10,6 +10,7 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+import recipe_config
 import torch
 from recipe_config import announce, checked_arguments, compose_config
 
@@ -17,6 +18,7 @@ from coachable.domains.humanoid import humanoid_style_reward
 from coachable.envs.humanoid import HumanoidEnv
 from coachable.training import Learner
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
+from coachable.training.hardware import Hardware
 from coachable.training.train_settings import TrainSettings
 from coachable.training.weights import domain_of, load_policy
 
@@ -155,12 +157,28 @@ def test_a_training_too_short_for_an_update_says_so(tmp_path, capsys):
     assert "warning: no update will be made, because train.warmup_frames=" in capsys.readouterr().out
 
 
+def test_bf16_without_hardware_for_it_says_so(tmp_path, capsys, monkeypatch):
+    settings = ["preset=smoke", "learner.precision=bf16", "train.total_frames=200", f"run_dir={tmp_path}"]
+    config = compose_config("rare_targets", settings)
+    train = import_module("rare_targets").build(config)
+    for has_bf16 in (True, False):
+        monkeypatch.setattr(recipe_config, "detect", lambda bf16=has_bf16: Hardware(2, 0.0, 8.0, None, bf16))
+        announce(config, train)
+        assert ("warning: this machine has no bf16 in hardware" in capsys.readouterr().out) != has_bf16
+
+
 def test_hydras_options_pass_through():
     arguments = checked_arguments("humanoid_sac", ["preset=cpu", "--cfg", "job", "train.total_frames=1e6"])
-    assert arguments == ["--cfg", "job", "train.total_frames=1e6", "preset=humanoid_sac/cpu"]
+    assert arguments == ["train.total_frames=1e6", "preset=humanoid_sac/cpu", "--cfg", "job"]
     assert _compose("+note=mine")["note"] == "mine"
-    arguments = checked_arguments("humanoid_sac", ["--multirun", "preset=smoke,cpu", "seed=0,1"])
-    assert arguments == ["--multirun", "seed=0,1", "preset=humanoid_sac/smoke,humanoid_sac/cpu"]
+    assert checked_arguments("humanoid_sac", ["preset=cpu", "--info"]) == ["preset=humanoid_sac/cpu", "--info"]
+    assert checked_arguments("humanoid_sac", ["--hydra-help"]) == ["--hydra-help"]
+
+
+@pytest.mark.parametrize("arguments", [["--multirun"], ["-m", "seed=0,1"], ["seed=0,1"], ["preset=smoke,cpu"]])
+def test_sweeps_are_refused(arguments):
+    with pytest.raises(SystemExit, match=r"expected coachable train humanoid_sac seeds=0,1,2 for several seeds"):
+        checked_arguments("humanoid_sac", arguments)
 
 
 def test_resumed_runs_equal_uninterrupted_ones(tmp_path):

@@ -1,6 +1,8 @@
 """Every recipe's training, resumed from its middle, ends like the one that was not interrupted, bit for bit."""
 
+import fcntl
 import gc
+import os
 import sys
 from importlib import import_module
 
@@ -63,6 +65,15 @@ def test_a_refused_resumption_leaves_the_configuration_of_the_run(tmp_path):
     with pytest.raises(CheckpointError, match="was trained on another style space"):
         build(compose_config("rare_targets", [f"resume={tmp_path}", "sampler=one_hot", "train.total_frames=8"]))
     assert (tmp_path / "config.json").read_bytes() == before
+
+
+def test_a_folder_that_another_process_writes_to_is_left_alone(tmp_path):
+    descriptor = os.open(tmp_path, os.O_RDONLY)
+    fcntl.flock(descriptor, fcntl.LOCK_EX)
+    with pytest.raises(CheckpointError, match="another training is writing to"):
+        import_module("rare_targets").build(compose_config("rare_targets", [*TINY, f"run_dir={tmp_path}"]))
+    os.close(descriptor)
+    assert not list(tmp_path.iterdir())
 
 
 def test_settings_given_beside_resume_are_named_if_the_training_cannot_be_made(tmp_path, monkeypatch):

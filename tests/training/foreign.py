@@ -46,7 +46,7 @@ def openers(out):
         "weights": lambda source: export_weights(source, out / "weights.pt"),
         "evaluate": lambda source: evaluate(source, out / "evaluation", episodes=1, progress=False),
         "report": lambda source: report([source], out / "report", progress=False),
-        "render": lambda source: render(source, out / "film.png", progress=False),
+        "render": lambda source: render(source, out / "film.png"),
         "coach": CoachSession.open,
         "init_from": lambda source: initialise_from(
             source, torch.nn.Module(), torch.nn.Module(), humanoid_style_space()

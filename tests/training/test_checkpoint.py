@@ -1,5 +1,6 @@
 """Checkpoints: atomic, pickle-free, pruned, refused with a reason; and the files made from them."""
 
+import fcntl
 import json
 import os
 import signal
@@ -15,7 +16,14 @@ from coachable.replay import EventTableBuffer, KeyEvents
 from coachable.replay.replay_files import read_replay, write_replay
 from coachable.styles import Setpoint, StyleSpace
 from coachable.styles.samplers import PointMass, Uniform
-from coachable.training.checkpoint import CheckpointError, CheckpointStore, check_writable, find_checkpoint, read_state
+from coachable.training.checkpoint import (
+    CheckpointError,
+    CheckpointStore,
+    check_writable,
+    claim_folder,
+    find_checkpoint,
+    read_state,
+)
 from coachable.training.rng import preserved_rng, rng_state, seed_everything, set_rng_state
 from coachable.training.weights import export_weights, initialise_from, load_policy
 
@@ -203,6 +211,20 @@ def test_unwritable_and_full_folders_are_named_before_the_start(tmp_path):
         check_writable(tmp_path, required_bytes=10**18)
     check_writable(tmp_path / "new")
     assert list((tmp_path / "new").iterdir()) == []
+
+
+def test_a_folder_that_another_process_writes_to_is_refused(tmp_path):
+    descriptor = os.open(tmp_path, os.O_RDONLY)
+    fcntl.flock(descriptor, fcntl.LOCK_EX)
+    with pytest.raises(CheckpointError, match=r"another training is writing to .*run_dir=PATH"):
+        claim_folder(tmp_path)
+    os.close(descriptor)
+    claim_folder(tmp_path)
+    claim_folder(tmp_path)
+    descriptor = os.open(tmp_path, os.O_RDONLY)
+    with pytest.raises(BlockingIOError):
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    os.close(descriptor)
 
 
 def test_another_style_space_is_refused_with_the_difference(make_train, tmp_path):

@@ -12,7 +12,7 @@ from torchrl.envs import MultiStepTransform
 
 from coachable.domains.combat import combat_style_space
 from coachable.domains.humanoid import humanoid_style_space
-from coachable.domains.racing.families import family_style
+from coachable.domains.racing.families import racing_family
 from coachable.replay import EventTableBuffer, KeyEvents
 from coachable.styles import (
     Choice,
@@ -125,7 +125,7 @@ def test_styles_come_from_the_training_distribution():
 def spaces_and_samplers():
     """Every style space that the recipes train on, with every sampler that serves it."""
     spaces = [humanoid_style_space(), combat_style_space(["melee", "skykiller"]), combat_style_space(), echo_space()]
-    spaces += [family_style(family)[0] for family in ("drift", "resources", "aggressiveness")]
+    spaces += [racing_family(family).make_space() for family in ("drift", "resources", "aggressiveness")]
     makers = {
         "default": own,
         **{single: partial(style_mixture, single=single) for single in get_args(Single)},
@@ -176,7 +176,7 @@ def _assert_same_distribution(labels, draws):
 
 
 def test_the_cars_of_a_race_share_a_style_and_their_labels_do_not():
-    space = family_style("aggressiveness")[0]
+    space = racing_family("aggressiveness").make_space()
     assert isinstance(space.sampler, Shared)
     copies = space.sampler.copies
     drawn = space.sample((copies * 7,), torch.Generator().manual_seed(0)).reshape(copies, 7, space.dim)

@@ -24,7 +24,7 @@ def add_parser(commands: Any, source_help: str, run: Callable[[argparse.Namespac
     text = "coach an agent while it acts, on a page in the browser"
     parser = commands.add_parser("coach", help=text, epilog=ENV_OPTIONS)
     parser.add_argument("source", help=source_help)
-    parser.add_argument("--port", type=_port, default=8080, help="first port to try (default: %(default)s)")
+    parser.add_argument("--port", type=int, default=8080, help="first port to try (default: %(default)s)")
     parser.add_argument(
         "--host", default="127.0.0.1", help="address to listen on; whoever reaches it can steer (default: %(default)s)"
     )
@@ -113,9 +113,3 @@ def wait() -> None:
 def _quietly(stop: Callable[[], None]) -> None:
     with redirect_stdout(io.StringIO()):  # viser prints that it stops
         stop()
-
-
-def _port(text: str) -> int:
-    if not text.isdecimal() or int(text) > 65535:
-        raise argparse.ArgumentTypeError(f"there is no port {text!r}: expected a number from 0 to 65535")
-    return int(text)

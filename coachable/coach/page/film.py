@@ -88,7 +88,7 @@ def film(
     Args:
         recording: The recording.
         session: Session whose policy and domain are used; it is not changed.
-        out: File to write, `.mp4` or `.gif`.
+        out: File to write, `.mp4`.
         last: Length of the end of the recording to film [s]; all of it if None.
         size: Width and height [px].
         on_progress: Called with the share of the steps that are done, from 0 to 1.
@@ -98,10 +98,10 @@ def film(
 
     Raises:
         ValueError: If nothing was recorded, or for another suffix.
-        ImportError: For mp4 without PyAV; the message names the extra to install.
+        ImportError: Without PyAV; the message names the extra to install.
     """
-    if out.suffix not in (".mp4", ".gif"):
-        raise ValueError(f"cannot write {out.name}: expected a file ending in .mp4 or .gif")
+    if out.suffix != ".mp4":
+        raise ValueError(f"cannot write {out.name}: expected a file ending in .mp4")
     if recording.steps == 0:
         raise ValueError("nothing was recorded yet: step the session first")
     out.parent.mkdir(parents=True, exist_ok=True)

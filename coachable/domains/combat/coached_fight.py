@@ -15,7 +15,7 @@ from coachable.envs.combat.constants import PLAYER_HP
 from coachable.envs.combat.tables import ELEMENTS, STYLES
 from coachable.envs.combat.traits import MACHINE_NAMES
 from coachable.evaluation.figures import drawing
-from coachable.evaluation.runs import SWITCH_PERIOD
+from coachable.evaluation.switching import SWITCH_PERIOD
 from coachable.evaluation.wording import readable
 from coachable.styles import StyleSpace
 from coachable.training.rollout import Rollout

@@ -165,9 +165,3 @@ def typical_car(family: str, settings: Mapping[str, Any]) -> str:
     """
     car = settings.get("car", CAR[family])
     return "gt3" if car == POOL else car
-
-
-def family_style(family: str) -> tuple[StyleSpace, Callable[..., StyleReward]]:
-    """Return the style space of a family and its function `make_style_reward(space, **settings)`."""
-    found = racing_family(family)
-    return found.make_space(), found.make_reward

@@ -12,13 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from coachable import __version__
+from coachable.domain import Domain
 from coachable.export.graph import import_onnx
 from coachable.export.onnx import TOLERANCE, write_onnx
 from coachable.export.web.part import PagePart
 from coachable.export.web.pinned_files import Package, packages, provide
 from coachable.outputs import complete_folder
 from coachable.scene.look import ICON, stylesheet
-from coachable.training.weights import LoadedPolicy, domain_of, load_policy
+from coachable.training.weights import LoadedPolicy
 
 __all__ = ["SCHEMA_VERSION", "about", "copy_page", "export_page", "finish_page", "manifest_of"]
 
@@ -31,12 +32,7 @@ _PRELOADS = "<!-- preloads -->"
 
 
 def export_page(
-    source: str | Path,
-    out: Path,
-    assets: Path | None = None,
-    *,
-    env_options: Mapping[str, str] | None = None,
-    home: str | None = None,
+    agent: LoadedPolicy, domain: Domain, out: Path, assets: Path | None = None, home: str | None = None
 ) -> int:
     """Write the page of an agent.
 
@@ -44,10 +40,10 @@ def export_page(
     everything else that the page has to know, and the pinned files of other projects in `third_party`.
 
     Args:
-        source: Checkpoint, run folder, weights file, or the name of a domain that ships with weights.
+        agent: The agent.
+        domain: Its domain, which declares `make_web`.
         out: Folder to write into; files of the same names are replaced.
         assets: Folder with the files of other projects, see `coachable.export.web.pinned_files.provide`.
-        env_options: Options of the domain's environment as texts, see `Domain.env_options`.
         home: Address of the documentation, to which the page links; by default the one that `home_page` finds.
 
     Returns:
@@ -55,21 +51,19 @@ def export_page(
 
     Raises:
         ImportError: If the extra `export` is not installed.
-        ValueError: If the agent's domain has no page, no such option, or not with such a value.
-        CheckpointError: If the source does not hold a usable policy.
         OSError: If the files of other projects cannot be fetched, or writing fails.
     """
     import_onnx()
-    agent = load_policy(source)
-    part = _part_of(agent, env_options or {})
+    assert domain.make_web is not None
+    part = domain.make_web(agent.space)
     with complete_folder(out) as folder:
         vendored = provide(assets, *part.packages)
         files = part.files()
         copy_page(folder, vendored, part.licence)
-        write_onnx(agent, domain_of(agent), folder / _POLICY)
+        write_onnx(agent, domain, folder / _POLICY)
         for name, content in files.items():
             (folder / name).write_bytes(content)
-        manifest = manifest_of(agent, part) | ({} if home is None else {"home": home})
+        manifest = manifest_of(agent, domain, part) | ({} if home is None else {"home": home})
         return finish_page(folder, manifest, [*files, _POLICY], vendored)
 
 
@@ -153,14 +147,14 @@ def home_page() -> str:
     return next((addresses[name] for name in ("documentation", "repository", "homepage") if name in addresses), "")
 
 
-def manifest_of(agent: LoadedPolicy, part: PagePart) -> dict[str, Any]:
+def manifest_of(agent: LoadedPolicy, domain: Domain, part: PagePart) -> dict[str, Any]:
     """Return what the page has to know besides models and graphs.
 
     Args:
         agent: Agent from `load_policy`.
+        domain: Its domain.
         part: The domain's part of the page.
     """
-    space, domain = agent.space, domain_of(agent)
     controls = [
         {
             "name": control.parameter.name,
@@ -181,8 +175,8 @@ def manifest_of(agent: LoadedPolicy, part: PagePart) -> dict[str, Any]:
         "kind": part.kind,
         "title": part.title,
         "summary": part.summary,
-        "style_space": json.loads(space.to_json()),
-        "default_style": space.default.tolist(),
+        "style_space": json.loads(agent.space.to_json()),
+        "default_style": agent.space.default.tolist(),
         "presets": {name: dict(style) for name, style in domain.words.presets.items()},
         "controls": controls,
         "opens": dict(part.opens),
@@ -198,14 +192,6 @@ def manifest_of(agent: LoadedPolicy, part: PagePart) -> dict[str, Any]:
         "starts": [dict(start) for start in part.starts],
         "largest_difference": TOLERANCE,
     }
-
-
-def _part_of(agent: LoadedPolicy, env_options: Mapping[str, str]) -> PagePart:
-    domain = domain_of(agent)
-    domain = domain.with_options(domain.read_options(env_options))
-    if domain.make_web is None:
-        raise ValueError(f"the domain {domain.name} has no page for the browser: expected one that declares `make_web`")
-    return domain.make_web(agent.space)
 
 
 def _used(vendored: Mapping[str, Path]) -> list[Package]:

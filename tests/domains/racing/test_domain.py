@@ -8,7 +8,7 @@ import torch
 
 from coachable.domain import load_domain
 from coachable.domains.racing.events import racing_events
-from coachable.domains.racing.families import family_env, family_style, training_tracks
+from coachable.domains.racing.families import family_env, racing_family, training_tracks
 from coachable.domains.racing.metrics import RacingMeasures
 from coachable.domains.racing.stage import RacingStage
 from coachable.envs.racing import RacingEnv
@@ -117,8 +117,8 @@ def test_a_domain_is_as_its_training_made_it():
 def test_events_are_what_their_names_say(family, names):
     events = racing_events(family)
     assert list(events.names) == ["recovery", *names]
-    space, make_reward = family_style(family)
-    env = coachable_env(family_env(8, family=family, seed=0), space, make_reward(space), seed=0)
+    space, reward = racing_family(family).make_space(), racing_family(family).make_reward
+    env = coachable_env(family_env(8, family=family, seed=0), space, reward(space), seed=0)
     data = env.rollout(15, break_when_any_done=False).reshape(-1)
     found = events(data)
     assert found.shape == (120, 1 + len(names))
@@ -131,7 +131,7 @@ def test_events_are_what_their_names_say(family, names):
         assert torch.equal(found[:, 1], data["next", "telemetry"][:, TELEMETRY.index("contact")] > 0)
 
 
-@pytest.mark.parametrize("make", [family_style, racing_events, lambda name: family_env(2, family=name)])
+@pytest.mark.parametrize("make", [racing_family, racing_events, lambda name: family_env(2, family=name)])
 def test_families_are_checked_everywhere(make):
     with pytest.raises(ValueError, match="unknown family 'speed': expected drift, resources or aggressiveness"):
         make("speed")

@@ -12,7 +12,7 @@ import torch
 from coachable.domain import load_domain
 from coachable.domains.racing import laps, stints, traffic
 from coachable.domains.racing.drifts import evaluate_drift
-from coachable.domains.racing.families import family_style
+from coachable.domains.racing.families import racing_family
 from coachable.domains.racing.laps import circuits_report, circuits_summary, drive_circuits
 from coachable.domains.racing.metrics import whole_turns
 from coachable.domains.racing.races import _count, _overtakes, _pair_results, evaluate_aggressiveness
@@ -48,7 +48,7 @@ def scripted(family, car, **settings):
             env, driver = made[-1]
             return data.set("action", driver(env.field, data["observation"]))
 
-    agent = LoadedPolicy(Policy(), family_style(family)[0], {"env": {"track": "ring", "car": car}}, {})
+    agent = LoadedPolicy(Policy(), racing_family(family).make_space(), {"env": {"track": "ring", "car": car}}, {})
     return replace(domain, make_env=make_env), agent
 
 

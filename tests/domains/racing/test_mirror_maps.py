@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict
 
 from coachable.domains.racing.events import SLIDE, racing_events
-from coachable.domains.racing.families import family_env, family_style
+from coachable.domains.racing.families import family_env, racing_family
 from coachable.domains.racing.mirror_maps import racing_mirror_maps
 from coachable.envs.racing import RacingEnv
 from coachable.envs.racing.circuit.circuits import load_track
@@ -85,8 +85,8 @@ def test_a_mirrored_race_stays_the_mirror_image(family, cars, make_env):
     mirror = maps["observation"]
     changes = torch.tensor([mirror.sign[i] < 0 or mirror.source[i] != i for i in range(env.observation_size)])
     driver = LineFollower(env.tracks, env.garage.typical, grip=1.05, lanes=(0.0, 1.0, -1.0))
-    (space, make_reward), events = family_style(family), racing_events(family)
-    style_reward = make_reward(space)
+    space, events = racing_family(family).make_space(), racing_events(family)
+    style_reward = racing_family(family).make_reward(space)
     generator = torch.Generator().manual_seed(0)
     theta = space.low + (space.high - space.low) * torch.rand(3 * cars, space.dim, generator=generator)
     sign = torch.ones(len(TELEMETRY), dtype=torch.float64)

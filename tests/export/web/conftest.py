@@ -24,7 +24,8 @@ def exported(name, folder, *needed):
         provide(None, *needed)
     except OSError as error:
         pytest.skip(str(error))
-    export_page(name, folder, home="../index.html")
+    agent = load_policy(name)
+    export_page(agent, domain_of(agent), folder, home="../index.html")
     return folder
 
 
@@ -42,20 +43,19 @@ def stepped_site(tmp_path_factory):
 @pytest.fixture(scope="session")
 def recorded_site(tmp_path_factory):
     """A page with three short recordings."""
-    from coachable.evaluation import recorded_page
+    from coachable.evaluation.recorded_page import export_recordings
     from coachable.export.web.pinned_files import provide
 
     try:
         provide(None, "three")
     except OSError as error:
         pytest.skip(str(error))
-    domain = domain_of(load_policy("racing_resources"))
+    agent = load_policy("racing_resources")
+    domain = domain_of(agent)
     grid = {"overtake": (1.0,), "defend": (1.0,), "tire": (0.0,), "fuel": (0.0, 52.0, 105.0)}
     short = replace(domain, recorded=replace(domain.recorded, grid=grid, seconds=1.0))
     folder = tmp_path_factory.mktemp("recorded") / "site"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(recorded_page, "domain_of", lambda _: short)
-        recorded_page.export_recordings("racing_resources", folder, progress=False)
+    export_recordings(agent, short, folder)
     return folder
 
 
