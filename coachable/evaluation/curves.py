@@ -33,10 +33,15 @@ def read_metric(run: Path, x: str, y: str) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         ValueError: If the file is damaged, there is no such column, or no row has both values.
     """
+    tables = {file: _rows(file) for file in metrics_files(run)}
+    columns = list(dict.fromkeys(column for rows in tables.values() for row in rows[:1] for column in row))
+    for name in (x, y):  # a stage that has just begun may not have it yet
+        if tables and name not in columns:
+            raise ValueError(f"{run} has no metric {name!r}: expected one of {columns}")
     pairs: list[tuple[float, float]] = []
     start = 0.0
-    for table in metrics_files(run):
-        own, end = _read(table, x, y)
+    for table, rows in tables.items():
+        own, end = _numbers(table, rows, x, y)
         pairs += [(start + at, value) for at, value in own]
         start += end
     if not pairs:
@@ -52,20 +57,19 @@ def metrics_files(run: Path) -> list[Path]:
     return in_order or [file for file in (run / "metrics.csv",) if file.is_file()]
 
 
-def _read(table: Path, x: str, y: str) -> tuple[list[tuple[float, float]], float]:
-    """Return the numbers of both columns from the rows that have both, and the last one of the first column."""
+def _rows(table: Path) -> list[dict[str, str]]:
     try:
         with table.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
+            return list(csv.DictReader(file))
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{table} is no table of metrics: {error}") from error
-    columns = list(rows[0]) if rows else []
-    for name in (x, y):
-        if name not in columns:
-            raise ValueError(f"{table.parent} has no metric {name!r}: expected one of {columns}")
+
+
+def _numbers(table: Path, rows: list[dict[str, str]], x: str, y: str) -> tuple[list[tuple[float, float]], float]:
+    """Return the numbers of both columns from the rows that have both, and the last one of the first column."""
     try:
-        positions = [float(row[x]) for row in rows if row[x]]
-        pairs = [(float(row[x]), float(row[y])) for row in rows if row[x] and row[y]]
+        positions = [float(row[x]) for row in rows if row.get(x)]
+        pairs = [(float(row[x]), float(row[y])) for row in rows if row.get(x) and row.get(y)]
     except ValueError as error:
         raise ValueError(f"{table} is damaged: {error} in {x!r} or {y!r}, expected numbers") from error
     if not all(map(math.isfinite, positions)):

@@ -101,3 +101,12 @@ def test_a_figure_that_cannot_be_written_leaves_the_old_one(tmp_path, monkeypatc
     with pytest.raises(OSError, match="No space left"):
         draw_learning_curves({"one": runs}, out)
     assert out.read_bytes() == b"old" and {file.name for file in tmp_path.iterdir()} == {"curves.png", "run"}
+
+
+def test_a_stage_without_the_metric_yet_leaves_the_curve_of_the_others(tmp_path):
+    make_run(tmp_path / "run" / "stages" / "1_walk", 1.0)
+    table = make_run(tmp_path / "run" / "stages" / "2_run", 1.0) / "metrics.csv"
+    table.write_text("updates,loss/alpha\n0,0.1\n")
+    at, values = read_metric(tmp_path / "run", "updates", "episode/return")
+    np.testing.assert_allclose(values, at)
+    assert len(at) == 20
