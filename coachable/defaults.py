@@ -216,13 +216,21 @@ def steps_per_episode(make_env: Callable[..., EnvBase]) -> int:
     env = make_env(num_envs=1)
     simulation, repeats = simulation_of(env)
     limits = (
-        getattr(getattr(simulation, "spec", None), "max_episode_steps", None),  # Gymnasium
+        getattr(getattr(simulation, "spec", None), "max_episode_steps", None),  # Gymnasium, if it is registered
+        _time_limit(simulation),
         getattr(simulation, "_step_limit", None),  # dm_control
         getattr(simulation, "episode_steps", None),
     )
     env.close()
     found = next((limit for limit in limits if limit is not None and np.isfinite(limit)), _EPISODE_STEPS * repeats)
     return max(1, int(found) // repeats)
+
+
+def _time_limit(simulation: Any) -> int | None:
+    """Return the limit of Gymnasium's wrapper `TimeLimit`, or None if there is no such wrapper."""
+    while simulation is not None and "_max_episode_steps" not in vars(simulation):
+        simulation = vars(simulation).get("env")
+    return None if simulation is None else simulation._max_episode_steps
 
 
 def style_grid(space: StyleSpace) -> list[dict[str, Any]]:

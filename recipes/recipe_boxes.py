@@ -30,7 +30,7 @@ from coachable.styles import Sampler, StyleReward, StyleSpace
 from coachable.styles.mixtures import single_weight
 from coachable.training.async_collector import AsyncCollector
 from coachable.training.checkpoint import CheckpointStore, check_unused, check_writable, claim_folder
-from coachable.training.collection import evaluate_policy, simulation_env
+from coachable.training.collection import evaluate_policy, require_same_bounds, simulation_env
 from coachable.training.hardware import pick_device, share_threads
 from coachable.training.learner import Learner
 from coachable.training.logging import MetricsLog, Progress, wandb_logger
@@ -125,7 +125,8 @@ def make_loss(run: Run, actor: nn.Module, critics: list[nn.Module], env: EnvBase
         env: Its action specification bounds the policy.
 
     Raises:
-        ValueError: If the loss does not serve the actions, or needs more critics or other outputs of them.
+        ValueError: If the loss does not serve the actions or the actor has other bounds, or if the loss needs more
+            critics or other outputs of them.
     """
     settings = run.settings
     is_sac = settings.loss._target_.endswith(".SACLoss")
@@ -137,6 +138,7 @@ def make_loss(run: Run, actor: nn.Module, critics: list[nn.Module], env: EnvBase
         raise ValueError(
             f"loss=sac serves continuous actions only, {settings.domain} has buttons: expected cat_rac, network=gamepad"
         )
+    require_same_bounds(env, actor)
     loss = settings.loss.build(actor, critics, action_spec=env.action_spec, num_qvalue_nets=len(critics))
     if is_sac or isinstance(loss, ActorCriticLoss):
         with torch.no_grad(), torch.random.fork_rng(devices=[]):  # critics may have dropout

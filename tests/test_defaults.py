@@ -2,6 +2,7 @@
 
 from functools import partial, wraps
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -93,6 +94,28 @@ def test_time_is_asked_of_the_environment_when_it_is_first_read():
     assert (domain.control_step, domain.episode_steps, domain.control_step) == (0.25, 20, 0.25)
     assert made == [1, 1]
     assert (time_per_step(StyleEchoEnv), steps_per_episode(StyleEchoEnv)) == (1.0, 1000)
+
+
+def test_the_time_limit_of_an_environment_that_is_not_registered_is_found():
+    gymnasium = pytest.importorskip("gymnasium")
+    from coachable.gym import GymnasiumEnv
+
+    class Unregistered(gymnasium.Env):
+        observation_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+        action_space = gymnasium.spaces.Discrete(2)
+
+        def reset(self, *, seed=None, options=None):
+            return np.zeros(1, np.float32), {}
+
+        def step(self, action):
+            return np.zeros(1, np.float32), 0.0, False, False, {}
+
+    def limit(make):
+        return steps_per_episode(partial(GymnasiumEnv, make, lambda observation, action, info: [0.0]))
+
+    wrappers = gymnasium.wrappers
+    assert limit(lambda: wrappers.FlattenObservation(wrappers.TimeLimit(Unregistered(), 40))) == 40
+    assert limit(Unregistered) == 1000
 
 
 @pytest.mark.parametrize(

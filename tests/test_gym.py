@@ -328,6 +328,11 @@ def test_an_observation_of_another_size_than_its_space_is_refused():
         GymnasiumEnv(Short, moved).reset()
 
 
+def test_an_environment_in_place_of_a_function_that_makes_one_is_refused():
+    with pytest.raises(ValueError, match="expected the name of a registered environment, or a function that makes one"):
+        GymnasiumEnv(gymnasium.make("Pendulum-v1"), lambda obs, action, info: obs)
+
+
 def test_copies_that_are_not_separate_environments_are_refused():
     walk = Walk()
     with pytest.raises(ValueError, match="make returned the same Walk twice: expected a new environment at each call"):

@@ -56,6 +56,10 @@ class GymnasiumEnv(EnvBase):
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        if not isinstance(make, str) and not callable(make):
+            raise ValueError(
+                f"make is {make}: expected the name of a registered environment, or a function that makes one"
+            )
         super().__init__(device="cpu", batch_size=torch.Size((num_envs,)))
         self.features = features
         self.envs = [gymnasium.make(make) if isinstance(make, str) else make() for _ in range(num_envs)]

@@ -114,9 +114,10 @@ class ActorCriticLoss(SACLoss):
         policy = self._policy_at(tensordict)
         with self._full_precision():
             action, log_prob = self._sample(policy, relaxed=True)
+            self._checked("_sample", log_prob, tensordict.batch_size)
         output = self._critics_at(tensordict, action, self._cached_detached_qvalue_params)
         with self._full_precision():
-            value = self._values(output).min(0).values
+            value = self._checked("_values", self._values(output), output.shape[:-1]).min(0).values
             loss = self._alpha * log_prob - value
             return self._reduced(loss, tensordict), {"log_prob": log_prob.detach()}
 
@@ -130,6 +131,7 @@ class ActorCriticLoss(SACLoss):
         output = self._critics_at(tensordict, None, self.qvalue_network_params)
         with self._full_precision():
             losses, errors = self._errors(at_least_float32(output), target)
+            losses, errors = (self._checked("_errors", value, output.shape[:-1]) for value in (losses, errors))
             loss = self._reduced(losses.sum(0), tensordict)
             return loss, {"td_error": errors.detach().amax(0), **self._extra_metrics(target)}
 
@@ -147,9 +149,12 @@ class ActorCriticLoss(SACLoss):
         policy = self._policy_at(successor)
         with self._full_precision():
             action, log_prob = self._sample(policy, relaxed=False)
+            self._checked("_sample", log_prob, successor.batch_size)
         output = self._critics_at(successor, action, self.target_qvalue_network_params)
         with self._full_precision():
             next_value = self._next_value(at_least_float32(output))
+            quantiles = next_value.shape[-1:] if next_value.ndim > log_prob.ndim else ()
+            self._checked("_next_value", next_value, (*successor.batch_size, *quantiles))
             if next_value.ndim > log_prob.ndim:
                 log_prob = log_prob.unsqueeze(-1)
             return bootstrap_target(
@@ -214,6 +219,14 @@ class ActorCriticLoss(SACLoss):
     def _extra_metrics(self, target: Tensor) -> dict[str, Tensor]:
         """Return further scalars of the critic update, for logging."""
         return {}
+
+    def _checked(self, method: str, value: Tensor, expected: Sequence[int]) -> Tensor:
+        """Return a result of a subclass's method; another shape would broadcast to values of other states."""
+        if value.shape != torch.Size(expected):
+            raise RuntimeError(
+                f"{type(self).__name__}.{method} returned the shape {tuple(value.shape)}: expected {tuple(expected)}"
+            )
+        return value
 
     def _policy_at(self, tensordict: TensorDictBase) -> MixedAction:
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):

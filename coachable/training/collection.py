@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
 from torchrl.collectors import BaseCollector, Collector
+from torchrl.data import Bounded
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType
 
@@ -27,6 +28,7 @@ __all__ = [
     "evaluate_policy",
     "load_collector_state",
     "make_collector",
+    "require_same_bounds",
     "simulation_env",
 ]
 
@@ -70,7 +72,7 @@ def make_collector(
         policy_device: Device of the policy; None for the device of the environment.
 
     Raises:
-        ValueError: If the backend is unknown.
+        ValueError: If the backend is unknown, or the actions of policy and environment have other bounds.
     """
     common: dict[str, Any] = {
         "frames_per_batch": frames_per_batch,
@@ -83,7 +85,9 @@ def make_collector(
         common |= {"policy_device": policy_device, "env_device": "cpu", "storing_device": "cpu"}
     plain: dict[str, Any] = {"auto_register_policy_transforms": False}  # the policies here need none
     if backend == "direct":
-        collector = Collector(make_env(seed), policy, use_buffers=False, trust_policy=True, **common, **plain)
+        env = make_env(seed)
+        require_same_bounds(env, policy)
+        collector = Collector(env, policy, use_buffers=False, trust_policy=True, **common, **plain)
         if next(collector.policy.parameters()) is not next(policy.parameters()):  # the loop relies on shared weights
             raise RuntimeError(f"the collector copied the policy: build the policy on {policy_device}, where it runs")
         simulation = simulation_env(collector.env)
@@ -98,6 +102,36 @@ def make_collector(
         workers.worker_errors = receiver  # read by `check_workers`
         return workers
     raise ValueError(f"collector backend must be direct or process, got {backend!r}")
+
+
+def require_same_bounds(env: EnvBase, policy: Any) -> None:
+    """Raise a `ValueError` if the actions of a policy have other bounds than those of an environment.
+
+    Such a policy would reach a part of the actions only, or others than there are.
+
+    Args:
+        env: The environment.
+        policy: The actor; without a `spec` of bounded actions it is not checked.
+    """
+    spec: Any = getattr(policy, "spec", None)
+    own, expected = None if spec is None else spec.get("action", None), env.action_spec
+    if not isinstance(own, Bounded) or not isinstance(expected, Bounded) or own.shape[-1] != expected.shape[-1]:
+        return
+    bounds, own_bounds = _bounds_of(expected), _bounds_of(own)
+    differs = ~torch.isclose(bounds, own_bounds).all(0)
+    if differs.any():
+        entry = int(differs.nonzero()[0])
+        (low, high), (own_low, own_high) = bounds[:, entry].tolist(), own_bounds[:, entry].tolist()
+        raise ValueError(
+            f"entry {entry} of the action ranges over [{low:g}, {high:g}] in the environment, over "
+            f"[{own_low:g}, {own_high:g}] in the policy: append torchrl.envs.ActionScaling() to the environment, which "
+            "scales actions in [-1, 1]"
+        )
+
+
+def _bounds_of(spec: Any) -> torch.Tensor:
+    """Return the bounds (2, width) of a bounded action, of a batch those in its first environment."""
+    return torch.stack([spec.space.low, spec.space.high]).reshape(2, -1, spec.shape[-1])[:, 0].double().cpu()
 
 
 @dataclass(eq=False)

@@ -74,6 +74,30 @@ def test_critics_of_another_width() -> None:
         loss(make_batch(AXES))
 
 
+@pytest.mark.parametrize(
+    ("method", "result", "message"),
+    [
+        ("_next_value", lambda output: output, r"_next_value returned the shape \(2, 8, 32\): expected \(8, 32\)"),
+        ("_next_value", lambda output: output.mean(), r"_next_value returned the shape \(\): expected \(8,\)"),
+        ("_values", lambda output: output.mean(-1, keepdim=True), r"_values .* \(2, 8, 1\): expected \(2, 8\)"),
+        ("_errors", lambda output, target: (output, output[..., 0]), r"_errors .* \(2, 8, 32\): expected \(2, 8\)"),
+        ("_errors", lambda output, target: (output[..., 0], output), r"_errors .* \(2, 8, 32\): expected \(2, 8\)"),
+        (
+            "_sample",
+            lambda policy, relaxed: (policy.hard_action(), policy.loc),
+            r"_sample .* \(8, 2\): expected \(8,\)",
+        ),
+    ],
+)
+def test_methods_of_an_own_loss_that_return_another_shape(method: str, result: Any, message: str) -> None:
+    """It would broadcast, and train on sums over other states."""
+    kind: Any = type("OwnLoss", (QRSACLoss,), {method: staticmethod(result)})
+    critics = [make_critic(OBS, 2, PlainSpace(), (8,), num_outputs=32) for _ in range(2)]
+    loss = kind(make_mixed_actor(OBS, AXES, PlainSpace(), (8,)), critics)
+    with pytest.raises(RuntimeError, match="OwnLoss." + message):
+        loss(make_batch(AXES, (8,)))
+
+
 def test_a_single_critic() -> None:
     critic = make_critic(OBS, 2, PlainSpace(), (8,))
     actor = make_mixed_actor(OBS, AXES, PlainSpace(), (8,))

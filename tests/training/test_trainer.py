@@ -10,10 +10,12 @@ import warnings
 
 import pytest
 import torch
-from torchrl.envs.utils import check_env_specs
+from torchrl.envs import ActionScaling, PendulumEnv, TransformedEnv
+from torchrl.envs.utils import RandomPolicy, check_env_specs
 
+from coachable.networks import make_gaussian_actor
 from coachable.training.checkpoint import find_checkpoint, read_state
-from coachable.training.collection import evaluate_policy
+from coachable.training.collection import evaluate_policy, make_collector, require_same_bounds
 from coachable.training.train_settings import TrainSettings
 
 
@@ -70,6 +72,15 @@ def test_batches_larger_than_the_replay_buffer_are_refused_at_the_start(make_tra
     make_train(batch_size=300)
     with pytest.raises(ValueError, match="batch_size=301: expected at most 300, the capacity of the replay buffer"):
         make_train(batch_size=301)
+
+
+def test_a_policy_whose_actions_have_other_bounds_than_the_environments_is_refused():
+    actor = make_gaussian_actor(3, 1, None, (8,))
+    wide = r"entry 0 of the action ranges over \[-2, 2\] in the environment, over \[-1, 1\] in the policy"
+    with pytest.raises(ValueError, match=wide):
+        make_collector(lambda seed: PendulumEnv(), actor, frames_per_batch=1)
+    require_same_bounds(TransformedEnv(PendulumEnv(), ActionScaling()), actor)
+    require_same_bounds(PendulumEnv(), RandomPolicy(PendulumEnv().action_spec))
 
 
 def test_a_training_killed_before_its_first_checkpoint_leaves_no_row_to_the_next(make_train, tmp_path):
