@@ -122,7 +122,8 @@ def test_mistakes_in_a_file_of_ones_own_are_named_too(text, message, tmp_path):
     file.parent.mkdir(parents=True)
     file.write_text("# @package _global_\ndefaults: [/preset/humanoid_sac/smoke]\npreset: mine\n")
     arguments = ["--config-dir", str(tmp_path), "preset=mine"]
-    assert checked_arguments("humanoid_sac", arguments)[-1] == "preset=humanoid_sac/mine"
+    expected = ["preset=humanoid_sac/mine", "--config-dir", str(tmp_path)]
+    assert checked_arguments("humanoid_sac", arguments) == expected
     file.write_text(f"# @package _global_\n{text}\n")
     with pytest.raises(SystemExit, match=message):
         checked_arguments("humanoid_sac", arguments)
