@@ -3,8 +3,8 @@
 python -m tests.printed_commands                     all that take less than a minute
 python -m tests.printed_commands --list              what is run, and why the others are not
 
-A command fails if its exit status is not 0 or it does not end within ten minutes. A page of `coachable coach` is started, has
-to answer with HTTP 200, and is stopped.
+A command fails if its exit status is not 0 or it does not end within ten minutes. A page of `coachable coach` is
+started, has to answer with HTTP 200, and is stopped.
 """
 
 import argparse
