@@ -472,20 +472,7 @@ static inline const uint16_t *columns_of_bf16(const uint16_t *matrix, int64_t ro
 }
 #endif
 
-#define ELEMENT uint16_t
-#define LOAD(x) widen(x)
-#define STORE(x) narrow(x)
-#define NAME(x) x##_bf16
-#ifdef __AVX512BF16__
-#define DENSE
-#endif
-#include "kernels.c"
-#undef ELEMENT
-#undef LOAD
-#undef STORE
-#undef NAME
-#undef DENSE
-
+/* The functions below for each type; the file includes itself, and undefines the type at its end. */
 #define ELEMENT float
 #define LOAD(x) (x)
 #define STORE(x) (x)
@@ -494,11 +481,15 @@ static inline const uint16_t *columns_of_bf16(const uint16_t *matrix, int64_t ro
 #define DENSE
 #endif
 #include "kernels.c"
-#undef ELEMENT
-#undef LOAD
-#undef STORE
-#undef NAME
-#undef DENSE
+
+#define ELEMENT uint16_t
+#define LOAD(x) widen(x)
+#define STORE(x) narrow(x)
+#define NAME(x) x##_bf16
+#ifdef __AVX512BF16__
+#define DENSE
+#endif
+#include "kernels.c"
 
 #else
 
@@ -732,7 +723,7 @@ void NAME(weight_gradient)(const ELEMENT *dz, int64_t m, const ELEMENT *x, int64
 void NAME(wide_head_forward)(const ELEMENT *restrict x, const float *weight, const float *restrict bias, int64_t rows,
                              int64_t n, int64_t outputs, float *restrict y) {
     FLUSH_TINY
-    const int64_t size = n * ((outputs + BLOCK - 1) / BLOCK * BLOCK);
+    const int64_t size = packed_size_fp32(n, outputs);
     float *packed = packing_memory((size + ROWS * n) * sizeof *packed), *some = packed + size, sums[ROWS * BLOCK];
     pack_transposed_fp32(weight, outputs, n, packed);
     for (int64_t i = 0; i < rows; i += ROWS) {
@@ -781,5 +772,11 @@ void NAME(wide_head_backward)(const float *grad, const ELEMENT *restrict x, cons
         for (int64_t o = 0; o < outputs; o++) dbias[o] += grad[r * outputs + o];
 }
 #endif
+
+#undef ELEMENT
+#undef LOAD
+#undef STORE
+#undef NAME
+#undef DENSE
 
 #endif

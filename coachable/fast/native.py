@@ -163,9 +163,9 @@ def _products(library: ctypes.CDLL, dtype: torch.dtype) -> Products | None:
         "wide_head_backward": [p, p, p, i, i, i, flag, flag, p, p, p],
         "sac_gradients": [p, i, i, flag, flag],
     }
-    functions = {function: library[f"{function}_{name}"] for function in arguments}
-    for function, function_pointer in functions.items():
-        function_pointer.argtypes, function_pointer.restype = arguments[function], None
+    functions = {key: library[f"{key}_{name}"] for key in arguments}
+    for key, function in functions.items():
+        function.argtypes, function.restype = arguments[key], None
     return Products(**functions)
 
 

@@ -183,10 +183,6 @@ static float quantile_loss(const float *q, const float *y, int64_t n, float kapp
 #define STORE(x) (x)
 #define NAME(x) x##_fp32
 #include "sac.c"
-#undef ELEMENT
-#undef LOAD
-#undef STORE
-#undef NAME
 
 #ifdef __AVX512BF16__
 #define ELEMENT uint16_t
@@ -201,7 +197,7 @@ static float quantile_loss(const float *q, const float *y, int64_t n, float kapp
 
 /* Rows of a network's input, with a column of zeros if their number is odd; `last` (rows, axes) follows. */
 static const ELEMENT *NAME(assemble)(const Inputs *inputs, int64_t start, int64_t rows, const float *last, int64_t axes,
-                                int64_t *stride) {
+                                     int64_t *stride) {
     int64_t width = last ? axes : 0;
     for (int64_t i = 0; i < inputs->count; i++) width += inputs->width[i];
     *stride = width + width % 2;
@@ -240,8 +236,8 @@ static float *NAME(network_forward)(const Network *net, const ELEMENT *x, int64_
         tape->mean[i] = floats(rows);
         tape->rstd[i] = floats(rows);
         NAME(dense_forward)(layer->inner, layer->weight, tape->z[i], layer->bias, layer->gamma, layer->beta, x, stride,
-                      layer->from, layer->to, layer->width, (float)layer->eps, rows, n, tape->out[i], tape->mean[i],
-                      tape->rstd[i], scratch);
+                            layer->from, layer->to, layer->width, (float)layer->eps, rows, n, tape->out[i], tape->mean[i],
+                            tape->rstd[i], scratch);
         x = tape->out[i];
         stride = n;
     }
@@ -255,7 +251,7 @@ static float *NAME(network_forward)(const Network *net, const ELEMENT *x, int64_
 /* Backward pass from dy (count, outputs): the parameters' gradients if `trained`; else the gradient of `columns` inputs
  * from `first`, for the rows of `index`, written to those rows of dx (rows, columns). */
 static void NAME(network_backward)(const Network *net, const NAME(Tape) *tape, const float *dy, int64_t count, int trained,
-                     const int64_t *index, float *dx, int64_t first, int64_t columns) {
+                                   const int64_t *index, float *dx, int64_t first, int64_t columns) {
     const int64_t size = count * widest(net);
     float *scratch = floats(2 * widest(net));
     ELEMENT *here = take(size * sizeof *here), *below = take(size * sizeof *below), *dz = take(size * sizeof *dz);
@@ -263,15 +259,15 @@ static void NAME(network_backward)(const Network *net, const NAME(Tape) *tape, c
     const ELEMENT *x = tape->out[top];
     if (net->outputs <= FEW)
         NAME(head_backward)(dy, x, net->weight, count, net->layer[top].outer, net->outputs, trained, 0, here,
-                           net->dweight, net->dbias, scratch);
+                            net->dweight, net->dbias, scratch);
     else
         NAME(wide_head_backward)(dy, x, net->weight, count, net->layer[top].outer, net->outputs, trained, 0, here,
-                           net->dweight, net->dbias);
+                                 net->dweight, net->dbias);
     for (int64_t i = top; i >= 0; i--) {
         const Layer *layer = net->layer + i;
         const int64_t n = layer->inner, m = layer->outer;
         NAME(layer_backward)(here, tape->z[i], layer->bias, layer->gamma, layer->beta, tape->mean[i], tape->rstd[i], index,
-                            count, trained, 0, m, dz, layer->dgamma, layer->dbeta, layer->dbias, scratch);
+                             count, trained, 0, m, dz, layer->dgamma, layer->dbeta, layer->dbias, scratch);
         if (trained)
             NAME(weight_gradient)(dz, m, i ? tape->out[i - 1] : tape->x, n, i ? n : tape->stride, count, 0, layer->dweight);
         if (i) {
@@ -281,7 +277,7 @@ static void NAME(network_backward)(const Network *net, const NAME(Tape) *tape, c
             below = free;
         } else if (dx) {
             NAME(dense_backward)(dz, count, m, (const ELEMENT *)layer->weight + first, n, columns, here, layer->from - first, layer->to,
-                           layer->width, below);
+                                 layer->width, below);
             for (int64_t r = 0; r < count; r++)
                 for (int64_t j = 0; j < columns; j++) dx[index[r] * columns + j] = LOAD(below[r * columns + j]);
         }
@@ -383,5 +379,10 @@ void NAME(sac_gradients)(const Job *job, int64_t start, int64_t rows, int critic
     if (policy) NAME(policy_gradients)(job, start, rows);
     give_back(before);
 }
+
+#undef ELEMENT
+#undef LOAD
+#undef STORE
+#undef NAME
 
 #endif
