@@ -319,6 +319,22 @@ def test_features_of_a_changing_number_are_refused(count):
         env.rollout(2)
 
 
+def test_features_that_are_no_row_of_numbers_are_refused():
+    with pytest.raises(ValueError, match=r"features returned \[\[1.0\], \[1.0, 2.0\]\]: expected \(F,\), the numbers"):
+        GymnasiumEnv(Walk, lambda o, a, i: [[1.0], [1.0, 2.0]])
+
+
+def test_an_observation_without_a_key_of_its_space_is_refused():
+    class Halved(Walk):
+        observation_space = spaces.Dict(left=Walk.observation_space, right=Walk.observation_space)
+
+        def _observation(self):
+            return {"left": super()._observation()}
+
+    with pytest.raises(ValueError, match=r"does not fit its space Dict\(.*\) \(KeyError: 'right'\): \{'left'"):
+        GymnasiumEnv(Halved, lambda o, a, i: [1.0]).reset()
+
+
 def test_an_observation_of_another_size_than_its_space_is_refused():
     class Short(Walk):
         def _observation(self):

@@ -54,20 +54,19 @@ def evaluate_switching(
         episodes: Number of episodes.
         **options: See `RolloutOptions`.
     """
-    period = SWITCH_PERIOD
     generator = torch.Generator().manual_seed(options.get("seed", 0))
     steps = options.get("steps") or domain.episode_steps
-    styles = space.sample((-(-steps // period), episodes), generator)
-    label = f"{episodes} episodes, style switched every {period} steps"
-    record = record_styles(domain, policy, space, lambda step: styles[step // period], label, **options)
+    styles = space.sample((-(-steps // SWITCH_PERIOD), episodes), generator)
+    label = f"{episodes} episodes, style switched every {SWITCH_PERIOD} steps"
+    record = record_styles(domain, policy, space, lambda step: styles[step // SWITCH_PERIOD], label, **options)
     summary = {"survived": record.survived.float(), **domain.measures.summarise(record.measures, record.alive)}
     metrics = {name: value.nanmean().item() for name, value in summary.items()}
     complies = domain.measures.complies(record.measures) & record.alive
     is_known = bool((judged_steps(domain.measures, record.measures) & record.alive).any())
     waits, switches = [], 0
-    for start in range(period, len(complies) if is_known else 0, period):
+    for start in range(SWITCH_PERIOD, len(complies) if is_known else 0, SWITCH_PERIOD):
         running = record.alive[start]
-        done, first = complies[start : start + period].max(0)
+        done, first = complies[start : start + SWITCH_PERIOD].max(0)
         switches += int(running.sum())
         waits.append((first[running & done] + 1) * domain.control_step)
     times = torch.cat(waits) if waits else torch.empty(0)

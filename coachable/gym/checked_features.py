@@ -22,9 +22,12 @@ def checked_features(features: ArrayLike) -> np.ndarray:
     """Return the features of a step as float32 (F,).
 
     Raises:
-        ValueError: If they have another shape.
+        ValueError: If they have another shape, or are not numbers.
     """
-    array = np.array(features, dtype=np.float32)
+    try:
+        array = np.array(features, dtype=np.float32)
+    except (TypeError, ValueError):
+        raise ValueError(f"features returned {features!r}: expected (F,), the numbers of a single step") from None
     if array.ndim != 1:
         raise ValueError(f"features returned shape {array.shape}: expected (F,), the numbers of a single step")
     return array
@@ -36,7 +39,14 @@ def flat_observation(space: spaces.Space, observation: Any) -> np.ndarray:
     Args:
         space: Space of the observation.
         observation: An element of it.
+
+    Raises:
+        ValueError: If the observation is not of that kind, such as a dictionary without one of the space's keys.
     """
-    flat = spaces.flatten(space, observation)
+    try:
+        flat = spaces.flatten(space, observation)
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise ValueError(f"an observation does not fit its space {space} ({reason}): {observation!r}") from error
     assert isinstance(flat, np.ndarray)  # flatdim has raised for spaces without a fixed size
     return flat

@@ -134,6 +134,7 @@ class Trainer:
         self._filled_from = 0  # env-steps when the replay buffer was empty
         self._logged = self._saved = time.monotonic()
         self._logged_frames = 0
+        self._saved_frames = -1  # env-steps of the checkpoint in the run's own folder that was resumed
 
     def run(self) -> dict[str, float]:
         """Run the loop.
@@ -298,11 +299,13 @@ class Trainer:
 
     def _finish(self, *, interrupted: bool) -> None:
         # Neither row is repeated if the training was resumed at its end or has just been evaluated.
-        if not interrupted and self._evaluated_frames < self.frames:
+        evaluates = not interrupted and self._evaluated_frames < self.frames
+        if evaluates:
             self._evaluate()
         if self._logged_frames < self.frames:
             self._log()
-        self._checkpoint()
+        if evaluates or self._saved_frames < self.frames:
+            self._checkpoint()
         self.progress.update(self.frames, self.learner.updates, self._latest, force=True)
 
     def state_dict(self) -> dict[str, Any]:
@@ -339,6 +342,8 @@ class Trainer:
         require_same_agent(state, self.describe(), path)
         with refusing(path, "the state of a training"):
             self._restore(state, path / "replay")
+        if self.checkpoints and path.parent.resolve() == self.checkpoints.directory.resolve():
+            self._saved_frames = self.frames
         self.log.rewind(self.frames)
         return path
 

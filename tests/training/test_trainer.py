@@ -54,18 +54,20 @@ def test_n_plus_n_equals_2n_bit_for_bit(make_train, tmp_path):
     assert (stored == again).all()
 
 
-def test_resume_of_a_finished_training_changes_no_row(make_train, tmp_path):
+def test_resume_of_a_finished_training_changes_no_row_and_writes_no_checkpoint(make_train, tmp_path):
     """A kill after the last checkpoint is complete leaves such a training behind."""
     train = make_train(total_frames=80)
     train.evaluate = lambda: {"return": 1.0}
     train.run()
     before = (tmp_path / "run" / "metrics.csv").read_text()
     assert before.count("\n80,") == 2  # of the evaluation, and of the log
+    checkpoints = sorted((tmp_path / "run" / "checkpoints").iterdir())
     again = make_train(total_frames=80)
     again.evaluate = train.evaluate
     again.resume(tmp_path / "run")
     again.run()
     assert (tmp_path / "run" / "metrics.csv").read_text() == before
+    assert sorted((tmp_path / "run" / "checkpoints").iterdir()) == checkpoints
 
 
 def test_batches_larger_than_the_replay_buffer_are_refused_at_the_start(make_train):

@@ -214,6 +214,7 @@ class CoachPage:
 
     def _add_presets(self) -> None:
         gui = self.server.gui
+        self._given_presets = {name.lower() for name in self.session.presets}  # of the session, and of every visitor
         with gui.add_folder("Presets"):
             self.preset = gui.add_dropdown("preset", list(self.session.presets))
             apply = gui.add_button("Apply preset")
@@ -236,6 +237,8 @@ class CoachPage:
         name = self.preset_name.value.strip()
         if not name:
             raise ValueError("give the preset a name first")
+        if name.lower() in self._given_presets:
+            raise ValueError(f"the preset {name!r} came with the agent: expected another name")
         if len(name) > _LONGEST_NAME or len(session.presets) >= _PRESETS:
             raise ValueError(f"expected at most {_PRESETS} presets, each name of at most {_LONGEST_NAME} characters")
         session.presets[name] = session.style

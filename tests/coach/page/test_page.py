@@ -75,10 +75,13 @@ def test_the_agent_acts_while_a_phrase_is_read(page, monkeypatch):
     wait_for(lambda: page.session.style["target"] == pytest.approx(0.4))
 
 
-def test_presets_do_not_pile_up(page):
+def test_presets_do_not_pile_up_or_replace_those_of_the_agent(page):
     page.preset_name.value = "x" * 100
     page.loop.submit(page._save_preset)
     wait_for(lambda: "at most 40 characters" in page.status.content)
+    page.preset_name.value = "Default"
+    page.loop.submit(page._save_preset)
+    wait_for(lambda: "'Default' came with the agent" in page.status.content)
     page.session.presets |= {f"p{number}": {} for number in range(48)}
     for name in ("last", "one too many"):
         page.preset_name.value = name
