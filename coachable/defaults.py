@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
+from torchrl.envs import Compose, EnvBase, SerialEnv, StepCounter, TransformedEnv
 
 from coachable.gl import RenderingError
 from coachable.keys import STYLE, STYLE_FEATURES
@@ -220,6 +220,7 @@ def steps_per_episode(make_env: Callable[..., EnvBase]) -> int:
         _time_limit(simulation),
         getattr(simulation, "_step_limit", None),  # dm_control
         getattr(simulation, "episode_steps", None),
+        _step_count(env, repeats),
     )
     env.close()
     found = next((limit for limit in limits if limit is not None and np.isfinite(limit)), _EPISODE_STEPS * repeats)
@@ -231,6 +232,16 @@ def _time_limit(simulation: Any) -> int | None:
     while simulation is not None and "_max_episode_steps" not in vars(simulation):
         simulation = vars(simulation).get("env")
     return None if simulation is None else simulation._max_episode_steps
+
+
+def _step_count(env: EnvBase, repeats: int) -> int | None:
+    """Return the limit of TorchRL's `StepCounter` in steps of the simulation, or None if there is no such transform."""
+    while isinstance(env, TransformedEnv):
+        for transform in env.transform if isinstance(env.transform, Compose) else [env.transform]:
+            if isinstance(transform, StepCounter) and transform.max_steps is not None:
+                return transform.max_steps * repeats
+        env = env.base_env
+    return None
 
 
 def style_grid(space: StyleSpace) -> list[dict[str, Any]]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import DMControlEnv, PendulumEnv, SerialEnv, TransformedEnv
+from torchrl.envs import Compose, DMControlEnv, PendulumEnv, RewardSum, SerialEnv, StepCounter, TransformedEnv
 
 from coachable.defaults import EnvPictures, RewardMeasures, simulation_of, steps_per_episode, style_grid, time_per_step
 from coachable.domain import Domain
@@ -116,6 +116,14 @@ def test_the_time_limit_of_an_environment_that_is_not_registered_is_found():
     wrappers = gymnasium.wrappers
     assert limit(lambda: wrappers.FlattenObservation(wrappers.TimeLimit(Unregistered(), 40))) == 40
     assert limit(Unregistered) == 1000
+
+
+def test_the_limit_of_a_step_counter_is_found():
+    def make_env(num_envs):
+        counted = TransformedEnv(StyleEchoEnv(num_envs), Compose(StepCounter(), StepCounter(30, step_count_key="n")))
+        return TransformedEnv(counted, RewardSum(), auto_unwrap=False)
+
+    assert steps_per_episode(make_env) == 30
 
 
 @pytest.mark.parametrize(
