@@ -204,8 +204,8 @@ class Trainer:
             stored = data.select(*self.replay_keys)
             require_finite(stored)
             self._episodes.add(data.reshape(-1))
-            # Flattening keeps the steps of each trajectory in order, as an EventTableBuffer requires.
-            self.replay.extend(stored.reshape(-1))
+            steps = stored.shape[-1:] if isinstance(self.replay, EventTableBuffer) else ()  # its rows are environments
+            self.replay.extend(stored.reshape(-1, *steps))
             if isinstance(self.collector, AsyncCollector) and isinstance(self.replay, EventTableBuffer):
                 self.replay.finish(self.collector.interrupted())
 

@@ -14,6 +14,7 @@ from torchrl.envs import ActionScaling, PendulumEnv, TransformedEnv
 from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 from coachable.networks import make_gaussian_actor
+from coachable.replay import EventTableBuffer
 from coachable.training.checkpoint import find_checkpoint, read_state
 from coachable.training.collection import evaluate_policy, make_collector, require_same_bounds
 from coachable.training.train_settings import TrainSettings
@@ -68,6 +69,17 @@ def test_resume_of_a_finished_training_changes_no_row_and_writes_no_checkpoint(m
     again.run()
     assert (tmp_path / "run" / "metrics.csv").read_text() == before
     assert sorted((tmp_path / "run" / "checkpoints").iterdir()) == checkpoints
+
+
+def test_sums_in_tables_are_of_one_episode_if_the_collector_yields_several_steps_at_once(make_train, make_echo_env):
+    train = make_train(total_frames=160)
+    train.collector = make_collector(make_echo_env, train.collector.policy, frames_per_batch=16)  # 4 steps of 4
+    train.replay = EventTableBuffer({"default": 300}, num_envs=4, n_steps=2, gamma=1.0)
+    train.run()
+    stored = train.replay.table("default")
+    assert (stored["steps_to_next_obs"] == 2).sum() > 100
+    later = 20 * (stored["next", "observation"] - stored["observation"])[:, 2:]  # steps since the start of the episode
+    torch.testing.assert_close(later, stored["steps_to_next_obs"].float())
 
 
 def test_batches_larger_than_the_replay_buffer_are_refused_at_the_start(make_train):
