@@ -192,8 +192,7 @@ def _report(
         )
     if switching is None:
         return text
-    times = switching.comply_seconds
-    median = f"{times.median():.2f} s" if len(times) else "never"
+    median = f"{switching.median_seconds:.2f} s" if len(switching.comply_seconds) else "never"
     text += f"\n## Style switched at random every {SWITCH_PERIOD} steps ({counted(switch_episodes, 'episode')})\n\n"
     formats = {name: ".0%" if domain.columns.get(name, "").endswith("%") else ".3f" for name in switching.metrics}
     text += markdown_table([switching.metrics], formats, units_of(domain, agent.space, formats))

@@ -213,10 +213,9 @@ class _Sections:
             return
         period = SWITCH_PERIOD * self.domain.control_step
         draw_switches(self.runs, period, self.out / "switches.png")
-        waits = [test.comply_seconds for test in tests]
         row: dict[str, Any] = {
             "complied": estimate([test.complied for test in tests]),
-            "median_seconds": estimate([wait.median().item() if len(wait) else np.nan for wait in waits]),
+            "median_seconds": estimate([test.median_seconds for test in tests]),
             **{name: estimate([test.metrics[name] for test in tests]) for name in tests[0].metrics},
         }
         write_csv([flat_row(row | {"switches": switches})], self.out / "switches.csv")

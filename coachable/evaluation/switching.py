@@ -34,6 +34,11 @@ class SwitchReport:
     complied: float
     switches: int
 
+    @property
+    def median_seconds(self) -> float:
+        """Median of `comply_seconds` [s], the mean of the two middle ones if their number is even; NaN without any."""
+        return self.comply_seconds.quantile(0.5).item() if len(self.comply_seconds) else float("nan")
+
 
 def evaluate_switching(
     domain: Domain,

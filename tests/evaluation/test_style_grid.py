@@ -14,7 +14,7 @@ from coachable.evaluation.episode_records import record_episodes
 from coachable.evaluation.evaluate import evaluate_styles
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.style_grid import evaluate_grid, markdown_table, write_csv
-from coachable.evaluation.switching import evaluate_switching
+from coachable.evaluation.switching import SwitchReport, evaluate_switching
 from coachable.styles import Choice, Setpoint, StyleReward, StyleSpace
 from coachable.training.weights import LoadedPolicy
 from coachable.transforms import coachable_env
@@ -106,6 +106,12 @@ def test_switching_counts_compliance_per_switch(monkeypatch):
     assert report.switches == 200
     assert report.complied == pytest.approx(0.5, abs=5 * (0.25 / 200) ** 0.5)
     torch.testing.assert_close(report.comply_seconds, torch.full_like(report.comply_seconds, 0.1))
+
+
+def test_the_median_of_an_even_number_of_waits_is_between_the_middle_two():
+    report = SwitchReport({}, torch.tensor([0.4, 0.1, 0.2, 0.8]), complied=1.0, switches=4)
+    assert report.median_seconds == pytest.approx(0.3)
+    assert np.isnan(SwitchReport({}, torch.empty(0), complied=0.0, switches=4).median_seconds)
 
 
 def test_trials_and_medians_are_reported(tmp_path):
