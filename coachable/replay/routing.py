@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from coachable.keys import EVENTS, SCENARIO, STYLE
@@ -67,13 +67,13 @@ class StyleEvents:
 
     def __call__(self, steps: TensorDictBase) -> Tensor:
         """Return booleans `(steps, len(names))`."""
-        fired = steps.get(("next", EVENTS))
+        fired = _entry(steps, ("next", EVENTS))
         if fired.shape[-1] != len(self.names):
             raise ValueError(
                 f"('next', 'events') has shape {tuple(fired.shape)}: expected {len(self.names)} events, one for each "
                 f"of {', '.join(self.names)} (weights and extra of StyleEvents)"
             )
-        weight = steps.get(STYLE).index_select(-1, self.columns.to(fired.device))
+        weight = _entry(steps, STYLE).index_select(-1, self.columns.to(fired.device))
         admitted = fired.clone()
         admitted[..., : len(self.columns)] &= weight != 0
         return admitted
@@ -91,7 +91,7 @@ class KeyEvents:
 
     def __call__(self, steps: TensorDictBase) -> Tensor:
         """Return booleans `(steps, len(names))`."""
-        return steps.get(("next", EVENTS))
+        return _entry(steps, ("next", EVENTS))
 
 
 class PredicateEvents:
@@ -135,7 +135,7 @@ class KeyRoute:
 
     def __call__(self, steps: TensorDictBase) -> Tensor:
         """Return table numbers `(steps,)`."""
-        number = steps.get(SCENARIO)
+        number = _entry(steps, SCENARIO)
         return number.squeeze(-1) if number.shape == (*steps.shape, 1) else number
 
 
@@ -188,6 +188,21 @@ def checked_route(route: Route, steps: TensorDictBase) -> Tensor:
             f"{len(route.names) - 1}, for the tables {', '.join(route.names)}"
         )
     return table
+
+
+def _entry(steps: TensorDictBase, key: NestedKey) -> Tensor:
+    """Return an entry of steps `(steps,)`.
+
+    Raises:
+        ValueError: If the steps do not have it.
+    """
+    value = steps.get(key, None)
+    if value is None:
+        raise ValueError(
+            f"the steps have no {key!r}, from which their tables follow: expected an environment that emits it and a "
+            "training loop that stores it (the Trainer's replay_keys)"
+        )
+    return value
 
 
 def _distinct(names: Sequence[str] | Mapping[str, object]) -> tuple[str, ...]:

@@ -3,10 +3,11 @@
 import pytest
 import torch
 
-from coachable.replay import EventTableBuffer, KeyEvents, PredicateEvents, StyleEvents
+from coachable.replay import EventTableBuffer, KeyEvents, KeyRoute, PredicateEvents, StyleEvents
 from coachable.styles import StyleSpace, Weight
 from tests.replay.one_event import one_event_buffer, steps
 
+HIT = StyleSpace([Weight("hit", 0.0, 1.0)])
 BAD_CONSTRUCTIONS = {
     "empty": (dict(table_capacities={}), "lacks"),
     "capacity": (dict(table_capacities={"default": 0}), "positive integer"),
@@ -74,6 +75,24 @@ def test_route_of_wrong_shape_or_range_is_reported(value):
     buffer = EventTableBuffer({"a": 9, "b": 5}, route=Returns(("a", "b"), value))
     with pytest.raises(ValueError, match="the route Returns"):
         buffer.extend(steps([0, 1, 2], [False] * 3))
+
+
+@pytest.mark.parametrize(
+    "given, lacking, message",
+    [
+        ({"events": KeyEvents(["hit"])}, ("next", "events"), "'next', 'events'"),
+        ({"events": StyleEvents(HIT)}, ("next", "events"), "'next', 'events'"),
+        ({"events": StyleEvents(HIT)}, "style", "no 'style'"),
+        ({"route": KeyRoute(["default", "hit"])}, "scenario", "no 'scenario'"),
+    ],
+)
+def test_steps_without_the_entry_that_decides_on_tables_are_refused(given, lacking, message):
+    horizon = {"event_horizon": 1} if "events" in given else {}
+    buffer = EventTableBuffer({"default": 9, "hit": 5}, num_envs=1, **horizon, **given)
+    whole = steps([0, 1], [False] * 2, style=torch.ones(2, 1), scenario=torch.zeros(2, 1, dtype=torch.long))
+    with pytest.raises(ValueError, match=message):
+        buffer.extend(whole.exclude(lacking))
+    buffer.extend(whole)
 
 
 def test_wrong_event_columns_name_the_tables():
