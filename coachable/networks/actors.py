@@ -88,7 +88,10 @@ class StyleNetwork(nn.Module):
         if self.space is None:
             return self.trunk(observation, *further)
         if style is None:
-            raise ValueError("this network is conditioned on a style: pass theta as its last argument")
+            raise ValueError(
+                "this network is conditioned on a style and got none: expected theta as its last argument, or in a "
+                f"tensordict under {STYLE!r}, of which losses also read {('next', STYLE)}"
+            )
         return self.trunk(observation, self.space.encode(style), *further)
 
 

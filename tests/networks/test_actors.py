@@ -86,5 +86,7 @@ def test_entropy_estimate_agrees_with_quadrature():
 def test_missing_style_and_bad_range_raise():
     with pytest.raises(ValueError, match="conditioned on a style"):
         GaussianPolicy(5, 2, ScaledStyle(), (16,), log_scale_range=(-5.0, 2.0))(torch.zeros(1, 5))
+    with pytest.raises(ValueError, match=r"under 'style', of which losses also read \('next', 'style'\)"):
+        make_gaussian_actor(5, 2, ScaledStyle(), (16,))(TensorDict({"observation": torch.zeros(1, 5)}, [1]))
     with pytest.raises(ValueError, match="low < high"):
         GaussianPolicy(5, 2, None, (16,), log_scale_range=(2.0, -2.0))
