@@ -127,15 +127,16 @@ def split(
         ignored: Words without a meaning, in addition to those of the vocabulary.
     """
     stems = [stem(token) for token in tokens]
-    sizes, named_ahead = _look_up(stems, lexicon)
+    sizes, ahead = _look_up(stems, lexicon)
     found, segment, i = [], Segment(), 0
     while i < len(tokens):
         size = sizes[i]
         mention = lexicon[tuple(stems[i : i + size])] if size else None
         separated = mention is None and tokens[i] in SEPARATORS
-        if separated or _begins_another(segment, tokens[i : i + 2], mention, named_ahead[i]):
+        outdone = mention is None and _outdoes(segment, tokens[i], ahead[i])
+        if separated or outdone or _begins_another(segment, tokens[i : i + 2], mention, ahead[i] is not None):
             found.append(segment)
-            segment = Segment()
+            segment = Segment(negated=outdone and tokens[i] not in NEGATIONS)
         if mention is not None:
             segment.words += tokens[i : i + size]
             if mention not in segment.mentions:
@@ -147,23 +148,33 @@ def split(
     return _tidy(found)
 
 
-def _look_up(stems: Sequence[str], lexicon: Mapping[tuple[str, ...], Mention]) -> tuple[list[int], list[bool]]:
+def _look_up(
+    stems: Sequence[str], lexicon: Mapping[tuple[str, ...], Mention]
+) -> tuple[list[int], list[Mention | None]]:
     """Look up the entries of the lexicon that begin at each token.
 
     Returns:
-        The number of tokens of the longest entry that begins at each token, 0 if there is none; and whether an entry
-        lies between the token and the next separator.
+        The number of tokens of the longest entry that begins at each token, 0 if there is none; and the next entry
+        between the token and the next separator.
     """
     longest = max((len(words) for words in lexicon), default=1)
-    sizes, named_ahead = [0] * len(stems), [False] * len(stems)
-    ahead, clear = False, 0  # `clear` counts the tokens before the next separator
+    sizes = [0] * len(stems)
+    named_ahead: list[Mention | None] = [None] * len(stems)
+    ahead, clear = None, 0  # `clear` counts the tokens before the next separator
     for i in reversed(range(len(stems))):
         fitting = [n for n in range(min(longest, len(stems) - i), 0, -1) if tuple(stems[i : i + n]) in lexicon]
         sizes[i] = fitting[0] if fitting else 0
         clear = 0 if stems[i] in SEPARATORS else clear + 1
-        ahead = clear > 0 and (ahead or any(n <= clear for n in fitting))
+        whole = next((n for n in fitting if n <= clear), 0)
+        ahead = lexicon[tuple(stems[i : i + whole])] if whole else ahead if clear else None
         named_ahead[i] = ahead
     return sizes, named_ahead
+
+
+def _outdoes(segment: Segment, word: str, ahead: Mention | None) -> bool:
+    """Return whether the next parameter is ruled out for the segment's: "traps not melee", "rather A than B"."""
+    contrasted = word in NEGATIONS or (segment.preferred and word in ("over", "than"))
+    return contrasted and bool(segment.mentions) and ahead is not None and not set(segment.names) & set(ahead.names)
 
 
 def _begins_another(segment: Segment, rest: Sequence[str], mention: Mention | None, named_ahead: bool) -> bool:

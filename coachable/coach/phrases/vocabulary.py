@@ -76,7 +76,7 @@ DEGREES = {
     **dict.fromkeys(("very", "really", "extremely", "super", "ultra"), STRONGLY),
 }
 NEGATIONS = _words("not no never without avoid stop cannot nor neither discourage ban skip forget quit drop dont")
-PREFERENCES = _words("prefer favour favor encourage love focus only mainly mostly use using choose always")
+PREFERENCES = _words("prefer favour favor encourage love focus only mainly mostly use using choose always rather")
 FACTORS = {"double": 2.0, "twice": 2.0, "triple": 3.0, "half": 0.5, "halve": 0.5}
 DEFAULTS = _words("reset normal default usual neutral standard ordinary regular")
 KEEPS = _words("keep same leave stay unchanged hold")
