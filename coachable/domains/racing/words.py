@@ -16,11 +16,13 @@ WORDS = {
     "drift": Words(
         vocabulary={
             "": _DRIVING,
-            "slip_angle_rear": ("drift", "drifting", "slide", "sliding", "sideway", "oversteer"),
+            "slip_angle_front slip_angle_rear": ("slip angle",),
+            "slip_ratio_front slip_ratio_rear": ("slip ratio",),
+            "slip_angle_rear": ("rear slip angle", "drift", "drifting", "slide", "sliding", "sideway", "oversteer"),
             "slip_angle_rear=low": ("grip", "grippy", "tidy"),
-            "slip_angle_front": ("understeer", "plough"),
-            "slip_ratio_rear": ("wheelspin", "burnout", "spin wheel", "spin the rear wheel"),
-            "slip_ratio_front": ("lock wheel", "lock the front wheel"),
+            "slip_angle_front": ("front slip angle", "understeer", "plough"),
+            "slip_ratio_rear": ("rear slip ratio", "wheelspin", "burnout", "spin wheel", "spin the rear wheel"),
+            "slip_ratio_front": ("front slip ratio", "lock wheel", "lock the front wheel"),
         },
         presets={
             "drift": {"slip_angle_rear": 5.0, "slip_ratio_rear": 5.0},
@@ -63,6 +65,7 @@ WORDS = {
             "": (*_DRIVING, "burn", "burning", "consume", "consuming", "spend", "spending", "wear out"),
             "overtake": ("attack", "pass"),
             "defend": ("block",),
+            "defend=low": ("let them pass", "let other pass", "let car pass", "let them by"),
         },
         presets={
             "flat out": {"tire": 0.0, "fuel": 0.0},
