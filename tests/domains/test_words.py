@@ -115,6 +115,18 @@ def test_phrases(domain, phrase, changes):
     assert understood.examples == ()
 
 
+def test_left_and_right_are_no_more_and_less():
+    grammar, now = grammar_of("racing_drift")
+    understood = grammar.read("drift to the right", now)
+    assert not understood.changes
+    assert understood.failed == ("'drift to right' (slip angle rear has no left and right)",)
+
+
+def test_what_is_taken_back_leaves_no_remainder():
+    grammar, now = grammar_of("racing_resources")
+    assert grammar.read("burn more fuel", now | {"fuel": 21.600000381469727}).changes == {"fuel": 0.0}
+
+
 def test_a_bit_more_is_about_both_margins():
     grammar, now = grammar_of("racing_aggressiveness")
     first = grammar.read("be more aggressive", now)

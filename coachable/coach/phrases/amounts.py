@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import cast
 
 from coachable.coach.phrases.segments import Segment
-from coachable.coach.phrases.vocabulary import ANY, PERCENT, PLAINLY, SLIGHTLY, STRONGLY, TURNS, UNITS, stem
+from coachable.coach.phrases.vocabulary import ANGLE, ANY, PERCENT, PLAINLY, SLIGHTLY, STRONGLY, TURNS, UNITS, stem
 from coachable.evaluation.wording import readable
 from coachable.styles import Choice, Setpoint, Weight
 
@@ -27,6 +27,8 @@ def amount(p: Weight | Setpoint, segment: Segment, now: float, last: Last | None
     Returns:
         The value, which may lie outside the range if the request contains a number; or, as text, what is missing.
     """
+    if segment.direction is not None and segment.direction[0] == ANGLE != dimension_of(p):
+        return f"{readable(p.name)} has no left and right"
     compared = segment.direction is not None or segment.level is not None
     sense = segment.sense or (-1 if spent and compared else 0)
     sign = _sign(segment, p, last, sense)
@@ -93,7 +95,9 @@ def _moved(p: Weight | Setpoint, segment: Segment, now: float, sign: float) -> f
     degree = segment.degree or (SLIGHTLY if segment.negated else PLAINLY)
     if _is_circle(p):
         return now + sign * TURNS[degree] * 360.0
-    return min(max(now + sign * degree * (p.high - p.low), p.low), p.high)
+    width = p.high - p.low
+    moved = min(max(now + sign * degree * width, p.low), p.high)
+    return moved if abs(moved) > 1e-6 * width else 0.0  # a style in float32 leaves a remainder
 
 
 def _level(p: Weight | Setpoint, share: float, degree: float) -> float:
