@@ -27,7 +27,7 @@ from coachable.training.weights import LoadedPolicy, domain_of, load_policy, wid
 
 __all__ = ["TOLERANCE", "contract_of", "export", "largest_difference", "write_onnx"]
 
-TOLERANCE = 1e-5
+TOLERANCE = 1e-4  # in float32 torch itself is off by up to 1e-5 on some processors
 """Largest difference between the file's actions and torch's."""
 
 _SAMPLES = 256  # inputs for which they are compared

@@ -65,6 +65,12 @@ def test_parity_with_the_actor_of_the_humanoid(file, batch):
     np.testing.assert_allclose(action, expected.numpy(), rtol=0, atol=1e-5)
 
 
+def test_rounding_in_the_largest_shipped_network_is_no_difference(tmp_path):
+    agent = load_policy("combat_full")
+    plain = DeterministicAction(agent.actor)
+    assert largest_difference(write(plain, tmp_path / "fighter.onnx"), plain, agent.space) <= TOLERANCE
+
+
 def test_the_file_describes_itself(file):
     session = onnxruntime.InferenceSession(str(file))
     assert [(i.name, i.shape[1]) for i in session.get_inputs()] == [("observation", 82), ("style", 4)]
