@@ -16,7 +16,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from coachable.cli import main
 from coachable.contract.contract import SCHEMA_VERSION
 from coachable.distributions.action_heads import ActionHeads
-from coachable.export.onnx import TOLERANCE, _trace, export, largest_difference
+from coachable.export.onnx import _trace, export, largest_difference
+from coachable.export.verify import TOLERANCE
 from coachable.networks import make_gaussian_actor
 from coachable.networks.mixed import make_mixed_actor
 from coachable.networks.plain import DeterministicAction, policy_network

@@ -214,7 +214,7 @@ class CoachPage:
 
     def _add_presets(self) -> None:
         gui = self.server.gui
-        self._given_presets = {name.lower() for name in self.session.presets}  # of the session, and of every visitor
+        self._given_presets = {name.lower() for name in self.session.presets}  # which visitors must not replace
         with gui.add_folder("Presets"):
             self.preset = gui.add_dropdown("preset", list(self.session.presets))
             apply = gui.add_button("Apply preset")

@@ -14,7 +14,8 @@ from typing import Any
 from coachable import __version__
 from coachable.domain import Domain
 from coachable.export.graph import import_onnx
-from coachable.export.onnx import TOLERANCE, write_onnx
+from coachable.export.onnx import write_onnx
+from coachable.export.verify import TOLERANCE
 from coachable.export.web.part import PagePart
 from coachable.export.web.pinned_files import Package, packages, provide
 from coachable.outputs import complete_folder
