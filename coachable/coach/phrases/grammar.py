@@ -274,6 +274,8 @@ class StyleGrammar:
                 return (), f" (nothing here has a {dimension})"
         else:
             fitting = [n for n in numeric if dimension_of(self.parameters[n]) != "angle"]
+        if segment.every:
+            return tuple(fitting), ""  # "both 0.5 m"
         if reading.last is not None and (reading.last[0][0] in fitting or not dimension):
             return reading.last[0], ""
         together = any(mention.names == tuple(fitting) for mention in self.lexicon.values())
@@ -304,7 +306,8 @@ class StyleGrammar:
             return
         was = readable_number(before) if isinstance(before, float) else _shown(parameter, before)
         outside = isinstance(before, float) and not parameter.low <= float(value) <= parameter.high
-        trained = f", outside the trained range {parameter.low:g} to {parameter.high:g}" if outside else ""
+        bounds = f"{parameter.low:g} to {_shown(parameter, parameter.high)}"
+        trained = f", outside the trained range {bounds}" if outside else ""
         reading.said.append(f"{readable(name)} {was} → {_shown(parameter, value)}{note}{trained}")
         reading.values[name] = reading.changes[name] = value
 

@@ -11,6 +11,7 @@ from coachable.coach.phrases.vocabulary import (
     DEFAULTS,
     DEGREES,
     DIRECTIONS,
+    EVERY,
     FACTORS,
     FILLERS,
     KEEPS,
@@ -24,7 +25,14 @@ from coachable.coach.phrases.vocabulary import (
     stem,
 )
 
-_FLAGS = {"preferred": PREFERENCES, "default": DEFAULTS, "keep": KEEPS, "repeated": REPEATS, "absolute": ABSOLUTE}
+_FLAGS = {
+    "preferred": PREFERENCES,
+    "default": DEFAULTS,
+    "keep": KEEPS,
+    "repeated": REPEATS,
+    "every": EVERY,
+    "absolute": ABSOLUTE,
+}
 """Words by the attribute of `Segment` that they set."""
 
 
@@ -74,6 +82,7 @@ class Segment:
     default: bool = False
     keep: bool = False
     repeated: bool = False
+    every: bool = False
     absolute: bool = False
     signed: bool = False
 

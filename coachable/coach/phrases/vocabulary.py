@@ -81,6 +81,7 @@ FACTORS = {"double": 2.0, "twice": 2.0, "triple": 3.0, "half": 0.5, "halve": 0.5
 DEFAULTS = _words("reset normal default usual neutral standard ordinary regular")
 KEEPS = _words("keep same leave stay unchanged hold")
 REPEATS = _words("again more further less")
+EVERY = _words("both each all every")
 ABSOLUTE = _words("to at of than exactly about around roughly")
 SEPARATORS = _words(", ; . ! ? : and but plus while with then also")
 
@@ -92,7 +93,7 @@ FILLERS = _words(
     getting give set put have has having try move moving style than rather quite some any possible
     ok okay hey well thanks thank instead back exactly about roughly around by into or if when keep hold stay leave
     holding keeping bit lot lots touch tad one such kind sort how what which where when between during after before
-    over under per both each maybe"""
+    over under per both each all every maybe"""
 )
 
 RESERVED = frozenset().union(

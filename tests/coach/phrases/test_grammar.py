@@ -133,7 +133,16 @@ def test_changes_stop_at_the_end_of_the_range_and_numbers_are_flagged(grammar):
     assert grammar.read("much shorter", NOW | {"step_length": 0.35}).changes == {"step_length": pytest.approx(0.3)}
     beyond = grammar.read("step length 0.9", NOW)
     assert beyond.changes == {"step_length": 0.9}
-    assert "outside the trained range 0.3 to 0.65" in str(beyond)
+    assert "outside the trained range 0.3 to 0.65 m" in str(beyond)
+
+
+def test_both_and_all_change_every_parameter_that_fits():
+    gaps = [Setpoint("ahead", 0.0, 2.0, unit="m"), Setpoint("beside", 0.0, 1.0, unit="m")]
+    grammar = StyleGrammar([*gaps, Weight("fuel", 0.0, 1.0)])
+    now = {"ahead": 1.0, "beside": 0.25, "fuel": 0.5}
+    first = grammar.read("ahead 1.5 m", now)
+    assert grammar.read("both 0.5 m", now, first).changes == {"ahead": 0.5, "beside": 0.5}
+    assert grammar.read("all higher", now, first).changes == {"ahead": 1.4, "beside": 0.45, "fuel": 0.7}
 
 
 def test_back_to_normal_means_everything(grammar):
