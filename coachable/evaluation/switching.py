@@ -26,7 +26,7 @@ class SwitchReport:
         metrics: Mean over episodes of survival and of the domain's measures.
         comply_seconds: Time from a switch until the agent complied (S,) [s], for the switches after which it did.
         complied: Share of the switches after which the agent complied before the next one.
-        switches: Number of switches, in episodes that had not ended, after which compliance could be judged.
+        switches: Number of switches in episodes that had not ended; 0 if no step shows whether the agent complied.
     """
 
     metrics: dict[str, float]
@@ -50,8 +50,7 @@ def evaluate_switching(
 ) -> SwitchReport:
     """Evaluate a policy with a new style from the training distribution every `SWITCH_PERIOD` steps.
 
-    A switch does not count if compliance cannot be judged in any step before the next one, such as savings of fuel
-    without a comparison, or margins to other cars while none is near.
+    No switch counts if compliance cannot be judged in any step, such as savings of fuel without a comparison.
 
     Args:
         domain: Domain in which the policy acts.
@@ -68,13 +67,13 @@ def evaluate_switching(
     summary = {"survived": record.survived.float(), **domain.measures.summarise(record.measures, record.alive)}
     metrics = {name: value.nanmean().item() for name, value in summary.items()}
     complies = domain.measures.complies(record.measures) & record.alive
-    judged = judged_steps(domain.measures, record.measures) & record.alive
+    is_known = bool((judged_steps(domain.measures, record.measures) & record.alive).any())
     waits, switches = [], 0
-    for start in range(SWITCH_PERIOD, len(complies), SWITCH_PERIOD):
-        counts = record.alive[start] & judged[start : start + SWITCH_PERIOD].any(0)
+    for start in range(SWITCH_PERIOD, len(complies) if is_known else 0, SWITCH_PERIOD):
+        running = record.alive[start]
         done, first = complies[start : start + SWITCH_PERIOD].max(0)
-        switches += int(counts.sum())
-        waits.append((first[counts & done] + 1) * domain.control_step)
+        switches += int(running.sum())
+        waits.append((first[running & done] + 1) * domain.control_step)
     times = torch.cat(waits) if waits else torch.empty(0)
     return SwitchReport(metrics, times, len(times) / switches if switches else float("nan"), switches)
 
