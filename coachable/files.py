@@ -126,7 +126,7 @@ def load_state(file: Path, device: torch.device | str = "cpu") -> dict[str, Any]
             state = torch.load(file, map_location=device, weights_only=True)
         except Exception as error:
             raise CheckpointError(
-                f"cannot read {file}: it holds something else than tensors, numbers, strings and containers of these, "
+                f"cannot read {file}: it holds something other than tensors, numbers, strings and containers of these, "
                 "which is not loaded because loading could run code"
             ) from error
         _check_plain(state, str(file))

@@ -50,7 +50,7 @@ class Range:
             value: The value.
 
         Raises:
-            ValueError: If it does not; the message names the quantity, the value and the range.
+            ValueError: If it is not in the range; the message names the quantity, the value and the range.
         """
         if not self.holds(value):
             raise ValueError(f"{name} is {value!r}: expected {self}")

@@ -49,4 +49,4 @@ def require_agent(source: str) -> None:
     if not source or not Path(source).exists():
         raise ValueError(f"there is no agent {source!r}: expected {SOURCE_HELP} ({names})")
     if not source.endswith(".onnx") and not zipfile.is_zipfile(source):
-        raise ValueError(f"{source} is no weights file: expected {SOURCE_HELP} ({names})")
+        raise ValueError(f"{source} is not a weights file: expected {SOURCE_HELP} ({names})")

@@ -297,6 +297,7 @@ def make_trainer(
     """
     settings, run_dir = run.settings, Path(run.settings.run_dir)
     network = fitted_network(run, env)
+    name = f"{settings.domain} {settings.stage}" if settings.stage else settings.domain
     trainer = Trainer(
         settings=settings.train,
         collector=collector,
@@ -313,7 +314,7 @@ def make_trainer(
             config=run.config,
         ),
         style_terms=style_reward.terms_of,
-        log=MetricsLog(run_dir, wandb_logger(settings.domain, run_dir, **asdict(settings.wandb))),
+        log=MetricsLog(run_dir, wandb_logger(name, run_dir, **asdict(settings.wandb))),
         progress=Progress(settings.train.total_frames),
         checkpoints=CheckpointStore(run_dir / "checkpoints", **asdict(settings.checkpoint)),
         replay_keys=stored_keys(run, env, replay),

@@ -197,7 +197,8 @@ def _contents(run: Path) -> dict[str, Any]:
     folder = find_checkpoint(run)
     state = {name: value for name, value in read_state(folder).items() if name not in UNEQUAL}
     contents = dict(_leaves(state, "state"))
-    contents |= dict(_leaves(torch.load(folder / "replay" / "state.pt", weights_only=True), "replay"))
+    if (folder / "replay").exists():  # the checkpoint of a finished stage has none
+        contents |= dict(_leaves(torch.load(folder / "replay" / "state.pt", weights_only=True), "replay"))
     for file in sorted((folder / "replay").glob("*.npy")):
         contents[f"replay/{file.stem}"] = torch.from_numpy(np.load(file))
     return contents | _metrics(run)

@@ -26,7 +26,7 @@ class ClusterError(WorkerError):
 
 
 class Connection:
-    """Connection of this process to Ray, which starts a local Ray unless it is told of a cluster.
+    """Connection of this process to Ray, which starts a local Ray unless it is given the address of a cluster.
 
     If this process is connected to Ray already, that connection is used and left open.
 
@@ -54,7 +54,7 @@ class Connection:
         self.ray: Any = ray
         self._folder: str | None = None
         self._is_ours = not ray.is_initialized()
-        if self._is_ours:  # what a lost worker raises is told as a warning; Ray would print its traceback as well
+        if self._is_ours:  # what a lost worker raises is reported as a warning; Ray would print its traceback as well
             os.environ.setdefault("RAY_IGNORE_UNHANDLED_ERRORS", "1")
         address = address or os.environ.get("RAY_ADDRESS")
         try:

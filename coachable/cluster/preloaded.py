@@ -5,6 +5,6 @@ import gc
 import coachable.cluster.worker  # noqa: F401
 from coachable.code_version import code_version
 
-code_version()  # of the source that has been loaded here, whatever becomes of the files
+code_version()  # of the source that is loaded here, even if the files change later
 gc.collect()
-gc.freeze()  # the collector of garbage would write to the shared pages, which copies them
+gc.freeze()  # otherwise the garbage collector would write to the shared pages, which would then be copied

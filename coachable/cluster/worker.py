@@ -70,7 +70,7 @@ class Batch:
 
 
 class _Paced(Transform):
-    """Environment transform that lets time pass as the throttle says, step by step."""
+    """Environment transform that waits at each step as the throttle requires."""
 
     def __init__(self, throttle: Throttle) -> None:
         super().__init__()
@@ -85,7 +85,7 @@ class _Paced(Transform):
 class RolloutWorker:
     """Worker that collects one batch per call.
 
-    It does nothing before `start`, so that whatever fails there is told as an ordinary error.
+    It does nothing before `start`, so that whatever fails there is reported as an ordinary error.
     """
 
     def start(self, task: bytes, settings: WorkerSettings) -> tuple[int, str]:

@@ -13,7 +13,7 @@ Key = tuple[int, int]  # a worker's number, and how often it had been started be
 
 
 class WorkerHost:
-    """Ray actor that answers for its workers, each of which may be called by another thread.
+    """Ray actor that forwards calls to its workers, each of which may be called from a different thread.
 
     Args:
         forks: Whether each worker gets a process of its own. Without it there is only one worker, in this process.

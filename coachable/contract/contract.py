@@ -195,14 +195,14 @@ def _json(text: str, what: str, kind: type, longest: int = _LONGEST_TEXT) -> Any
     try:
         value = json.loads(text, parse_constant=_refuse)
     except (ValueError, RecursionError):
-        raise ContractError(f"its {what} is no JSON") from None
+        raise ContractError(f"its {what} is not valid JSON") from None
     if not isinstance(value, kind):
         raise ContractError(f"its {what} is a {type(value).__name__}: expected a {kind.__name__}")
     return value
 
 
 def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is no JSON")
+    raise ValueError(f"{constant} is not valid JSON")
 
 
 def _signals(text: str, what: str) -> tuple[Signal, ...]:

@@ -146,7 +146,7 @@ def read_model(file: Path | str) -> tuple[Contract, OnnxRun]:
     try:
         model = onnx.load_model_from_string(content)
     except Exception as error:  # a damaged file may raise anything
-        raise CheckpointError(f"{file} is no ONNX file, or is damaged or cut short ({size:,} bytes)") from error
+        raise CheckpointError(f"{file} is not an ONNX file, or is damaged or cut short ({size:,} bytes)") from error
     try:
         _check_graph(onnx, model)
         contract = Contract.from_metadata({entry.key: entry.value for entry in model.metadata_props})
@@ -172,7 +172,7 @@ def import_onnx() -> Any:
 def _check_graph(onnx: Any, model: Any) -> None:
     """Refuse operators of other libraries, and weights in other files, which the file could name freely."""
     if not model.graph.node:
-        raise ContractError("it has no graph: it is no ONNX file, or is cut short")
+        raise ContractError("it has no graph: it is not an ONNX file, or is cut short")
     own = {*_STANDARD, *(function.domain for function in model.functions)}
     graphs = [*_graphs(model.graph), *(graph for function in model.functions for graph in _graphs(function))]
     foreign = {node.domain for graph in graphs for node in graph.node} - own

@@ -173,7 +173,7 @@ def _entropy_of_rows(
 
 
 def _log_of_product(q: Tensor) -> Tensor:
-    """Return the sum of log q over the last axis for q in (1, 2], by an eighth of the logarithms."""
+    """Return the sum of log q over the last axis for q in (1, 2], with an eighth as many logarithms."""
     remainder = 0.0
     for _ in range(3):
         n = q.shape[-1]

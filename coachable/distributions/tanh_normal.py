@@ -17,8 +17,8 @@ from coachable.distributions.tanh_gaussian import at_least_float32, sample_tanh_
 class TanhGaussian(TanhNormal):
     """Distribution of `tanh(u)` with independent Gaussian `u`, on (-1, 1).
 
-    It is the distribution `TanhNormal(loc, scale)`, whose constructor takes 0.3 ms, longer than sampling, twice per
-    update. Densities are computed from u, so that they are exact also where tanh saturates.
+    It is the same distribution as `TanhNormal(loc, scale)`, whose constructor takes 0.3 ms, longer than sampling, and
+    runs twice per update. Densities are computed from u, so that they are exact also where tanh saturates.
 
     Args:
         loc: Location of u `(..., A)`.

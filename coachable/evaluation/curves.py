@@ -62,7 +62,7 @@ def _rows(table: Path) -> list[dict[str, str]]:
         with table.open(newline="", encoding="utf-8") as file:
             return list(csv.DictReader(file))
     except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{table} is no table of metrics: {error}") from error
+        raise ValueError(f"{table} is not a table of metrics: {error}") from error
 
 
 def _numbers(table: Path, rows: list[dict[str, str]], x: str, y: str) -> tuple[list[tuple[float, float]], float]:

@@ -11,6 +11,7 @@ from matplotlib.patches import Rectangle
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from coachable.contract.exported_model import OnnxPolicy
 from coachable.domain import Domain
 from coachable.evaluation.attribution import Ranking, import_captum, input_groups, rank_groups
 from coachable.evaluation.episode_records import RolloutOptions, record_styles
@@ -44,10 +45,15 @@ def explain(
 
     Raises:
         ImportError: If the extra `explain` is not installed.
-        ValueError: If the domain's groups do not fit its observation.
+        ValueError: If the source is an exported model, or the domain's groups do not fit its observation.
     """
     import_captum()
     agent = load_policy(source)
+    if isinstance(agent.actor, OnnxPolicy):
+        raise ValueError(
+            f"{source} is an exported model, which has no gradients: expected a run's folder, a checkpoint, a weights "
+            "file, or a domain that ships with weights"
+        )
     domain = domain_of(agent)
     outputs = ActionOutputs(agent.actor).eval()
     groups = input_groups(domain, agent.space, outputs.observation_dim)

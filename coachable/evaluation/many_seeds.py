@@ -9,17 +9,19 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from coachable.evaluation.curves import metrics_files, read_metric
 from coachable.evaluation.many_agents import side_by_side, table_of
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
-from coachable.training.hardware import detect
+from coachable.training.hardware import detect, share_threads
 
 __all__ = ["parse_seeds", "seed_table", "train_seeds"]
 
 _PR_SET_PDEATHSIG = 1  # of <sys/prctl.h>
-_SHOWN = ("frames", "updates", "minutes", "episode/return", "eval/return")
+_COUNTED = ("frames", "updates", "minutes")  # from the start of each stage
+_SHOWN = (*_COUNTED, "episode/return", "eval/return")
 
 
 def parse_seeds(text: str) -> list[int]:
@@ -65,10 +67,11 @@ def train_seeds(script: Path, arguments: Sequence[str], seeds: Sequence[int], fo
         )
     folder.mkdir(parents=True, exist_ok=True)
     record.write_text(json.dumps(said), encoding="utf-8")
-    free = detect().free
-    at_once = min(len(seeds), free)
-    threads = [f"threads.{part}={free // at_once}" for part in ("simulator", "learner")]
-    threads = [text for text in threads if not any(said.startswith("threads.") for said in arguments)]
+    hardware = detect()
+    at_once = min(len(seeds), hardware.free)
+    share = share_threads(hardware=replace(hardware, cores=hardware.free // at_once, busy=0.0))
+    given = {argument.split("=")[0] for argument in arguments}
+    threads = [f"{key}={n}" for part, n in asdict(share).items() if (key := f"threads.{part}") not in given]
     waiting = [seed for seed in seeds if not _has_ended(folder / f"seed_{seed}")]
     running: dict[int, subprocess.Popen[bytes]] = {}
     failed: dict[int, str] = {}
@@ -137,6 +140,8 @@ def _last(run: Path, name: str) -> float:
     if not metrics_files(run):
         return math.nan
     try:
+        if name in _COUNTED:
+            return float(read_metric(run, name, name)[0][-1])
         return float(read_metric(run, "frames", name)[1][-1])
     except ValueError:  # there is no such column, or no row has it
         return math.nan
@@ -144,4 +149,4 @@ def _last(run: Path, name: str) -> float:
 
 def _last_line(log: Path) -> str:
     lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-    return lines[-1] if lines else "ended without a word"
+    return lines[-1] if lines else "it ended without printing anything"

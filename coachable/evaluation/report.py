@@ -159,7 +159,8 @@ def _lead(agents: Mapping[str, LoadedPolicy], runs: Sequence[Run], episodes: int
         f"{counted(episodes, 'episode')} in each of {counted(len(grid.cells), 'style')}, up to {grid.steps} steps "
         "each. Values are interquartile means over the runs, each run counting with the mean of its episodes; in "
         "brackets 95 % intervals, by stratified bootstrap over runs. An interquartile mean leaves out the lowest and "
-        "the highest quarter: of shares it tells the typical style, so the summary also has the plain mean."
+        "the highest quarter. For shares it describes a typical style rather than the average, so the summary also "
+        "gives the plain mean."
     )
 
 

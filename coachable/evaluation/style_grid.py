@@ -54,7 +54,8 @@ class StyleGrid:
 
         Returns:
             Rows with the other parameters' values, `slope` of the realised over the requested value (least squares over
-            episodes), `rank_correlation`, and `mean_error`. Of several set-points, the one that is measured is empty.
+            episodes), `rank_correlation`, and `mean_error`. With several set-points, the column of
+            the measured one is empty.
         """
         rows = []
         known = self.episodes.keys() & self.cells[0].keys()

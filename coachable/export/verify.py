@@ -72,7 +72,7 @@ def _declared(file: str | Path, contract: Contract, domain: Domain | str | None)
     if isinstance(domain, Domain):
         return domain
     name = domain or contract.domain
-    load_domain(name)  # an unknown name is no fault of the file
+    load_domain(name)  # an unknown name is not the fault of the file
     with refusing(file, "a configuration of its environment"):
         return load_domain(name, {"env": contract.environment})
 

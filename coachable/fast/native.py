@@ -138,7 +138,7 @@ def _cache() -> Path | None:
 
 
 def _only_ours(path: Path) -> bool:
-    """Whether `path`, which is no link, belongs to this user and nobody else can write to it."""
+    """Whether `path`, which is not a link, belongs to this user and nobody else can write to it."""
     status = path.lstat()
     return status.st_uid == os.geteuid() and not status.st_mode & 0o022 and not stat.S_ISLNK(status.st_mode)
 

@@ -118,7 +118,7 @@ def _array(folder: Path, entry: dict[str, Any], filled: int) -> np.ndarray:
     try:
         array = np.lib.format.open_memmap(file, mode="r")  # refuses arrays of objects, which would need pickle
     except ValueError as error:
-        raise CheckpointError(f"{file} is damaged or no array of numbers: {error}") from error
+        raise CheckpointError(f"{file} is damaged or not an array of numbers: {error}") from error
     expected = entry["dtype"], tuple(entry["shape"])
     if (np.lib.format.dtype_to_descr(array.dtype), array.shape) != expected or array.shape[0] != filled:
         raise CheckpointError(
@@ -131,7 +131,7 @@ def _file(key: list[str]) -> str:
     """Return the name of an entry's file, which is never outside its folder."""
     name = ".".join(key) + ".npy"
     if Path(name).name != name:
-        raise CheckpointError(f"{name!r} is no name of a file of records: expected one without folders")
+        raise CheckpointError(f"{name!r} is not the name of a file of records: expected one without folders")
     return name
 
 

@@ -219,7 +219,7 @@ class StratifiedSampler(Sampler):
         if bool(state_dict) != self.prioritized:
             raise ValueError(
                 f"the saved buffer was {'' if state_dict else 'not '}prioritised, this one is "
-                f"{'' if self.prioritized else 'not'}: give the same prioritized="
+                f"{'' if self.prioritized else 'not '}prioritised: give the same value of prioritized"
             )
         self._empty()
         if state_dict:

@@ -162,7 +162,7 @@ class StyleSpace:
             parameter = self[name]
             if isinstance(parameter, Choice):
                 if value not in parameter.options:
-                    raise ValueError(f"{name} = {value!r} is no option: expected one of {list(parameter.options)}.")
+                    raise ValueError(f"{name} = {value!r} is not an option: expected one of {list(parameter.options)}.")
                 theta[self.slices[name]] = torch.tensor([float(o == value) for o in parameter.options])
             else:
                 try:
@@ -170,7 +170,7 @@ class StyleSpace:
                     theta[self.slices[name]] = min(max(float(value), -largest), largest)
                 except (TypeError, ValueError, OverflowError):
                     raise ValueError(
-                        f"{name} = {value!r} is no number: expected one in [{parameter.low}, {parameter.high}]."
+                        f"{name} = {value!r} is not a number: expected one in [{parameter.low}, {parameter.high}]."
                     ) from None
         return self.clamp(theta, strict=strict)
 
@@ -184,7 +184,7 @@ class StyleSpace:
             Theta `(number of styles, dim)`, float32.
 
         Raises:
-            ValueError: If a name or option is unknown, or a value is no number or out of range.
+            ValueError: If a name or option is unknown, or a value is not a number or out of range.
         """
         return torch.stack([self.make(strict=True, **style) for style in styles])
 

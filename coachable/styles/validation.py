@@ -42,7 +42,7 @@ def violations(parameters: Sequence[Parameter], low: Tensor, high: Tensor, theta
     for p, block in blocks:
         if isinstance(p, Choice):
             if not bool(_is_one_hot(block).all()):
-                clauses.append(f"{p.name} is no one-hot of its {p.width} options {list(p.options)}")
+                clauses.append(f"{p.name} is not a one-hot of its {p.width} options {list(p.options)}")
         elif outside[first]:
             clauses.append(f"{p.name} = {_span(block)}{_unit(p)} lies outside [{p.low:g}, {p.high:g}]{_unit(p)}")
         first += p.width

@@ -164,6 +164,11 @@ class CheckpointStore:
             for folder in others:
                 self._remove(folder / "replay")
 
+    def remove_replay(self) -> None:
+        """Remove the replay buffer, which takes up most of a checkpoint's space; weights and settings stay."""
+        for folder in _complete(self.directory):
+            self._remove(folder / "replay")
+
     def _remove(self, folder: Path) -> None:
         """Rename a folder before removing it, so that a process killed meanwhile leaves nothing that looks complete."""
         if folder.exists():
@@ -243,7 +248,7 @@ def check_fits(saved: Mapping[str, Tensor], present: Mapping[str, Tensor], what:
     for name, value in present.items():
         there = saved.get(name, value)
         if not isinstance(there, Tensor) or there.is_floating_point() != value.is_floating_point():
-            problems.append(f"{name} is no tensor of {value.dtype} in the checkpoint")
+            problems.append(f"{name} is not a tensor of {value.dtype} in the checkpoint")
         elif there.shape != value.shape:
             problems.append(f"{name} is {tuple(there.shape)} in the checkpoint, {tuple(value.shape)} here")
     if problems:

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from coachable.training.checkpoint import CheckpointError, check_unused, find_checkpoint, read_state
+from coachable.training.checkpoint import CheckpointError, CheckpointStore, check_unused, find_checkpoint, read_state
 from coachable.training.hardware import share_threads
 from coachable.training.trainer import Trainer
 
@@ -20,7 +20,8 @@ class Curriculum:
     """Training that runs one stage after the other.
 
     Stage i of the run is a run of its own in `stages/i_NAME`, with an empty replay buffer and new optimisers. Its
-    checkpoints hold the settings of all stages, so that the run can be resumed in any of them.
+    checkpoints hold the settings of all stages, so that the run can be resumed in any of them. The replay buffer of a
+    finished stage is removed from its checkpoint, because the next stage does not need it.
 
     Args:
         config: `stages` is the list of the stages' complete configurations in plain containers, each with its name
@@ -47,7 +48,7 @@ class Curriculum:
         if resume:
             self.number = self._number_of(config.get("stage"), resume)
             if _is_finished(resume, self.stages[self.number]) and self.number + 1 < len(self.stages):
-                self.number, resume = self.number + 1, None
+                self.number, resume, self._init_from = self.number + 1, None, str(find_checkpoint(resume))
         else:
             check_unused(self.run_dir)
             self.number = 0
@@ -75,7 +76,9 @@ class Curriculum:
                     f"the end of stage {self.stages[self.number]['stage']} was not saved, and the next stage starts "
                     f"from it. When there is space again, continue with resume={self.run_dir}"
                 )
-            self.number += 1
+            finished = self.folder(self.number)
+            CheckpointStore(finished / "checkpoints").remove_replay()
+            self.number, self._init_from = self.number + 1, str(finished)
             # The next stage needs the memory of this one's replay buffer. When a SerialEnv is collected, TorchRL also
             # raises the number of threads, which must happen before the next stage sets it.
             del self.train
@@ -87,14 +90,12 @@ class Curriculum:
         return self.run_dir / "stages" / f"{number + 1}_{self.stages[number]['stage']}"
 
     def _start(self, resume: str | None) -> Trainer:
-        first = self.number == 0
-        init_from = self._init_from if first else str(self.folder(self.number - 1))
         config = {
             **self.stages[self.number],
             "stages": self.stages,
             "run_dir": str(self.folder(self.number)),
             "resume": resume,
-            "init_from": None if resume else init_from,
+            "init_from": None if resume else self._init_from,
         }
         train = self._build(config)
         self._announce(config, train)

@@ -99,7 +99,10 @@ def pick_device(name: str = "auto") -> torch.device:
     if device.type != "cuda":
         return device
     if not torch.cuda.is_available():
-        raise ValueError(f"device={name} but torch finds no CUDA device here: set device=cpu, or choose preset=cpu")
+        raise ValueError(
+            f"device={name} but torch finds no CUDA device here: set device=cpu, or choose a preset for CPU cores "
+            "(--help lists them)"
+        )
     # TorchRL treats "cuda" and "cuda:0" as different devices, and would copy the policy from one to the other.
     return torch.device("cuda", torch.cuda.current_device() if device.index is None else device.index)
 
@@ -160,11 +163,10 @@ def estimate_update_seconds(parameters: int, batch_size: int, bf16: bool, device
     for _ in range(4):  # the first rounds include start-up costs, so the best one counts
         start = time.perf_counter()
         for _ in range(repeats):
-            c = a @ b
+            torch.mm(a, b)
         if device.type == "cuda":
             torch.cuda.synchronize(device)
         best = min(best, (time.perf_counter() - start) / repeats)
-    del c
     operations = 16 * 2 * batch_size * parameters
     overhead = 0.003  # about 2-3 ms of Python per update, whatever its size (measured)
     return 2 * operations * best / (2 * 256 * 512 * 512) + overhead

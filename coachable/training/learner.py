@@ -208,11 +208,13 @@ class Learner:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned, with the constructor's learning rates and fixed entropy weight."""
+        """Restore what :meth:`state_dict` returned, with the constructor's `adam_eps`, rates and fixed alpha."""
         self._follow()
         self.loss_module.load_state_dict(state["loss_module"])
         for name, optimizer in self.optimizers.items():
             optimizer.load_state_dict(state["optimizers"][name])
+            for group in optimizer.param_groups:
+                group["eps"] = self._options["adam_eps"]
         self.scale_learning_rates(1.0)
         self.scale_entropy_weight(1.0)
         self.updates = int(state["updates"])

@@ -50,7 +50,7 @@ class MetricsLog:
         """Drop the rows after `frames` env-steps, which a resumed training writes again.
 
         Raises:
-            ValueError: If the column has an entry that is not a number, or the file is not a table.
+            ValueError: If an entry of the column `frames` is not a number, or the file is not a table.
         """
         rows = self._read()
         try:
@@ -79,6 +79,11 @@ class MetricsLog:
             finite = {k: float(v) for k, v in row.items() if math.isfinite(v)}
             self.logger.log_metrics(finite, step=int(row["frames"]))
 
+    def close(self) -> None:
+        """End the logger's run, so that the next one, such as that of the next stage, is another."""
+        if self.logger is not None:
+            self.logger.shutdown()
+
     def _read(self) -> list[dict[str, Any]]:
         if not self.path.exists():
             return []
@@ -88,7 +93,7 @@ class MetricsLog:
                 self.columns = list(reader.fieldnames or [])
                 return list(reader)
         except (UnicodeDecodeError, csv.Error) as error:
-            raise ValueError(f"{self.path} is no table of metrics: {error}. {_MOVE}") from error
+            raise ValueError(f"{self.path} is not a table of metrics: {error}. {_MOVE}") from error
 
     def _rewrite(self, rows: list[dict[str, Any]]) -> None:
         partial = self.path.with_name(self.path.name + ".partial")
@@ -114,12 +119,11 @@ def wandb_logger(name: str, run_dir: Path, *, project: str = "coachable", mode: 
     modes = ("auto", "online", "offline", "off")
     if mode not in modes:
         raise ValueError(f"wandb.mode must be one of {', '.join(modes)}, got {mode!r}")
-    has_key = bool(os.environ.get("WANDB_API_KEY"))
-    if mode == "off" or (mode == "auto" and not has_key):
+    if mode == "off" or (mode == "auto" and not os.environ.get("WANDB_API_KEY")):
         return None
     from torchrl.record.loggers.wandb import WandbLogger
 
-    return WandbLogger(exp_name=name, offline=mode == "offline" or not has_key, save_dir=str(run_dir), project=project)
+    return WandbLogger(exp_name=name, offline=mode == "offline", save_dir=str(run_dir), project=project)
 
 
 class Progress:

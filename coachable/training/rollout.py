@@ -27,8 +27,8 @@ class Rollout:
 
     Args:
         env: N environments with style transforms.
-        seed: Seed of the initial states and of sampled actions. Without one, the environments draw from where they
-            are, and the policy from torch's global generator.
+        seed: Seed of the initial states and of sampled actions. Without one, the environments continue
+            their own random streams, and the policy draws from torch's global generator.
     """
 
     def __init__(self, env: EnvBase, seed: int | None = None) -> None:
@@ -68,7 +68,9 @@ class Rollout:
         steps: int,
         style: StyleSchedule | None = None,
     ) -> Iterator[tuple[TensorDictBase, Tensor]]:
-        """Step the episodes that `begin` began until each one has ended. Those that end first are stepped on.
+        """Step the episodes that `begin` began until each one has ended.
+
+        Episodes that end earlier continue to be stepped.
 
         Args:
             policy: Policy that writes `action`.

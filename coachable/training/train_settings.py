@@ -19,7 +19,7 @@ class TrainSettings:
             throttle leaves.
         throttle: Highest rate of the collection [env-steps/s]; None for no limit.
         anneal: Share of `total_frames`, at its end, over which the learning rates fall linearly to a tenth.
-        anneal_entropy: Factor to which the entropy weight falls over the same share.
+        anneal_entropy: Factor to which the entropy weight falls over the same share; it has no effect if `anneal` is 0.
         eval_interval: Distance between evaluations [env-steps]; with 0 there is one, at the end.
         log_interval: Time between rows of metrics [s].
         checkpoint_interval: Time between checkpoints [s].

@@ -34,7 +34,7 @@ def trained_parameters(loss_module: LossModule) -> dict[str, list[str]]:
 
 
 class Watch:
-    """Detector of changes of a loss's or its policy's parameters: other ones, another place in memory, another dtype.
+    """Detector of parameters of a loss or its policy that were replaced, moved in memory or cast to another dtype.
 
     A parameter gets other memory by `tensor.data = other` or `.to(dtype)`, and its memory moves by `share_memory_()`.
 

@@ -129,11 +129,9 @@ class Trainer:
         self._episodes = EpisodeStatistics(style_terms)
         self._losses = Means()
         self._latest: dict[str, float] = {}
-        self._evaluations = 0
+        self._evaluations = self._logged_frames = self._filled_from = 0  # the last: when the replay buffer was empty
         self._evaluated_frames = -1
-        self._filled_from = 0  # env-steps when the replay buffer was empty
         self._logged = self._saved = time.monotonic()
-        self._logged_frames = 0
         self._saved_frames = -1  # env-steps of the checkpoint in the run's own folder that was resumed
 
     def run(self) -> dict[str, float]:
@@ -168,6 +166,7 @@ class Trainer:
             raise
         finally:
             self.progress.close()
+            self.log.close()
             self.collector.shutdown()
         return self._latest
 
@@ -294,6 +293,7 @@ class Trainer:
     def _checkpoint(self) -> None:
         if self.checkpoints is not None:
             with self._timed("checkpoint"):
+                self.learner.check_finite()
                 self.checkpoints.try_save({**self.describe(), **self.state_dict()}, self._position(), self.replay)
                 self._saved = time.monotonic()
 

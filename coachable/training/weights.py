@@ -13,7 +13,7 @@ from torchrl.objectives import LossModule
 
 from coachable.contract.exported_model import OnnxPolicy, read_model
 from coachable.domain import Domain, load_domain
-from coachable.files import check_finite, refusing, save_state, space_named, tensor_bytes
+from coachable.files import refusing, save_state, space_named, tensor_bytes
 from coachable.networks import make_gaussian_actor, make_mixed_actor
 from coachable.networks.mixed import MixedPolicy
 from coachable.networks.plain import policy_network
@@ -205,7 +205,6 @@ def export_weights(checkpoint: Path | str, out: Path | str) -> Path:
         for part in ("actor", "critics"):  # copied, because a view would bring its whole storage into the file
             agent[part] = {name: value.clone() for name, value in agent[part].items()}
         counters = {"frames": state["loop"]["frames"], "updates": state["learner"]["updates"]}
-    check_finite({"actor": agent["actor"], "critics": agent["critics"]}, source)
     agent["config"] = _without_paths(agent["config"])
     out = Path(out)
     with complete_file(out) as unfinished, space_named(out, tensor_bytes(agent)):

@@ -1,4 +1,4 @@
-"""Errors of worker processes, of which TorchRL tells the training process the exit status alone."""
+"""Errors of worker processes; TorchRL reports only their exit status to the training process."""
 
 import time
 from collections.abc import Iterator

@@ -115,9 +115,9 @@ BAD = {
     "older": ({"schema_version": "2"}, "version 2: expected 3; export the agent anew"),
     "no version": ({"schema_version": "x"}, "has the version 'x': expected 3"),
     "no space": ({"style_space": None}, "lacks style_space"),
-    "no JSON": ({"style_space": "{"}, "style space is no JSON"),
-    "nested": ({"environment": "[" * 100_000}, "environment is no JSON"),
-    "NaN": ({"environment": '{"a": NaN}'}, "environment is no JSON"),
+    "no JSON": ({"style_space": "{"}, "style space is not valid JSON"),
+    "nested": ({"environment": "[" * 100_000}, "environment is not valid JSON"),
+    "NaN": ({"environment": '{"a": NaN}'}, "environment is not valid JSON"),
     "a list": ({"environment": "[1]"}, "environment is a list: expected a dict"),
     "an empty space": ({"style_space": "{}"}, "style space cannot be used: style space has schema version None"),
     "a long text": ({"environment": " " * (1 << 21)}, "environment has 2,097,152 characters: expected at most"),
@@ -170,7 +170,7 @@ def test_bad_contracts_are_one_sentence(what, file, tmp_path, capsys):
 def test_a_truncated_file_is_one_sentence(share, file, tmp_path):
     cut = tmp_path / "cut.onnx"
     cut.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
-    with pytest.raises(CheckpointError, match=r"cut\.onnx (is no ONNX file|cannot be used).* cut short"):
+    with pytest.raises(CheckpointError, match=r"cut\.onnx (is not an ONNX file|cannot be used).* cut short"):
         read_model(cut)
 
 
@@ -179,7 +179,7 @@ def test_other_files_are_refused(tmp_path, file):
         read_model(tmp_path / "none.onnx")
     text = tmp_path / "text.onnx"
     text.write_text("This is a text, and no model at all. " * 100)
-    with pytest.raises(CheckpointError, match="is no ONNX file"):
+    with pytest.raises(CheckpointError, match="is not an ONNX file"):
         load_policy(text)
 
 

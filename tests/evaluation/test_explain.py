@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from coachable.cli import main
+from coachable.contract.exported_model import OnnxPolicy
 from coachable.distributions.action_heads import ActionHeads
 from coachable.domain import load_domain
 from coachable.evaluation.attribution import Group, input_groups, rank_groups
@@ -137,3 +138,10 @@ def test_a_missing_extra_is_named(monkeypatch, tmp_path):
 def test_too_few_episodes_are_refused(tmp_path):
     with pytest.raises(ValueError, match="at least 2 episodes"):
         explain("humanoid", tmp_path, episodes=1)
+
+
+def test_exported_models_have_no_gradients(tmp_path, monkeypatch):
+    agent = load_policy("humanoid")._replace(actor=OnnxPolicy.__new__(OnnxPolicy))
+    monkeypatch.setattr("coachable.evaluation.explain.load_policy", lambda source: agent)
+    with pytest.raises(ValueError, match="is an exported model, which has no gradients: expected a run's"):
+        explain("walker.onnx", tmp_path)

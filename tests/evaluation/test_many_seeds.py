@@ -13,8 +13,11 @@ import pytest
 from recipe_config import compose_config
 
 from coachable.cli import main
-from coachable.evaluation.many_seeds import parse_seeds
+from coachable.evaluation import many_seeds
+from coachable.evaluation.many_seeds import parse_seeds, seed_table, train_seeds
 from coachable.training.checkpoint import find_checkpoint, read_state
+from coachable.training.hardware import Hardware
+from coachable.training.logging import MetricsLog
 from tests.cluster.test_faults import wait_for_end
 
 TINY = ["preset=smoke", "train.total_frames=200", "threads.simulator=1", "threads.learner=1"]
@@ -54,6 +57,38 @@ def test_finished_trainings_are_shown_and_not_repeated(tmp_path, capsys):
     assert main(["train", "rare_targets", *TINY, "loss=qr_sac", "seeds=0,1", f"run_dir={tmp_path}"]) == 2
     assert re.search(r"holds trainings with .*: expected the same settings", capsys.readouterr().err)
     assert [(tmp_path / f"seed_{seed}" / "metrics.csv").read_text() for seed in (0, 1)] == before
+
+
+def test_the_table_counts_all_stages(tmp_path):
+    for stage, frames in (("1_first", 24), ("2_second", 40)):
+        log = MetricsLog(tmp_path / "seed_0" / "stages" / stage)
+        log.write({"frames": frames, "updates": frames // 4, "minutes": 1.5, "eval/return": frames})
+    cells = [line.strip("| ").split(" | ") for line in seed_table(tmp_path, [0], {}).splitlines()]
+    rows = {row[0]: row[1] for row in cells if len(row) > 1}
+    assert (rows["frames"], rows["updates"], rows["minutes"]) == ("64", "16", "3")
+    assert rows["eval/return"] == "40"
+
+
+@pytest.mark.parametrize(
+    "said, cores, expected",
+    [
+        ([], 4, ["threads.simulator=2", "threads.learner=2"]),
+        ([], 64, ["threads.simulator=32", "threads.learner=8"]),
+        (["threads.learner=1"], 4, ["threads.simulator=2"]),
+    ],
+)
+def test_trainings_side_by_side_share_the_cores(said, cores, expected, tmp_path, monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr(many_seeds, "detect", lambda: Hardware(cores, 0.0, 8.0, None, False))
+    commands = []
+
+    def start(script, arguments, seed, folder):
+        commands.append(arguments)
+        return subprocess.Popen(["true"])
+
+    monkeypatch.setattr(many_seeds, "_start", start)
+    train_seeds(Path("recipe.py"), said, [0, 1], tmp_path)
+    assert commands == [[*said, *expected]] * 2
 
 
 @pytest.mark.slow

@@ -94,8 +94,15 @@ def test_a_signal_at_the_end_of_a_stage_ends_the_training(whole, tmp_path, monke
     monkeypatch.setattr(Trainer, "_evaluate", interrupted)
     start(*TINY, STAGES, f"run_dir={run}").run()
     assert [folder.name for folder in (run / "stages").iterdir()] == ["1_first"]
+    elsewhere = tmp_path / "elsewhere"
+    start(f"resume={run}", f"run_dir={elsewhere}").run()
     start(f"resume={run}").run()
-    assert differences(run / "stages" / "2_second", whole / "stages" / "2_second") in ([], ["metrics/episodes"])
+    for end in (run, elsewhere):
+        assert differences(end / "stages" / "2_second", whole / "stages" / "2_second") in ([], ["metrics/episodes"])
+
+
+def test_a_finished_stage_keeps_no_replay_buffer(whole):
+    assert [folder.parents[2].name for folder in whole.glob("stages/*/checkpoints/*/replay")] == ["2_second"]
 
 
 @pytest.mark.filterwarnings("ignore:.*was not written")

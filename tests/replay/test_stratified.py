@@ -168,6 +168,15 @@ def test_prioritised_draws_and_weights_are_relative_to_the_table():
     torch.testing.assert_close(batch["priority_weight"], (weight / weight.max()).float())
 
 
+@pytest.mark.parametrize("prioritized", [True, False])
+def test_priorities_of_another_kind_of_buffer_are_refused(prioritized):
+    saved, other = filled({"a": 4}, prioritized=prioritized), filled({"a": 4}, prioritized=not prioritized)
+    kinds = ("prioritised", "not prioritised")
+    expected = "{}, this one is {}".format(*(kinds if prioritized else reversed(kinds)))
+    with pytest.raises(ValueError, match=f"saved buffer was {expected}: give the same value of prioritized"):
+        other.sampler.load_state_dict(saved.sampler.state_dict())
+
+
 def test_new_records_get_the_largest_priority():
     rb = filled({"a": 4}, prioritized=True, priority_alpha=1.0)
     slots = torch.from_numpy(rb.regions.slots(0))

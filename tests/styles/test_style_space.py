@@ -119,9 +119,9 @@ def test_make_clamps_with_a_warning_or_raises(space):
     ("values", "message"),
     [
         ({"steplength": 0.5}, r"unknown style parameter 'steplength'.*'step_length'"),
-        ({"pose": "y_pose"}, r"pose = 'y_pose' is no option.*'t_pose'"),
-        ({"pose": 1}, "is no option"),
-        ({"gap": "far"}, r"gap = 'far' is no number.*\[0\.0, 2\.0\]"),
+        ({"pose": "y_pose"}, r"pose = 'y_pose' is not an option.*'t_pose'"),
+        ({"pose": 1}, "is not an option"),
+        ({"gap": "far"}, r"gap = 'far' is not a number.*\[0\.0, 2\.0\]"),
         ({"gap": float("nan")}, r"NaN in \['gap'\]"),
     ],
 )
@@ -154,7 +154,7 @@ def test_clamp_names_every_change_of_a_batch(space):
 def test_clamp_makes_a_one_hot_of_the_largest_entry(space):
     theta = space.default
     theta[:3] = torch.tensor([0.2, 0.3, 4.0])
-    with pytest.warns(StyleRangeWarning, match="pose is no one-hot of its 3 options"):
+    with pytest.warns(StyleRangeWarning, match="pose is not a one-hot of its 3 options"):
         assert space.clamp(theta)[:3].tolist() == [0, 0, 1]
 
 
@@ -165,8 +165,8 @@ def test_clamp_makes_a_one_hot_of_the_largest_entry(space):
         (torch.zeros(()), "expected"),
         (torch.zeros(6, dtype=torch.long), "floating point"),
         (torch.full((2, 6), float("nan")), "NaN"),
-        (torch.zeros(6), "pose is no one-hot"),
-        (torch.tensor([1.0, 1.0, 0.0, 0.5, 0.0, 0.0]), "pose is no one-hot"),
+        (torch.zeros(6), "pose is not a one-hot"),
+        (torch.tensor([1.0, 1.0, 0.0, 0.5, 0.0, 0.0]), "pose is not a one-hot"),
         (torch.tensor([1.0, 0.0, 0.0, 0.5, -0.1, 0.0]), r"gap = -0\.1 m lies outside \[0, 2\] m"),
     ],
 )
@@ -345,7 +345,7 @@ def test_declarations_are_checked(declare, message):
     ("sampler", "message"),
     [
         (Uniform(0, 1), "draws 1 numbers.*need 3"),
-        (Product([Uniform(0.3, 0.6), UniformChoice(2)]), "pose is no one-hot"),
+        (Product([Uniform(0.3, 0.6), UniformChoice(2)]), "pose is not a one-hot"),
         (Product([UniformChoice(2), Uniform(0.3, 0.9)]), r"length = .* lies outside \[0\.3, 0\.6\]"),
         # too rare for a trial draw, found by its support
         (

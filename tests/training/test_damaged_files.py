@@ -135,8 +135,11 @@ CHANGES = {
         r"42 of 42 values of actor\..*NaN or infinite",
     ),
     "infinity": (lambda s: s["critics"]["x"].fill_(INFINITY), r"2 of 2 values of critics\.x are NaN or infinite"),
-    "integers": (lambda s: s.update(actor={k: v.long() for k, v in s["actor"].items()}), "no tensor of torch.float32"),
-    "text": (lambda s: s.update(actor=dict.fromkeys(s["actor"], "x")), "no tensor of torch.float32"),
+    "integers": (
+        lambda s: s.update(actor={k: v.long() for k, v in s["actor"].items()}),
+        "not a tensor of torch.float32",
+    ),
+    "text": (lambda s: s.update(actor=dict.fromkeys(s["actor"], "x")), "not a tensor of torch.float32"),
 }
 
 
@@ -196,7 +199,7 @@ def test_a_damaged_table_of_metrics_is_named(run):
     with pytest.raises(ValueError, match=r"metrics.csv is damaged: could not convert string to float: 'x'"):
         read_metric(run, "updates", "y")
     (run / "metrics.csv").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ValueError, match=r"metrics.csv is no table of metrics"):
+    with pytest.raises(ValueError, match=r"metrics.csv is not a table of metrics"):
         read_metric(run, "updates", "y")
 
 

@@ -207,6 +207,14 @@ def test_a_gpu_skips_the_step_and_the_next_check_raises(monkeypatch):
     assert any((value != before["loss_module"][name]).any() for name, value in after.items())
 
 
+def test_a_checkpoint_does_not_replace_settings_of_the_optimisers(make_learner):
+    before = make_learner(make_loss(), precision="fp32", actor_lr=1e-3, adam_eps=1e-7)
+    before.update(make_batch(16))
+    after = make_learner(make_loss(), precision="fp32", actor_lr=1e-2, adam_eps=0.25)
+    after.load_state_dict(before.state_dict())
+    assert [after.optimizers["actor"].param_groups[0][key] for key in ("lr", "eps")] == [1e-2, 0.25]
+
+
 @pytest.mark.parametrize("order", ["simultaneous", "policy_first"])
 def test_resumed_equals_uninterrupted(make_learner, order):
     def run(learner, seeds):

@@ -86,3 +86,18 @@ def test_wandb_is_off_without_a_key(tmp_path, monkeypatch):
     assert wandb_logger("run", tmp_path, mode="off") is None
     with pytest.raises(ValueError, match="must be one of auto, online, offline, off"):
         wandb_logger("run", tmp_path, mode="on")
+
+
+@pytest.mark.slow
+def test_wandb_has_one_run_per_log(tmp_path, monkeypatch):
+    """Such as that of each stage, whose env-steps begin at 0."""
+    monkeypatch.setenv("WANDB_MODE", "offline")  # restored afterwards: TorchRL sets it
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    names = []
+    for stage in ("first", "second"):
+        log = MetricsLog(tmp_path / stage, wandb_logger(stage, tmp_path / stage, mode="offline"))
+        log.write({"frames": 5, "loss": 1.0})
+        names.append(log.logger.experiment.name)
+        log.close()
+    assert names == ["first", "second"]
+    assert all(list((tmp_path / name).glob("wandb/offline-run-*")) for name in names)

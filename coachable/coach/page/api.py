@@ -201,7 +201,7 @@ def _parse(message: str | bytes) -> dict[str, Any]:
     try:
         request = json.loads(message, parse_constant=_refuse)
     except (ValueError, RecursionError):
-        raise ValueError("the message is no JSON") from None
+        raise ValueError("the message is not valid JSON") from None
     if not isinstance(request, dict):
         raise ValueError(f"the message is a {type(request).__name__}: expected an object with the entry 'do'")
     if not isinstance(request.get("id", 0), int | str):
@@ -210,7 +210,7 @@ def _parse(message: str | bytes) -> dict[str, Any]:
 
 
 def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is no JSON")
+    raise ValueError(f"{constant} is not valid JSON")
 
 
 def _change_of(what: Any, request: Mapping[str, Any]) -> Callable[[CoachSession], Any]:

@@ -342,7 +342,7 @@ def _read_recording(content: bytes) -> Recording:
     try:
         return Recording.from_json(content.decode())
     except UnicodeDecodeError:
-        raise ValueError("this is no recording: expected JSON written by a coaching session") from None
+        raise ValueError("this is not a recording: expected JSON written by a coaching session") from None
 
 
 def listed(domain: Domain, space: StyleSpace, measured: Mapping[str, float]) -> str:

@@ -37,7 +37,7 @@ def read_env_options(parser: argparse.ArgumentParser, arguments: Sequence[str]) 
     """Return options of a domain's environment by name, of which the domain knows whether there are such.
 
     Args:
-        parser: Parser that does not know them; it ends the program if they are no pairs of a name and a value.
+        parser: Parser that does not know them; it ends the program if they are not pairs of a name and a value.
         arguments: `--NAME VALUE` or `--NAME=VALUE`, any number of them.
     """
     options: dict[str, str] = {}

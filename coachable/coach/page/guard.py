@@ -140,7 +140,7 @@ class Guard:
             return "only the page itself may talk to this server"
         protocol = request.headers.get("Sec-WebSocket-Protocol", "")
         if upgrade and not (protocol == PROTOCOL if request.path == PATH else _VISER.fullmatch(protocol)):
-            return "this is no connection of the page"
+            return "this is not a connection of the page"
         if set(parse_qs(urlsplit(request.path).query, keep_blank_values=True)) & set(_FOREIGN_SOURCES):
             return "the page shows this server only"
         return ""
@@ -171,7 +171,7 @@ class GuardedConnection(server.ServerConnection):
                 wanted = is_wanted(message)
             except Exception as error:  # random bytes can raise anything
                 _log.info("a message was refused: %s", error)
-                await self.close(1007, "this is no message of the page")
+                await self.close(1007, "this is not a message of the page")
                 continue
             if wanted == "FileTransferPart":
                 self._uploaded += len(message)

@@ -89,7 +89,7 @@ def pad_page() -> str:
 
 
 def dressed(response: Response) -> Response:
-    """Give a response of viser the page's own title, icon and styles; responses that are no page are left alone."""
+    """Give a response of viser the page's own title, icon and styles; responses that are not pages are left alone."""
     if "text/html" in response.headers.get("Content-Type", ""):
         response.body = _dressed(bytes(response.body or b""), response.headers.get("Content-Encoding") == "gzip")
         if "Content-Length" in response.headers:

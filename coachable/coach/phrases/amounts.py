@@ -131,7 +131,9 @@ def _given(p: Weight | Setpoint, segment: Segment, now: float, sign: float | Non
         return p.low + (p.high - p.low) * (1.0 - share if sense < 0 else share)
     if unit:
         if dimension_of(p) != UNITS[unit][0]:
-            return f"{readable(p.name)} is no {UNITS[unit][0]}" + (f", it is in {p.unit}" if p.unit else "")
+            article = "an" if UNITS[unit][0] == ANGLE else "a"
+            in_unit = f", it is in {p.unit}" if p.unit else ""
+            return f"{readable(p.name)} is not {article} {UNITS[unit][0]}{in_unit}"
         number = number * UNITS[unit][1] / UNITS[stem(p.unit)][1]
     if segment.signed or (number < 0 and p.low >= 0):
         return now + number

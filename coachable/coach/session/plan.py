@@ -32,7 +32,7 @@ def read_plan(text: str, session: CoachSession) -> dict[float, dict[str, Value]]
     for entry in filter(str.strip, re.split(r"[;\n]", text)):
         match = _ENTRY.fullmatch(entry)
         if match is None:
-            raise ValueError(f"'{entry.strip()}' is no SECONDS: PHRASE, such as {example}")
+            raise ValueError(f"'{entry.strip()}' is not of the form SECONDS: PHRASE, such as {example}")
         seconds, phrase = float(match[1]), match[2].strip()
         preset = next((values for name, values in session.presets.items() if name.lower() == phrase.lower()), None)
         if preset is None:
@@ -40,7 +40,7 @@ def read_plan(text: str, session: CoachSession) -> dict[float, dict[str, Value]]
             fixed = [name for name in previous.changes if name not in session.space]
             hint = [f"try: {', '.join(previous.examples)}"] if previous.examples else []
             if previous.failed or fixed:
-                problems = [*previous.failed, *(f"{name} is no style" for name in fixed), *hint]
+                problems = [*previous.failed, *(f"{name} is not a style" for name in fixed), *hint]
                 raise ValueError(f"at {seconds:g} s: " + "; ".join(problems))
             preset = previous.changes
         style |= preset

@@ -64,7 +64,7 @@ class Recording:
             values = json.loads(text)
             version = values.pop("version")
         except (ValueError, AttributeError, KeyError, TypeError, RecursionError):
-            raise ValueError("this is no recording: expected JSON written by a coaching session") from None
+            raise ValueError("this is not a recording: expected JSON written by a coaching session") from None
         if version != SCHEMA_VERSION:
             raise ValueError(f"recording has schema version {version!r}: this release reads version {SCHEMA_VERSION}")
         try:

@@ -140,12 +140,12 @@ def test_a_state_that_is_read_after_the_answer_has_the_change(echo):
 @pytest.mark.parametrize(
     ("message", "error"),
     [
-        ("nonsense", "the message is no JSON"),
+        ("nonsense", "the message is not valid JSON"),
         ("[1]", "the message is a list: expected an object with the entry 'do'"),
-        ('{"do": "set", "style": {"target": NaN}}', "the message is no JSON"),
+        ('{"do": "set", "style": {"target": NaN}}', "the message is not valid JSON"),
         ('{"do": "set", "style": {"target": 1' + "0" * 400 + "}}", "expected a number"),
         ('{"do": "set", "style": {"target": true}}', "target = True: expected a number"),
-        ('{"do": "set", "style": {"mood": "merry"}}', "mood = 'merry' is no option: expected one of"),
+        ('{"do": "set", "style": {"mood": "merry"}}', "mood = 'merry' is not an option: expected one of"),
         ('{"do": "set", "style": {"self": 1}}', "nothing is named 'self': expected some of ['target', 'mood', 'fire']"),
         ('{"do": "set", "style": {"strict": 1}}', "nothing is named 'strict'"),
         ('{"do": "set"}', "style is missing: expected values by name"),
@@ -163,7 +163,7 @@ def test_a_state_that_is_read_after_the_answer_has_the_change(echo):
         ('{"do": "fly"}', "do = 'fly': expected 'space', 'read', "),
         ('{"id": [1]}', "the id of the message is neither"),
         ('"' + "x" * (1 << 16) + '"', "characters: expected at most 65,536"),
-        ("[" * 60_000, "the message is no JSON"),
+        ("[" * 60_000, "the message is not valid JSON"),
     ],
 )
 def test_bad_messages_change_nothing_and_are_answered(message, error, echo):

@@ -146,7 +146,7 @@ def test_presets_and_schedule(page):
     assert targets == pytest.approx([0.0, 0.0, 0.25, 0.25, 0.5])
     page.plan.value = "soon: mine"
     page.run_plan.value = True
-    wait_for(lambda: "is no SECONDS: PHRASE" in page.status.content)
+    wait_for(lambda: "is not of the form SECONDS: PHRASE" in page.status.content)
 
 
 def test_replay_on_the_page(page):

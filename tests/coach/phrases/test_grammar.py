@@ -69,7 +69,7 @@ NOT_UNDERSTOOD = [
     ("0.4 kg", "unknown: kg"),
     ("0.5 yards longer", "unknown: yards"),
     ("0.4 s", "nothing here has a time"),
-    ("step length 20 degrees", "step length is no angle, it is in m"),
+    ("step length 20 degrees", "step length is not an angle, it is in m"),
     ("steps", "how much"),
     ("not arms in front", "say what instead: arms up or t pose"),
     ("change your arms", "pose can be arms in front or arms up or t pose"),

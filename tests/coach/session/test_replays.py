@@ -124,7 +124,7 @@ def test_bad_recordings(session):
         session.step()
         assert session.step_count == before + 1 and session.style["target"] == 0.25, "the session goes on"
     for text in ("", "[1]", "{}", "nonsense", "[" * 100_000):
-        with pytest.raises(ValueError, match="no recording"):
+        with pytest.raises(ValueError, match="not a recording"):
             Recording.from_json(text)
 
 

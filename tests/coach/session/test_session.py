@@ -60,8 +60,8 @@ def test_a_drawn_style_is_within_the_trained_range(session):
     [
         ({"target": math.nan}, "NaN"),
         ({"speed": 1.0}, "unknown style parameter 'speed'"),
-        ({"mood": "angry"}, "no option"),
-        ({"target": "fast"}, "is no number"),
+        ({"mood": "angry"}, "is not an option"),
+        ({"target": "fast"}, "is not a number"),
     ],
 )
 def test_a_bad_request_changes_nothing(session, values, message):

@@ -109,7 +109,7 @@ def test_bad_files_are_refused(tmp_path, change, message):
 def test_a_file_that_is_no_text_is_refused(tmp_path):
     file = tmp_path / "picture.csv"
     file.write_bytes(b"\x89PNG\xff\xfe")
-    with pytest.raises(ValueError, match="is no text: expected lines of x, y"):
+    with pytest.raises(ValueError, match="is not a text file: expected lines of x, y"):
         Track.from_csv(file)
 
 

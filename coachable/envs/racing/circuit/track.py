@@ -59,14 +59,14 @@ class Track:
             margin: Distance from the edge of the track to the wall [m].
 
         Raises:
-            ValueError: If the file is no text, a line does not hold four finite numbers, or the track is open, crosses
+            ValueError: If the file is not text, a line does not hold four finite numbers, or the track is open, crosses
                 itself, is too narrow or too long.
         """
         path = Path(path)
         try:
             lines = path.read_text(encoding="utf-8-sig").splitlines()
         except UnicodeDecodeError:
-            raise ValueError(f"{path} is no text: expected lines of x, y, w_right, w_left in metres") from None
+            raise ValueError(f"{path} is not a text file: expected lines of x, y, w_right, w_left in metres") from None
         rows = []
         for number, line in enumerate(lines, start=1):
             if not line.strip() or line.lstrip().startswith("#"):

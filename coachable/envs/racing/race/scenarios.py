@@ -148,7 +148,7 @@ class Starter:
         cars: Number A of cars in a race.
 
     Raises:
-        ValueError: If there are more cars than grid slots, `scenarios` are no scenarios, or their shares do not add up
+        ValueError: If there are more cars than grid slots, `scenarios` are not scenarios, or their shares do not add up
             to 1.
     """
 

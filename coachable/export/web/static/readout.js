@@ -19,7 +19,7 @@ export class Readout {
     this.marked = new Map(this.measures.map(({ name }) => [name, []]));
   }
 
-  /** Add what was measured at a time [s]; NaN is no value. */
+  /** Add what was measured at a time [s]; NaN is not a value. */
   add(time, values) {
     this.rows.push({ time, values });
     while (this.rows[0].time < time - this.seconds) this.rows.shift();
