@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
-from coachable.evaluation.style_grid import markdown_table, mean_of, rows_where
+from coachable.evaluation.style_grid import markdown_table, rows_where
 
 Row = Mapping[str, Any]
 
@@ -95,10 +95,12 @@ def lap_bounds(circuits: Sequence[Row], home: str) -> list[dict[str, Any]]:
     rows = []
     if unseen:
         clean, over = (np.array([row[name] for row in unseen]) for name in ("clean_laps", "over"))
-        label, interval = f"{len(unseen)} held-out circuits", bootstrap_interval(over)
+        label = f"{len(unseen)} held-out circuits"
+        # A circuit without a lap after the first one makes the mean NaN: the bound is then not reached.
+        interval = (math.nan, math.nan) if np.isnan(over).any() else bootstrap_interval(over)
         rows += [
             bound(f"clean laps on {label}", clean.mean(), bootstrap_interval(clean), at_least=CLEAN),
-            bound(f"lap over quasi-steady state on {label}", mean_of(over), interval, at_most=OVER_HELD_OUT),
+            bound(f"lap over quasi-steady state on {label}", over.mean(), interval, at_most=OVER_HELD_OUT),
         ]
     for row in own:
         interval = row["over_low"], row["over_high"]
@@ -156,7 +158,8 @@ def drift_bounds(sweep: Sequence[Row], middle: float) -> list[dict[str, Any]]:
         return row[name], (row[f"{name}_low"], row[f"{name}_high"])
 
     angle, straights = "sideslip_corners", measured("drift_straights", middle)[0]
-    ratio = measured("drift_corners", middle)[0] / straights if straights else math.inf
+    corners = measured("drift_corners", middle)[0]
+    ratio = corners / straights if straights else math.inf if corners else math.nan
     at = f"at weight {middle:g}"
     asked = [row for row in sweep if row["weight"] >= 0.0]
     return [

@@ -10,7 +10,6 @@ trade-off on this line, apart from the effects that a point mass neglects.
 from __future__ import annotations
 
 import argparse
-import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,6 +33,7 @@ from coachable.envs.racing.physics.powertrain import (
 from coachable.envs.racing.physics.tyres import WEAR_ENERGY
 from coachable.envs.racing.race.driver import line_geometry
 from coachable.evaluation.figures import drawing
+from coachable.evaluation.style_grid import write_csv
 
 STAGE = 6.0  # [m], about
 SPEEDS = np.linspace(4.0, 100.0, 385)  # [m/s], from below the speed of the slowest corner
@@ -57,13 +57,11 @@ class Lap:
         time: Lap time [s].
         fuel: Fuel used [l].
         wear: Mean wear of the tyres.
-        speeds: Speeds at the start of each stage (S,) [m/s].
     """
 
     time: float
     fuel: float
     wear: float
-    speeds: np.ndarray
 
 
 class LapProgramme:
@@ -182,11 +180,9 @@ class LapProgramme:
         each = np.arange(prices)
         speed = np.full(prices, 40.0)
         spent: dict[str, np.ndarray] = {}
-        trace = np.zeros((count, prices))
         for _ in range(2):
             spent = {name: np.zeros(prices) for name in ("time", "fuel", "tyre")}
             for k in range(count):
-                trace[k] = speed
                 after, cost, allowed = self._stage(k)
                 fastest = np.flatnonzero(allowed.any(1))[-1]
                 place = np.clip((speed - SPEEDS[0]) / (SPEEDS[1] - SPEEDS[0]), 0.0, fastest)
@@ -201,10 +197,18 @@ class LapProgramme:
                     spent[name] += mean(np.broadcast_to(cost[name], after.shape))
                 speed = mean(after)
         time, fuel, wear = (spent[name] for name in ("time", "fuel", "tyre"))
-        return [Lap(float(time[i]), float(fuel[i]), float(wear[i]), trace[:, i]) for i in range(prices)]
+        return [Lap(float(time[i]), float(fuel[i]), float(wear[i])) for i in range(prices)]
 
 
-def sweep(car: str, resource: str, prices: Sequence[float], *, exponent: float = 2.5, track: str = "lakeside") -> Rows:
+def sweep(
+    car: str,
+    resource: str,
+    prices: Sequence[float],
+    *,
+    exponent: float = 2.5,
+    track: str = "lakeside",
+    fuel: float = TANK / 2,
+) -> Rows:
     """Return the rows of the trade-off as dictionaries, the fastest lap first.
 
     Args:
@@ -213,9 +217,10 @@ def sweep(car: str, resource: str, prices: Sequence[float], *, exponent: float =
         prices: Values of λ in seconds per lap at the fastest lap's use; at 1 a lap's use of the resource is worth 1 s.
         exponent: Exponent n of the fuel law.
         track: Name of a shipped circuit.
+        fuel: Fuel on board, half a tank by default [l].
     """
     rates = Resources.calibrated(car)
-    programme = LapProgramme(load_track(track), load_car(car), Resources(rates.wear, rates.fuel, exponent))
+    programme = LapProgramme(load_track(track), load_car(car), Resources(rates.wear, rates.fuel, exponent), fuel=fuel)
     [free] = programme.laps(resource, [0.0])
     use = {"tyre": free.wear, "fuel": free.fuel}[resource]
     rows = []
@@ -249,11 +254,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for car in ("gt3", "x2019")
         for resource, exponent in (("tyre", 2.5), ("fuel", 2.5), ("fuel", 1.0))
     ]
-    with (out / "frontier.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(curves[0][0]))
-        writer.writeheader()
-        for row in (row for rows in curves for row in rows):
-            writer.writerow({k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()})
+    write_csv([row for rows in curves for row in rows], out / "frontier.csv")
     draw(curves, out / "frontier.png")
 
 

@@ -130,14 +130,19 @@ def circuits_report(rows: Sequence[Mapping[str, Any]]) -> str:
     """
     text = "\n## Circuits\n\nAlone, in the default style.\n\n" + markdown_table(rows, _SHOWN, _UNITS)
     text += "\nTrained: whether the agent was trained on the circuit. Fuel: at the start; only the family `resources` "
-    text += "uses fuel up, and its bound is on half a tank. Laps: completed ones; clean if never three "
-    text += "wheels were off the track. Mean lap: after the first one; over: above the quasi-steady state of a "
-    text += "point mass. "
-    return text + "Off: share of the time off the track. Retired: share of the cars that stood, drove back or left.\n"
+    text += "uses fuel up, and its bound is on half a tank. Laps: completed ones; clean if three wheels were never off "
+    text += "the track at once. Mean lap: after the first one; over: above the quasi-steady state of a point mass. "
+    text += (
+        "Off: share of the time off the track. Retired: share of the cars that stopped, drove backwards or left the "
+    )
+    return text + "track for good.\n"
 
 
 def circuits_summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
     """Return the means over the circuits that the agent was trained on, and over the others.
+
+    "circuits" is their number, and "circuits_timed" that of circuits with a lap after the first one, over which "over"
+    is the mean.
 
     Args:
         rows: Result of `drive_circuits`.
@@ -147,5 +152,7 @@ def circuits_summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, f
         own = rows_where(rows, trained=trained)
         if own:
             names = ("clean_laps", "over", "off", "retired")
-            summary[label] = {name: mean_of(np.array([row[name] for row in own])) for name in names}
+            means = {name: mean_of(np.array([row[name] for row in own])) for name in names}
+            timed = sum(not np.isnan(row["over"]) for row in own)
+            summary[label] = {"circuits": len(own), "circuits_timed": timed, **means}
     return summary

@@ -27,7 +27,7 @@ from coachable.envs.racing.race.scenarios import rolling_start
 from coachable.evaluation.episode_records import record_episodes
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import drawing, shade
-from coachable.evaluation.statistics import bootstrap_interval, rank_correlation, wilson_interval
+from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
 from coachable.evaluation.style_grid import markdown_table, mean_of, policy_sentence, rows_where, write_results
 from coachable.keys import STYLE_FEATURES
 
@@ -271,8 +271,9 @@ def _rows(cells: Sequence[tuple[str, str, float]], found: Mapping[str, np.ndarra
     for index, (setting, margin, requested) in enumerate(cells):
         of = {name: values[index] for name, values in found.items()}
         row: dict[str, Any] = {"margin": margin, "setting": setting, "requested": requested, "races": len(of["won"])}
+        # Per race, as the two cars of a pair are not independent of each other.
         row["win_rate"] = float(of["top_two"].mean())
-        row["win_rate_low"], row["win_rate_high"] = wilson_interval(int(of["top_two"].sum()), of["top_two"].size)
+        row["win_rate_low"], row["win_rate_high"] = bootstrap_interval(of["top_two"].mean(1))
         row["either_won"] = float(of["won"].max(1).mean())
         for name in _MEANS:
             per_race = np.array([mean_of(pair) for pair in of[name]])
@@ -314,7 +315,7 @@ def draw_radar(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Mapping[str, Any]) -> str:
-    text = "# racing, aggressiveness: requested margin and what came of it\n\n"
+    text = "# racing, aggressiveness: requested margin and measured behaviour\n\n"
     text += f"{policy_sentence(agent)} in all five cars; {summary['races_per_row']} races per row, {LAPS} laps, "
     text += f"rolling start, seed {summary['seed']}. Two cars, which start last (pursuer) or first (leader), keep the "
     text += f"requested margin; their lateral margin is {FIXED['lateral']:g} m and their longitudinal one "

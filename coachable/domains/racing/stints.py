@@ -19,7 +19,7 @@ from coachable.domains.racing.bounds import (
 )
 from coachable.domains.racing.families import home_track, typical_car
 from coachable.domains.racing.frontier import TANK, WORN, sweep
-from coachable.domains.racing.laps import TRIAL_STEPS, circuits_report, circuits_summary, cut_laps, drive_circuits
+from coachable.domains.racing.laps import circuits_report, circuits_summary, cut_laps, drive_circuits
 from coachable.domains.racing.metrics import TelemetryMeasures
 from coachable.domains.racing.traffic import draw_traffic, race_in_traffic, traffic_report, traffic_response
 from coachable.envs.racing.circuit.circuits import HELD_OUT, load_track
@@ -41,6 +41,9 @@ COMPARED = 6  # flying laps of each stint whose times are compared; the first la
 STINT_STEPS = 9000  # 15 minutes
 UNSEEN = HELD_OUT[0]  # circuit of the stints besides the agent's own
 _COLD = 40.0  # [°C]
+# Fuel of the frontier [l]: a stint on fuel carries about three quarters of a tank in the laps that are compared, one on
+# tyres a full tank, because no fuel is used.
+LOADS = {"fuel": 0.75 * TANK, "tyre": TANK}
 _PRICES = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0, 9.0, 12.0, 16.0, 24.0, 40.0, 70.0)  # of the frontier, see `LapProgramme.laps`
 
 
@@ -52,7 +55,7 @@ class Stint:
         laps: Times of the completed laps, counted from the car's start [s].
         clean: Whether each lap had at most two wheels off the track at any time.
         left: State of the resource at the end of each lap: fuel left [l], or wear.
-        per_km: Resource used per kilometre after the first lap, or in total if there is no other lap.
+        per_km: Resource used per kilometre after the first lap, or NaN if there is no other lap.
     """
 
     laps: np.ndarray
@@ -68,7 +71,7 @@ class Stint:
 
 
 def evaluate_resources(domain: Domain, agent: LoadedPolicy, out: Path, settings: EvaluationSettings) -> str:
-    """Drive stints under rising weights of one resource at a time, and a time trial without saving; write the results.
+    """Drive stints under rising weights of one resource at a time, and write the results.
 
     As in the paper, the other resource is switched off. The stints are on the circuit of the family, or the only one of
     the training, and on one that no preset trains on. The files are `stints.csv` (by circuit, resource and weight),
@@ -90,7 +93,7 @@ def evaluate_resources(domain: Domain, agent: LoadedPolicy, out: Path, settings:
     out.mkdir(parents=True, exist_ok=True)
     trained, episodes, seed = agent.config.get("env", {}), settings.episodes, settings.seed
     car, home = typical_car("resources", trained), home_track("resources", trained)
-    rates, length = Resources.calibrated(car), load_track(home).length
+    rates = Resources.calibrated(car)
     options: dict[str, Any] = {**settings.rollout, "steps": settings.steps or STINT_STEPS}
     rows: list[dict[str, Any]] = []
     every: list[dict[str, Any]] = []
@@ -112,14 +115,7 @@ def evaluate_resources(domain: Domain, agent: LoadedPolicy, out: Path, settings:
                     | {"time": float(time), "left": float(stint.left[lap]), "clean": bool(stint.clean[lap])}
                     for lap, time in enumerate(stint.laps)
                 ]
-    options |= {
-        "track": home,
-        "steps": min(options["steps"], TRIAL_STEPS),
-        "resources": rates,
-        "conditions": Conditions(fuel=TANK / 2),
-    }
-    [trial] = _drive(domain, agent, [{}], max(episodes, 10), "fuel", label="trial", length=length, **options)
-    summary = _summary(rows, trial, frontiers[home, "fuel"][0]["lap_time"], episodes, seed)
+    summary = _summary(rows, episodes, seed)
     traffic = race_in_traffic(domain, agent, settings) if trained.get("cars", 1) > 1 else []
     circuits = drive_circuits(domain, agent, settings)
     summary["circuits"] = circuits_summary(circuits)
@@ -138,7 +134,7 @@ def evaluate_resources(domain: Domain, agent: LoadedPolicy, out: Path, settings:
 
 
 def frontier(track: str, car: str, resource: str) -> list[dict[str, float]]:
-    """Return lap time [s] and range [km] of a point mass on a fixed line, the fastest lap first.
+    """Return lap time [s] and range [km] of a point mass on a fixed line, with the fuel of `LOADS`, the fastest first.
 
     Args:
         track: Name of a shipped circuit.
@@ -147,7 +143,7 @@ def frontier(track: str, car: str, resource: str) -> list[dict[str, float]]:
     """
     length = load_track(track).length / 1000.0
     stock, spent = (WORN, "wear_per_lap") if resource == "tyre" else (TANK, "fuel_per_lap")
-    laps = sweep(car, resource, _PRICES, track=track)
+    laps = sweep(car, resource, _PRICES, track=track, fuel=LOADS[resource])
     return [{"lap_time": lap["lap_time"], "range_km": length * stock / lap[spent]} for lap in laps]
 
 
@@ -190,13 +186,11 @@ def _stint(measured: Mapping[str, np.ndarray], alive: np.ndarray, row: int, leng
     running = left > 0.0 if resource == "fuel" else left < 1.0  # later steps use nothing
     distance, off, left = distance[running], off[running], left[running]
     times, clean, steps = cut_laps(distance, off, length)
-    first, last = (steps[0], steps[-1]) if len(steps) > 1 else (0, -1)  # the first lap contains the start
-    return Stint(
-        laps=times,
-        clean=clean,
-        left=left[steps],
-        per_km=abs(left[last] - left[first]) / max((distance[last] - distance[first]) / 1000.0, 1e-9),
-    )
+    per_km = float("nan")
+    if len(steps) > 1:  # the first lap contains the start
+        first, last = steps[0], steps[-1]
+        per_km = abs(left[last] - left[first]) / ((distance[last] - distance[first]) / 1000.0)
+    return Stint(laps=times, clean=clean, left=left[steps], per_km=per_km)
 
 
 def _rows(
@@ -205,21 +199,21 @@ def _rows(
     """Return range and pace for each weight, and their differences from those at a weight of 0."""
     rows = []
     capacity = TANK if resource == "fuel" else WORN
-    reach = np.array([[capacity / max(stint.per_km, 1e-9) for stint in group] for group in stints])
+    reach = capacity / np.maximum([[stint.per_km for stint in group] for group in stints], 1e-9)
     pace = np.array([[stint.compared for stint in group] for group in stints])
     for index, weight in enumerate(weights):
         low, high = bootstrap_interval(reach[index])
         gain = comparison_interval(reach[index], reach[0], lambda own, neutral: own / neutral - 1.0)
         lost = comparison_interval(pace[index], pace[0], np.subtract)
-        lap_time = mean_of(pace[index])
+        range_km, lap_time = mean_of(reach[index]), mean_of(pace[index])
         clean = np.concatenate([stint.clean for stint in stints[index]])
         rows.append(
             {
                 "weight": weight,
-                "range_km": float(reach[index].mean()),
+                "range_km": range_km,
                 "range_km_low": low,
                 "range_km_high": high,
-                "range_gain": float(reach[index].mean() / reach[0].mean() - 1.0),
+                "range_gain": range_km / mean_of(reach[0]) - 1.0,
                 "range_gain_low": gain[0],
                 "range_gain_high": gain[1],
                 "lap_time": lap_time,
@@ -245,21 +239,8 @@ def range_at(bound: Sequence[Mapping[str, float]], lap_time: float) -> float:
     return float(np.interp(lap_time, times, ranges, left=np.nan, right=np.nan))
 
 
-def _summary(
-    rows: Sequence[Mapping[str, Any]], trial: Sequence[Stint], estimate: float, episodes: int, seed: int
-) -> dict[str, Any]:
-    times = np.concatenate([stint.laps[1:] for stint in trial])
-    clean = np.concatenate([stint.clean for stint in trial])
-    summary: dict[str, Any] = {
-        "trial": {
-            "laps": len(times),
-            "mean_lap": float(times.mean()) if len(times) else None,
-            "best_lap": float(times.min()) if len(times) else None,
-            "quasi_steady_state": estimate,
-            "over_estimate": float(times.mean() / estimate - 1.0) if len(times) else None,
-            "clean_laps": float(clean.mean()) if len(clean) else 0.0,
-        }
-    }
+def _summary(rows: Sequence[Mapping[str, Any]], episodes: int, seed: int) -> dict[str, Any]:
+    summary: dict[str, Any] = {}
     for track, resource in dict.fromkeys((row["circuit"], row["resource"]) for row in rows):
         own = rows_where(rows, circuit=track, resource=resource)
         weights, reach = (np.array([row[name] for row in own]) for name in ("weight", "range_km"))
@@ -325,7 +306,6 @@ def draw_tradeoff(
 def _report(
     agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Mapping[str, Any], seed: int, episodes: int
 ) -> str:
-    trial = summary["trial"]
     text = "# racing, resources: requested and measured style\n\n"
     text += f"{policy_sentence(agent)}; {episodes} stints per weight, seed {seed}. "
     text += "The other resource is switched off, as in the paper; tyres start at 40 °C, with a full tank.\n\n"
@@ -337,14 +317,9 @@ def _report(
     text += markdown_table(rows, formats, units)
     text += f"\nRange: until the tank is empty, or until the tyres are worn by {WORN:.0%} on average, at the mean use. "
     text += f"Lap time: mean of {COMPARED} laps from the second one on. Frontier: range of a point mass on a fixed "
-    text += "line at the same lap time (nan where it has none so slow). Clean: never three wheels off the track.\n\n"
+    text += "line at the same lap time, nan where it has none so slow. "
+    text += f"It carries {LOADS['fuel']:g} l (fuel) or {LOADS['tyre']:g} l (tyres), about as much as the car does in "
+    text += "those laps. Clean: never three wheels off the track at once.\n\n"
     places = dict.fromkeys((row["circuit"], row["resource"]) for row in rows)
     ranks = ", ".join(f"{name} on {track} {summary[track][name]['rank_correlation']:.2f}" for track, name in places)
-    text += f"Rank correlation of weight and range: {ranks}.\n\n## Time trial, no saving asked\n\n"
-    if not trial["laps"]:
-        return text + "No car finished a flying lap.\n"
-    return text + (
-        f"{trial['laps']} flying laps on half a tank, wear and fuel on: mean {trial['mean_lap']:.2f} s, best "
-        f"{trial['best_lap']:.2f} s; quasi-steady state {trial['quasi_steady_state']:.2f} s, the mean is "
-        f"{trial['over_estimate']:+.1%} above it; clean laps {trial['clean_laps']:.0%}.\n"
-    )
+    return text + f"Rank correlation of weight and range: {ranks}.\n"

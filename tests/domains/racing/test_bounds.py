@@ -56,7 +56,17 @@ def test_laps_on_held_out_circuits_and_at_home():
     )
     assert reached([clean, over, home]) == ["no", "yes", "yes"]
     circuits[3]["over"] = math.nan  # nobody finished a lap there
-    assert lap_bounds(circuits, "home")[1]["measured"] == pytest.approx(0.04)
+    clean, over, home = lap_bounds(circuits, "home")
+    assert (
+        math.isnan(over["measured"])
+        and math.isnan(over["low"])
+        and reached([clean, over, home])
+        == [
+            "no",
+            "no",
+            "yes",
+        ]
+    )
 
 
 def test_range_gained_for_seconds_lost():
@@ -99,7 +109,9 @@ def test_drifts():
     slow = sweep([3, 6, 9, 20], pace_kept=0.4, turned_per_km=2.0, drift_straights=0.3)
     assert reached(drift_bounds(slow, 3.0)) == ["yes", "yes", "yes", "no", "no", "no", "yes"]
     never = drift_bounds(sweep([3, 6, 9, 20], drift_straights=0.0), 3.0)
-    assert never[4]["measured"] == math.inf
+    assert never[4]["measured"] == math.inf and never[4]["reached"] == "yes"
+    nowhere = drift_bounds(sweep([3, 6, 9, 20], drift_corners=0.0, drift_straights=0.0), 3.0)
+    assert math.isnan(nowhere[4]["measured"]) and nowhere[4]["reached"] == "no"
 
 
 def test_levels_rise_by_more_than_their_intervals():

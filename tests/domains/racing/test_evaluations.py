@@ -16,7 +16,8 @@ from coachable.domains.racing.families import racing_family
 from coachable.domains.racing.laps import circuits_report, circuits_summary, drive_circuits
 from coachable.domains.racing.metrics import whole_turns
 from coachable.domains.racing.races import _count, _overtakes, _pair_results, evaluate_aggressiveness
-from coachable.domains.racing.stints import _stint, evaluate_resources, range_at
+from coachable.domains.racing.races import _rows as race_rows
+from coachable.domains.racing.stints import Stint, _rows, _stint, evaluate_resources, frontier, range_at
 from coachable.domains.racing.traffic import draw_traffic, race_in_traffic, traffic_report, traffic_response
 from coachable.envs.racing.circuit.circuits import load_track, load_tracks
 from coachable.envs.racing.circuit.track import Track
@@ -78,8 +79,33 @@ def test_an_empty_tank_ends_the_stint():
     measured["distance"][:20, 0] = 2.0 * np.arange(1, 21)
     measured["fuel"] = np.maximum(19.0 - np.arange(50.0), 0.0)[:, None]
     stint = _stint(measured, np.ones((50, 1), dtype=bool), 0, 1000.0, "fuel")
-    assert len(stint.laps) == 0 and math.isnan(stint.compared)
-    assert stint.per_km == pytest.approx(18.0 / 0.036)
+    assert len(stint.laps) == 0 and math.isnan(stint.compared) and math.isnan(stint.per_km)
+
+
+def test_stints_of_a_single_lap_are_left_out_of_the_range():
+    def stint(per_km):
+        return Stint(laps=np.full(3, 90.0), clean=np.ones(3, dtype=bool), left=np.zeros(3), per_km=per_km)
+
+    single = Stint(laps=np.full(1, 99.0), clean=np.ones(1, dtype=bool), left=np.zeros(1), per_km=math.nan)
+    bound = [{"lap_time": 80.0, "range_km": 50.0}, {"lap_time": 95.0, "range_km": 90.0}]
+    stints = [[stint(2.0), single], [stint(1.0), single], [single, single]]
+    neutral, saving, none = _rows("fuel", [0.0, 1.0, 2.0], stints, bound)
+    assert (neutral["range_km"], saving["range_km"], saving["range_gain"]) == (50.0, 100.0, 1.0)
+    assert math.isnan(none["range_km"]) and math.isnan(none["range_gain"]) and math.isnan(none["range_gain_low"])
+
+
+def test_the_frontier_carries_the_fuel_of_the_stints(monkeypatch):
+    loads = {}
+
+    def sweep(car, resource, prices, *, track, fuel):
+        loads[resource] = fuel
+        return [{"lap_time": 80.0, "fuel_per_lap": 10.0, "wear_per_lap": 0.075}]
+
+    monkeypatch.setattr(stints, "sweep", sweep)
+    length = load_track("ring").length / 1000.0
+    for resource in ("fuel", "tyre"):
+        assert frontier("ring", "x2019", resource) == [{"lap_time": 80.0, "range_km": pytest.approx(10.0 * length)}]
+    assert loads == {"fuel": 75.0, "tyre": 100.0}
 
 
 def test_the_frontier_between_its_points():
@@ -140,6 +166,17 @@ def test_places_of_the_first_minute_count_apart():
     assert result["places_later"].tolist() == [1.0, 1.0]
 
 
+def test_the_two_cars_of_a_pair_are_one_observation():
+    """In half of the races both win, in the others neither does: 10 observations, not 20."""
+    won = np.repeat([[1.0], [0.0]], 5, axis=0).repeat(2, axis=1)
+    names = ("top_two", "won", "places_gained", "places_later", "overtakes", "contacts", "contacts_per_minute")
+    names += ("beside", "in_line", "gap_beside", "gap_in_line", "stranded", "off", "metres")
+    [row] = race_rows([("leader", "lateral", 0.0)], dict.fromkeys(names, won[None]))
+    assert row["win_rate"] == 0.5
+    assert (row["win_rate_low"], row["win_rate_high"]) == (row["contacts_low"], row["contacts_high"])
+    assert row["win_rate_high"] - row["win_rate_low"] >= 0.6  # 0.40 if the cars were independent
+
+
 def test_wilson_interval():
     low, high = wilson_interval(8, 10)
     assert (low, high) == (pytest.approx(0.4902, abs=1e-4), pytest.approx(0.9433, abs=1e-4))
@@ -161,10 +198,8 @@ def test_stints_of_the_scripted_driver(tmp_path, one_circuit, monkeypatch):
     assert all(15 < float(row["lap_time"]) < 30 and float(row["clean_laps"]) >= 0.5 for row in ring)
     assert all(int(row["laps"]) == 1 and float(row["clean_laps"]) == 1.0 for row in oval)  # it is longer
     summary = json.loads((tmp_path / "summary.json").read_text())
-    trial = summary["trial"]
     assert {"fuel", "tyre"} == set(summary["ring"]) == set(summary["oval"])
-    assert trial["laps"] >= 10 and 0.0 < trial["over_estimate"] < 0.3
-    assert "above it; clean laps" in report
+    assert "It carries 75 l (fuel) or 100 l (tyres)" in report and "## Circuits" in report
     assert {path.name for path in tmp_path.glob("*.png")} == {"stints.png", "tradeoff.png"}
 
 
@@ -196,6 +231,9 @@ def test_laps_on_shipped_held_out_and_own_circuits(tmp_path, monkeypatch):
         assert row["mean_lap"] == pytest.approx(row["quasi_steady_state"] * (1 + row["over"]))
     summary = circuits_summary(rows)
     assert summary["unseen"]["over"] == pytest.approx((rows[1]["over"] + rows[2]["over"]) / 2)
+    assert (summary["unseen"]["circuits"], summary["unseen"]["circuits_timed"]) == (2, 2)
+    without = circuits_summary([*rows[:2], rows[2] | {"over": math.nan}])["unseen"]
+    assert (without["over"], without["circuits"], without["circuits_timed"]) == (rows[1]["over"], 2, 1)
     assert "| own | no |" in circuits_report(rows)
 
 

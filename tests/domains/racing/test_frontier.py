@@ -60,6 +60,12 @@ def test_a_higher_price_saves_more_and_costs_more(car, resource, coarse_speeds):
     assert all(a > b for a, b in pairwise(used))
 
 
+def test_a_heavier_car_is_slower_and_wears_its_tyres_more(coarse_speeds):
+    light, heavy = (frontier.sweep("x2019", "tyre", [], track="ring", fuel=fuel)[0] for fuel in (50.0, 100.0))
+    assert heavy["lap_time"] > light["lap_time"] and heavy["wear_per_lap"] > light["wear_per_lap"]
+    assert frontier.sweep("x2019", "tyre", [], track="ring")[0] == light
+
+
 def test_a_ring_is_driven_at_the_speed_that_friction_allows():
     """Radius 200 m: the lap of a steady speed, to the width of the speed grid."""
     track, car = load_track("ring"), load_car("gt3")
