@@ -50,7 +50,11 @@ def resource_env(num_envs: int = 64, **options: Any) -> RacingEnv:
         num_envs: Number of cars that the agent drives. If it is not a multiple of `cars`, the agent drives one car of
             each race. Cars that it does not drive are scripted.
         **options: Options of `RacingEnv`.
+
+    Raises:
+        ValueError: If there are no calibrated rates of the car, so that its savings could not be evaluated.
     """
+    rates = Resources.calibrated(typical_car("resources", options))
     cars = options.get("cars", 1)
     controlled = options.get("controlled") or (1 if num_envs % cars else cars)
     if controlled < cars:
@@ -60,7 +64,7 @@ def resource_env(num_envs: int = 64, **options: Any) -> RacingEnv:
         "track": HOME["resources"],
         "car": CAR["resources"],
         "conditions": Conditions.resources(),
-        "resources": Resources.calibrated("gt3" if options.get("car") == "gt3" else "x2019"),
+        "resources": rates,
         "weights": TaskWeights(tyre_heat=TYRE_HEAT),
     }
     return RacingEnv(num_envs, **(defaults | options))

@@ -13,6 +13,7 @@ from coachable.domains.racing.metrics import RacingMeasures
 from coachable.domains.racing.stage import RacingStage
 from coachable.envs.racing import RacingEnv
 from coachable.envs.racing.circuit.circuits import SETS
+from coachable.envs.racing.physics.cars import Resources
 from coachable.envs.racing.race.referee import TELEMETRY
 from coachable.envs.racing.race.scenarios import Conditions
 from coachable.evaluation.wording import measured_text, measures_by_parameter
@@ -86,6 +87,17 @@ def test_an_agent_of_tyres_and_fuel_races_agents_or_scripted_drivers():
     agents, one = (family_env(n, family="resources", cars=3, track="ring", seed=0) for n in (6, 4))
     assert (agents.races, agents.controlled, one.races, one.controlled) == (2, 3, 4, 1)
     assert one.rollout(3)["next", "observation"].isfinite().all()
+
+
+@pytest.mark.parametrize(("options", "car"), [({}, "x2019"), ({"car": "gt3"}, "gt3"), ({"car": "pool"}, "gt3")])
+def test_tyres_and_fuel_are_used_at_the_rates_that_the_evaluation_has(options, car):
+    env = family_env(2, family="resources", track="ring", seed=0, **options)
+    assert env.simulation.resources == Resources.calibrated(car)
+
+
+def test_a_car_whose_savings_cannot_be_evaluated_is_refused():
+    with pytest.raises(ValueError, match="no calibrated wear and fuel rates of 'street': expected one of gt3, x2019"):
+        family_env(2, family="resources", track="ring", car="street")
 
 
 def test_an_unknown_family_is_refused():
