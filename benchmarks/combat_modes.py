@@ -1,4 +1,4 @@
-"""Do fighters have to sample their actions? Fights with sampled, most likely and sharpened actions.
+"""Fights with sampled, most likely and sharpened actions, which show whether fighters have to sample.
 
     python benchmarks/combat_modes.py combat combat_middle --fights 10
 
@@ -19,6 +19,7 @@ from torch import Tensor
 
 from coachable.domain import Domain
 from coachable.domains.combat.styles import single_styles
+from coachable.envs.combat import constants as c
 from coachable.envs.combat.gamepad import HEADS
 from coachable.envs.combat.state import BERRY, DODGE
 from coachable.envs.combat.tables import SITES
@@ -58,8 +59,17 @@ class Player:
         return found.set("action", torch.cat([*parts, torch.tanh(found["loc"] + noise)], -1))
 
 
+def damage_taken(before: Tensor, after: Tensor, eaten: Tensor) -> Tensor:
+    """Return the damage in a step, from the health before and after it and the berries eaten, (N,) each [HP].
+
+    A berry restores no more than the health that is missing.
+    """
+    restored = eaten * (c.PLAYER_HP - before).clamp(max=c.BERRY_HP)
+    return (before - after + restored).clamp(min=0.0)
+
+
 def fight(domain: Domain, agent: LoadedPolicy, way: str, fights: int) -> dict[str, np.ndarray]:
-    """Sums over each fight: outcome, damage taken, evasions, berries, and what the policy thinks of them."""
+    """Return sums over each fight: outcome, damage taken, evasions, berries, and how probable the policy makes them."""
     cells, machines = single_styles(agent.space), list(agent.config["env"]["machines"])
     rows = list(product(cells, machines, range(fights)))
     theta = agent.space.make_all(cell for cell, _, _ in rows)
@@ -73,7 +83,7 @@ def fight(domain: Domain, agent: LoadedPolicy, way: str, fights: int) -> dict[st
     while alive.any():
         before = simulation.state
         hp, berries, evading = before.hp.clone(), before.berries.clone(), before.timers[DODGE].clone()
-        could_eat = (before.hp < 700) & (before.berries > 0) & (before.timers[BERRY] <= 0)
+        could_eat = (before.hp < c.PLAYER_HP) & (before.berries > 0) & (before.timers[BERRY] <= 0)
         transition = rollout.step(player, theta)
         state, measured = simulation.state, domain.measures.step(transition)
         eaten = (berries - state.berries).clamp(min=0.0)
@@ -83,7 +93,7 @@ def fight(domain: Domain, agent: LoadedPolicy, way: str, fights: int) -> dict[st
             "won": measured["won"],
             "damage": measured["damage"],
             "requested": measured["requested"].nan_to_num(),
-            "taken": (hp - state.hp + 105.0 * eaten).clamp(min=0.0),
+            "taken": damage_taken(hp, state.hp, eaten),
             "evasions": ((state.timers[DODGE] > 0) & (state.timers[DODGE] > evading)).float(),
             "berries": eaten,
             "seconds": torch.full_like(hp, domain.control_step),

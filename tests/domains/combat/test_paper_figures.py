@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import apex_fight
+import combat_modes
 import matplotlib.image
 import numpy as np
 import paper_figures
@@ -199,6 +200,12 @@ def test_a_fight_under_requests_in_turn_is_logged_and_drawn(domain):
     assert len(rows) == log.alive[:, 0].sum() and rows[-1]["ended"] == "not won"
     with pytest.raises(ValueError, match="expected at least one of"):
         apex_fight.requests_in_turn(["part_shield"])
+
+
+def test_a_berry_restores_no_more_than_is_missing():
+    before, after = torch.tensor([400.0, 650.0, 650.0, 500.0]), torch.tensor([505.0, 700.0, 620.0, 450.0])
+    taken = combat_modes.damage_taken(before, after, torch.tensor([1.0, 1.0, 1.0, 0.0]))
+    assert taken.tolist() == [0.0, 0.0, 80.0, 50.0]
 
 
 def test_brittle_phases_are_counted_by_hand():
