@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 
 from coachable.envs.racing.physics.state import ROW, SPINS
+from coachable.envs.racing.physics.tyres import SLIP_SPEED
 from coachable.scene import palette
 from coachable.scene.palette import Colour
 from coachable.scene.parts import Parts, about_x, about_y
@@ -15,7 +16,6 @@ from coachable.scene.parts import Parts, about_x, about_y
 OPEN_WHEEL, GRAND_TOURER, STREET = "open-wheel", "grand tourer", "street"
 _WINGS = 3.0  # [m²], of downforce area, from which a car is an open-wheel car
 _NO_WINGS = 0.6  # [m²], below which it has no wing
-_SLOW = 3.0  # [m/s], keeps slip finite at rest, as in the tyre model
 _GLASS, _RUBBER, _RIM = (44, 52, 62), (38, 39, 42), (150, 154, 160)
 
 
@@ -111,7 +111,7 @@ def wheel_slip(state: np.ndarray, places: np.ndarray, radius: float, peak_ratio:
     sideways = state[ROW["vy"]] + yaw_rate * places[:, 0]
     along = forward * np.cos(steer) + sideways * np.sin(steer)
     across = sideways * np.cos(steer) - forward * np.sin(steer)
-    scale = np.sqrt(along**2 + _SLOW**2)
+    scale = np.sqrt(along**2 + SLIP_SPEED**2)
     ratio = (state[SPINS] * radius - along) / (scale * peak_ratio)
     angle = across / (scale * math.tan(peak_angle))
     return np.sqrt(ratio * ratio + angle * angle)

@@ -1,4 +1,4 @@
-"""What is to be seen of a car: places of its body and wheels, skid marks, the camera's direction, and gauges.
+"""Poses of a car's body and wheels, skid marks, the camera's direction and gauge values.
 
 These functions do not branch on values, so that they are exported for the page in the browser as they are.
 """

@@ -20,8 +20,9 @@ TOW = 0.3  # strength above which a slipstream counts
 def racing_events(family: str = "resources") -> PredicateEvents:
     """Return the events of a family's replay tables.
 
-    All families have "recovery" (three wheels off the track). Races have "contact", "overtake" (metres gained on a car
-    ahead) and "slipstream" as well, the other families "slide" (rear slip angle above 20 degrees).
+    All families have "recovery" (three wheels off the track). The family "aggressiveness" also has "contact",
+    "overtake" (metres gained on a car ahead) and "slipstream"; the other families have "slide" (rear slip angle above
+    20 degrees), also in races.
 
     Args:
         family: Name of the family: "drift", "resources" or "aggressiveness".

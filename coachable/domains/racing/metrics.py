@@ -88,7 +88,7 @@ class RacingMeasures:
             found["slip_ratio_front"], found["slip_ratio_rear"] = features[:, DRIFT].unbind(-1)[2:]
             found |= _drifting(told("sideslip") * degrees, told("speed"), told("curvature"), theta[:, 1] > 1.0)
         elif self.family == "resources":
-            found["complied"] = 1.0 - found["off"]
+            found["complied"] = torch.full_like(found["off"], torch.nan)
             near = anyone_near(features)
             for name, column in (("overtake", OVERTAKE), ("defend", DEFEND)):
                 found[name] = torch.where(near, features[:, column] / CONTROL_STEP, torch.nan)
@@ -133,8 +133,8 @@ class RacingMeasures:
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
         """Return whether the car complies in each step, (T, N) bool; see `StyleMeasures.complies`.
 
-        By family, it drifts with 15 to 60 degrees of sideslip in corners if asked to and has 8 degrees or less if not,
-        it is on the track, or it keeps the margins to the cars nearby.
+        For drift, it drifts with 15 to 60 degrees of sideslip in corners if asked to and has 8 degrees or less if not.
+        For aggressiveness, it keeps the margins to the cars nearby. For resources, no single step shows compliance.
         """
         return record["complied"] > 0
 
@@ -144,7 +144,7 @@ class RacingMeasures:
         Requested drifts can be judged only in corners, margins only while another car is near, and savings only by
         comparison with a stint without them.
         """
-        return ~torch.isnan(record["complied"]) & (self.family != "resources")
+        return ~torch.isnan(record["complied"])
 
 
 class TelemetryMeasures:

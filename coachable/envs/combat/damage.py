@@ -34,7 +34,6 @@ class Totals:
         buildup: Gain of the gauges less their decay (7, E, N).
         part_dealt: Damage to parts, clipped to the unit's health (12, E, N) [HP].
         removed: Number of removed units (12, E, N).
-        taken: Damage to the player (N,) [HP].
     """
 
     dealt: Tensor
@@ -42,7 +41,6 @@ class Totals:
     buildup: Tensor
     part_dealt: Tensor
     removed: Tensor
-    taken: Tensor
 
     @classmethod
     def zeros(cls, like: Tensor, slots: int) -> Totals:
@@ -53,7 +51,7 @@ class Totals:
             slots: Number of parts of a machine.
         """
         shapes = (6, len(ELEMENTS), len(ELEMENTS), slots, slots)
-        return cls(*(like.new_zeros((rows, *like.shape)) for rows in shapes), taken=like.new_zeros(like.shape[-1]))
+        return cls(*(like.new_zeros((rows, *like.shape)) for rows in shapes))
 
 
 @dataclass
@@ -289,7 +287,7 @@ def hit_factor(s: State, numbers: ElementNumbers) -> Tensor:
     return bonus[ACID] * bonus[FROST]
 
 
-def take_damage(s: State, raw: Tensor, active: Tensor, burst: Tensor, totals: Totals) -> Tensor:
+def take_damage(s: State, raw: Tensor, active: Tensor, burst: Tensor, totals: Totals) -> None:
     """Subtract damage from the machines, clipped to their health, and record its causes.
 
     Args:
@@ -298,9 +296,6 @@ def take_damage(s: State, raw: Tensor, active: Tensor, burst: Tensor, totals: To
         active: Active states during this frame (7, E, N), 0 or 1.
         burst: Whether plasma ends (E, N), 0 or 1.
         totals: Totals of the step; they change.
-
-    Returns:
-        Damage (E, N) [HP].
     """
     release = s.plasma_store * burst
     raw = torch.cat((raw[:BY_PLASMA], release.unsqueeze(0)))
@@ -313,4 +308,3 @@ def take_damage(s: State, raw: Tensor, active: Tensor, burst: Tensor, totals: To
     stored = c.PLASMA_SHARE * (applied - dealt[BY_PLASMA]) * active[PLASMA]
     s.plasma_store = (s.plasma_store + stored) * (1.0 - burst)
     s.stagger_sum = s.stagger_sum + applied
-    return applied

@@ -166,7 +166,7 @@ def strike_player(
     noise: Tensor,
     pillars: Tensor | None,
     blocks: Tensor,
-) -> Tensor:
+) -> None:
     """Advance the attacks by one frame and apply the damage to the player.
 
     Args:
@@ -180,9 +180,6 @@ def strike_player(
         noise: Standard normal numbers (2, E, N) for the aim of shots.
         pillars: Positions of the pillars (2, 4), or None if no fight has any [m].
         blocks: Whether the site has pillars (N,) bool.
-
-    Returns:
-        Damage to the player (N,) [HP].
     """
     attacking = (s.phase == ACTIVE) & (s.enemy_hp > 0) & (s.hits_left > 0)
     kind = blow[KIND]
@@ -220,7 +217,6 @@ def strike_player(
     worst = worst * (s.enemy_hp > 0).any(0)  # otherwise the fight is over
     charged = ((direct >= worst) & charge).any(0)
     _suffer(s, worst, charged)
-    return worst
 
 
 def _spread(roll: Tensor) -> Tensor:

@@ -262,7 +262,7 @@ def move_player(s: State, intent: Intent, traits: Traits, site: Tensor) -> None:
         s: State, changed in place.
         intent: What the players want.
         traits: Traits of the machines.
-        site: Row of numbers of the arena's ground, with the grip and the radius of the wall.
+        site: Rows of `site_table` (4, N).
     """
     direction = from_stick(intent.move, facing(s.yaw))
     swinging, helpless = s.timers[MELEE] > 0, s.timers[HELPLESS].amax(0) > 0
@@ -280,7 +280,7 @@ def inside_wall(position: Tensor, site: Tensor) -> Tensor:
 
     Args:
         position: (2, ..., N) [m].
-        site: Numbers of the arena's ground, with the radius of the wall.
+        site: Rows of `site_table` (4, N).
 
     Returns:
         (2, ..., N) [m].

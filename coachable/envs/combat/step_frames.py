@@ -74,10 +74,6 @@ class Noise:
         aim = normal[:, 2:].unflatten(1, (2, enemies))
         return cls(normal[:, :2], aim, flip, shot, choice, pause[0], hit[0])
 
-    def rows(self, rows: slice) -> Noise:
-        """Return the numbers of some of the fights."""
-        return Noise(*(getattr(self, name)[..., rows] for name in self.__dataclass_fields__))
-
 
 @dataclass
 class Rules:
@@ -173,7 +169,6 @@ def run_frame(
     move_machines(s, traits, site, blow, noise.flip[frame])
     burns = burns * (s.enemy_hp > 0).any(0)  # otherwise the fight is over
     s.hp = (s.hp - burns).clamp(min=0.0)
-    taken = strike_player(
+    strike_player(
         s, traits, blow, strength, self_damage, noise.hit, noise.shot[frame], noise.aim[frame], rules.pillars, blocks
     )
-    totals.taken = totals.taken + taken + burns

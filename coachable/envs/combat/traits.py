@@ -32,7 +32,7 @@ AMMO_SLOTS = 3  # sections of a weapon; a weapon of two ammo types leaves the la
 DAMAGE, TELEGRAPH, ACTIVE, RECOVER, NEAREST, FARTHEST, COOLDOWN, SHOTS, HIDDEN, HAZARD, KIND = range(11)
 NUM_ATTACK_ROWS = 11
 
-# Rows of `Ammo.numbers`; interval and reload in frames, spread in rad.
+# Columns of `ammo_table`; interval and reload in frames, spread in rad.
 IMPACT, ELEMENTAL, TEAR, BUILDUP, INTERVAL, MAGAZINE, RELOAD, SPEED, SPREAD, RANGE, BLAST = range(11)
 
 

@@ -15,7 +15,7 @@ SPEED, BEARING = STYLE_FEATURES_SIZE, STYLE_FEATURES_SIZE + 1
 STYLED_SPEED_SIZE = BEARING + 1
 
 WALK = "walk"
-"""Key of what is measured of the walk besides, see `pack_walk`; style rewards do not read it."""
+"""Key of further measurements of the walk (see `pack_walk`), which style rewards do not read."""
 POWER, FORCE, CLEARANCE, PITCH, DRIFT, SWING_KNEE, FOOT = range(7)
 WALK_SIZE = FOOT + 1
 

@@ -1,4 +1,4 @@
-"""Gait bookkeeping: which foot must strike next, and what the step that ended was like."""
+"""Gait tracking: the foot that must strike next, and measurements of the step that has just ended."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ def _bearing(head_height: np.ndarray, upright: np.ndarray, facing: np.ndarray, c
 
 
 COSTS = ("power", "impact", "clearance", "strike_pitch", "drift")
-"""What a walk costs besides, see `walk_costs`."""
+"""Names of the costs that `walk_costs` returns."""
 _WORST = 3.0  # of any of them in a control step
 _POWER = 1000.0  # [W] that cost 1
 _SOFT, _HARD = 1.5, 6.5  # forces under a foot [body weights] that cost 0 and 1

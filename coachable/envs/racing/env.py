@@ -57,8 +57,8 @@ class RacingEnv(EnvBase):
             the others.
         driver: Driver of the other cars.
         track: Name of a circuit, a `Track`, several of them, or the name of a set, see `load_tracks`. With several
-            circuits, races take turns on them: race b drives its episode e on circuit b + e, counted from 0 and round
-            and round.
+            circuits, races take turns on them: race b drives its episode e on circuit b + e, modulo the number of
+            circuits, all counted from 0.
         car: Name of a shipped car, or "pool" for cars drawn from a pool, one model per race and episode.
         adaptive: Whether cars of the pool that spin are drawn more often; otherwise all are equally likely.
         scenarios: Kinds of starts of the episodes; by default the mixture of `race_scenarios`.
@@ -67,7 +67,7 @@ class RacingEnv(EnvBase):
         weights: Weights of the task reward.
         course_points: Number of points of each edge of the track in the observation.
         curvature: Whether the observation has the curvature of the track ahead instead of the place on the lap, which
-            is 0 then. Use it for drivers of circuits that they have not seen.
+            is 0 then. Use it for agents that will drive circuits on which they were not trained.
         opponents: Whether the observation has columns for opponents; by default it has them if there are several cars.
             They are 0 for a car that is alone.
         episode_steps: Number of control steps (0.1 s) after which an episode is truncated.
@@ -84,7 +84,7 @@ class RacingEnv(EnvBase):
         seed: Seed of the starts; each race, up to `copies`, has a random stream of its own.
         num_threads: Ignored; torch's own threads are used.
 
-    Keys written: `observation` (N, D), `task_reward` (N, 1), `style_features` (N, 9 + 3 (A - 1)), `telemetry` (N, 14),
+    Keys written: `observation` (N, D), `task_reward` (N, 1), `style_features` (N, 10 + 3 (A - 1)), `telemetry` (N, 14),
     `scenario` (N, 1) int64, `done`, `terminated`, `truncated` (N, 1).
 
     Raises:

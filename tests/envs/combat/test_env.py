@@ -1,5 +1,7 @@
 """`CombatEnv` as a TorchRL environment, and what must hold in every fight."""
 
+from dataclasses import fields
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -73,7 +75,8 @@ def test_batched_step_equals_stepping_alone():
         for row, env in enumerate([*alone, together]):
             rows = slice(None) if env is together else slice(row, row + 1)
             pad = canonical_rows(action.T[:, rows].contiguous())
-            run_step(env.state, pad, env.rules, noise.rows(rows), env._ammo, env._sections)
+            own = Noise(*(getattr(noise, field.name)[..., rows] for field in fields(noise)))
+            run_step(env.state, pad, env.rules, own, env._ammo, env._sections)
     for name, value in together.state.tensors().items():
         for row, env in enumerate(alone):
             theirs = env.state.tensors()[name][..., 0]

@@ -13,6 +13,7 @@ from torch import Tensor
 
 CARS = ("gt3", "x2019", "street")
 MAX_GEARS = 8
+_POOL_CARS, _POOL_GT3 = 530, 50  # cars of the pool, and those of them that are derived from the GT3 car
 
 COMPOUNDS = tuple(
     f"{kind}_{hardness}" for kind in ("comfort", "sport", "race") for hardness in ("hard", "medium", "soft")
@@ -152,20 +153,15 @@ class Resources:
         return cls(**{name: entry["value"] for name, entry in table[car].items()})
 
 
-def car_pool(count: int = 530, seed: int = 0, archetype: str | None = None) -> Tensor:
+def car_pool() -> Tensor:
     """Draw a pool of different cars (our choice, for the paper's 530).
 
     Six archetypes (GT3, open-wheel and street car, and the GT3 car with front-wheel drive, all-wheel drive and mid
     engine) are perturbed in mass, power, torque, centre of gravity, grip and aerodynamics. The first 50 cars are
     derived from the GT3 car.
 
-    Args:
-        count: Number of cars.
-        seed: Seed of the perturbations.
-        archetype: Name of a shipped car to use as the only archetype.
-
     Returns:
-        Packed parameters (P, count); see `Car.unpack`.
+        Packed parameters (P, 530), always the same; see `Car.unpack`.
     """
     gt3 = load_car("gt3")
     archetypes = [
@@ -176,13 +172,10 @@ def car_pool(count: int = 530, seed: int = 0, archetype: str | None = None) -> T
         replace(gt3, drive_share_front=0.4, mass=1420.0, power=430e3, torque=600.0, lift_area=1.4),
         replace(gt3, front_axle=1.50, rear_axle=1.15, mass=1250.0, yaw_inertia=1700.0),
     ]
-    if archetype is not None:
-        archetypes = [load_car(archetype)]
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     columns = []
-    for index in range(count):
-        kind = 0 if index < 50 or len(archetypes) == 1 else index % len(archetypes)
-        base = archetypes[kind]
+    for index in range(_POOL_CARS):
+        base = archetypes[0 if index < _POOL_GT3 else index % len(archetypes)]
         mass, power, grip, lift, drag, shift = (1 + 0.08 * (2 * torch.rand(6, generator=generator) - 1)).tolist()
         moved = (shift - 1) * (base.front_axle + base.rear_axle) / 2
         car = replace(

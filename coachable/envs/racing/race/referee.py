@@ -158,7 +158,6 @@ class Referee:
         along = arc.ny * turned[0] - arc.nx * turned[1]  # the tangent is the normal turned to the right
         across = arc.nx * turned[0] + arc.ny * turned[1]
         speed = torch.sqrt(s.vx * s.vx + s.vy * s.vy)
-        one = torch.ones_like(s.x)
         outcome = Outcome(progress, *(torch.zeros_like(s.x) for _ in range(4)))
         others, bodies, tow = None, None, torch.zeros_like(s.x)
         if group is not None and impact is not None:
@@ -185,7 +184,7 @@ class Referee:
             before.pedal,
             (s.off_time > 0.5 * CONTROL_STEP).to(new.dtype),
             (s.wall_time > 0.0).to(new.dtype),
-            outcome.contact * one,
+            outcome.contact,
             tow,
             before.spins + facing_back.to(new.dtype),
             *frame.unbind(0),

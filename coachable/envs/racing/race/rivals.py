@@ -21,8 +21,8 @@ _STREAM = 7919  # keeps the draws apart from those of the starts
 class Rivals:
     """Driver that controls each car either by script, with a random share of the grip, or by a past copy of the policy.
 
-    The driver of each car and the style of the copies are drawn at the start of each race. Without a policy to follow,
-    all cars are scripted.
+    Whether a car is scripted, its share of the grip and its style are drawn at the start of each race; which copy
+    drives it changes when a copy is added. Without a policy to follow, all cars are scripted.
 
     Args:
         driver: Scripted driver.
