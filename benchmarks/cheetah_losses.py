@@ -1,4 +1,4 @@
-"""Does the cheetah's speed follow the set-point, whatever the loss? Learning curves and responses over seeds.
+"""Learning curves of the cheetah and how its speed follows the set-point, for each loss, over seeds.
 
 python benchmarks/cheetah_losses.py                 trains what is missing in runs/cheetah_losses, then draws
 python benchmarks/cheetah_losses.py --losses sac qr_sac --seeds 0 1

@@ -115,7 +115,7 @@ class Bench:
         self.collecting = type(self.settings)(**{**vars(self.settings), "utd_ratio": 0.0})
 
     def measure(self, workers: int) -> dict[str, dict[str, str]]:
-        """Returns the medians of all collectors with a number of workers, and their ratios to those of one process."""
+        """Return the medians of all collectors with a number of workers, and their ratios to those of one process."""
         contestants = [Contestant(name, workers, self) for name in self.options.only]
         rows: dict[str, list[Row]] = {c.name: [] for c in contestants}
         for _ in range(self.options.rounds):
@@ -126,7 +126,7 @@ class Bench:
         return {name: medians(found, rows.get("direct", found)) for name, found in rows.items()}
 
     def make(self, name: str, workers: int) -> Any:
-        """Makes a collector; that of one process shares the learner's actor."""
+        """Make a collector; that of one process shares the learner's actor."""
         frames, cores = self.num_envs * workers, 0.4 * (os.cpu_count() or 1) / workers
         if name == "coachable-ray":
             options: dict[str, Any] = {"num_collectors": workers, "steps_per_batch": STEPS, "cpus_per_worker": cores}
@@ -152,7 +152,7 @@ class Contestant:
             self._step()
 
     def round(self) -> Row:
-        """Returns what is measured in one round."""
+        """Return what is measured in one round."""
         train, seconds = self.train, self.bench.options.seconds
         alone = self._update_alone()
         self._wake()
@@ -170,7 +170,7 @@ class Contestant:
         return row
 
     def _update_alone(self) -> float:
-        """Returns the seconds of the processor that an update takes while no collector is used."""
+        """Return the seconds of the processor that an update takes while no collector is used."""
         self.train.collector = None  # pyright: ignore[reportAttributeAccessIssue]
         began = time.thread_time()
         for _ in range(20):
@@ -179,7 +179,7 @@ class Contestant:
         return (time.thread_time() - began) / 20
 
     def _step(self) -> float:
-        """Returns the seconds of the processor that taking and storing took."""
+        """Return the seconds of the processor that taking and storing took."""
         began = time.thread_time()
         data = self.train._collect(self.batches)
         self.train._store(data)
@@ -200,7 +200,7 @@ class Contestant:
         return row | {"thread": thread / max(updates, 1), "threads": 1e3 * others / max(updates, 1)}
 
     def _wake(self) -> None:
-        """Lets workers go on, and takes what they had ready and one more batch of each, so that all are busy."""
+        """Let workers go on, and take what they had ready and one more batch of each, so that all are busy."""
         if self.name == "coachable-ray":
             while self.collector.has_batch():
                 next(self.batches)
@@ -215,7 +215,7 @@ class Contestant:
             self.collector.workers.queue_size = 0
 
     def _push(self) -> tuple[float, float]:
-        """Sends the weights, with coachable-ray to the object store; returns the time and the processor's time [ms]."""
+        """Send the weights, with coachable-ray to the object store; return the time and the processor's time [ms]."""
         collector, began, thread = self.collector, time.perf_counter(), time.thread_time()
         if isinstance(collector, ClusterCollector):
             collector.after_update(collector._updates + collector.weights_every)
@@ -226,7 +226,7 @@ class Contestant:
 
 
 def torchrl_ray(make_env: Callable[[int], Any], actor: torch.nn.Module, frames: int, workers: int, cores: float) -> Any:
-    """Makes TorchRL's own collector on the Ray of this process; each of its batches is from one worker."""
+    """Make TorchRL's own collector on the Ray of this process; each of its batches is from one worker."""
     from torchrl.collectors import Collector
 
     collector: Any = Collector(
@@ -245,7 +245,7 @@ def torchrl_ray(make_env: Callable[[int], Any], actor: torch.nn.Module, frames: 
 
 
 def medians(rows: list[Row], reference: list[Row]) -> dict[str, str]:
-    """Returns the median of each column, and the median of its ratio to that of the reference in the same round."""
+    """Return the median of each column, and the median of its ratio to that of the reference in the same round."""
     cells = dict.fromkeys(COLUMNS, "")
     for column in rows[0]:
         values = [row[column] for row in rows]

@@ -34,6 +34,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 from cluster import QUICK
+from contest import cpu_seconds
 from matplotlib import pyplot as plt
 from recipe_config import compose_config
 
@@ -44,7 +45,6 @@ ENVIRONMENTS = {
 }
 SLOW = ["train.utd_ratio=null", "train.log_interval=1", "train.checkpoint_interval=1e9", "env.num_envs=1"]
 SLOW += ["threads.simulator=1", "threads.learner=1"]
-TICKS = os.sysconf("SC_CLK_TCK")  # [1/s]
 HEADINGS = (
     "environment",
     "env-steps/s asked",
@@ -115,7 +115,7 @@ class Fleet:
         self.train._write = self._observe
 
     def run(self) -> list[Row]:
-        """Returns the rows of the log from when all workers worked; the last one has what is measured once."""
+        """Return the rows of the log from when all workers worked; the last one has what is measured once."""
         threading.Thread(target=self._wait_for_all, args=(self.workers.queue_size,), daemon=True).start()
         self.workers.queue_size = 0  # workers that have started wait for the others
         self.train.run()
@@ -172,14 +172,14 @@ class Fleet:
             self.killed += 1
 
     def _memory(self) -> Row:
-        """Returns the memory per worker of everything that Ray runs, and the part that one has for itself [MB]."""
+        """Return the memory per worker of everything that Ray runs, and the part that one has for itself [MB]."""
         own = [memory(slot.pid) for slot in self.workers.slots if slot.is_ready]
         everything = sum(memory(pid)["Pss"] for pid in descendants(os.getpid()))
         private = statistics.mean(part["Private_Clean"] + part["Private_Dirty"] for part in own if part["Pss"])
         return {"megabytes": everything / self.options.workers / 1e6, "private megabytes": private / 1e6}
 
     def _cores(self, now: float) -> float:
-        """Returns the number of cores that as many workers use as are asked for, from those that are alive."""
+        """Return the number of cores that as many workers use as are asked for, from those that are alive."""
         alive = [slot.pid for slot in self.workers.slots if slot.is_ready and slot.pid in self.seen]
         spans = [(self.seen[pid], cpu_seconds(pid)) for pid in alive]
         used = sum(cpu - began for (_, began), cpu in spans)
@@ -187,13 +187,13 @@ class Fleet:
 
 
 def memory_left() -> float:
-    """Returns the memory that new processes can have [GB]."""
+    """Return the memory that new processes can have [GB]."""
     lines = Path("/proc/meminfo").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable")) / 1e6
 
 
 def memory(pid: int) -> dict[str, int]:
-    """Returns the memory of a process by kind [bytes]: `Pss` counts a page that n processes share as 1/n of one."""
+    """Return the memory of a process by kind [bytes]: `Pss` counts a page that n processes share as 1/n of one."""
     found = dict.fromkeys(("Pss", "Private_Clean", "Private_Dirty"), 0)
     try:
         lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()[1:]
@@ -202,17 +202,8 @@ def memory(pid: int) -> dict[str, int]:
     return found | {line.split(":")[0]: int(line.split()[1]) * 1024 for line in lines}
 
 
-def cpu_seconds(pid: int) -> float:
-    """Returns the processor time of a process [s]."""
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return 0.0
-    return (int(fields[11]) + int(fields[12])) / TICKS
-
-
 def descendants(pid: int) -> Iterable[int]:
-    """Yields the processes that a process and those below it have started."""
+    """Yield the processes that a process and those below it have started."""
     parents = {}
     for folder in Path("/proc").glob("[0-9]*"):
         try:

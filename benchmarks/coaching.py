@@ -19,6 +19,8 @@ import time
 from contextlib import contextmanager
 from pathlib import Path
 
+from contest import cpu_seconds
+
 CALLS = 5000
 WARMUP_SECONDS = 5.0
 
@@ -157,11 +159,6 @@ def visit(address: str, slider: str) -> None:
             for key in ("ArrowRight", "ArrowLeft"):
                 handle.press(key)
                 time.sleep(1.0)
-
-
-def cpu_seconds(pid: int) -> float:
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 if __name__ == "__main__":

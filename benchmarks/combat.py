@@ -4,7 +4,7 @@
     python benchmarks/combat.py --envs 2048 --side-by-side 2 --peers .venv-bench/bin/python
 
 Every fight acts at random; finished fights are reset; observations, rewards, features, events and TensorDict included.
-Both clocks are given: on a busy machine the wall clock measures the neighbours. `--side-by-side 2` steps 2048 fights in
+CPU time is given beside wall time, which other programs on the machine affect. `--side-by-side 2` steps 2048 fights in
 each of two processes at once; `--peers` names an interpreter with vizdoom, which plays in turn with ours.
 """
 
@@ -78,7 +78,7 @@ def bench(num_envs: int, steps: int, device: str) -> dict[str, float]:
 
 
 def split(num_envs: int, steps: int) -> dict[str, float]:
-    """Milliseconds of CPU time per batch step in each phase."""
+    """Return the milliseconds of CPU time per batch step in each phase."""
     total = {name: 0.0 for _, name in PHASES}
     originals = [(module, name, getattr(module, name)) for module, name in PHASES]
     for module, name, function in originals:
@@ -93,7 +93,7 @@ def split(num_envs: int, steps: int) -> dict[str, float]:
 
 
 def side_by_side(processes: int, steps: int) -> float:
-    """Steps per second (wall) of so many processes that run at once."""
+    """Return the steps per second (wall) of so many processes that run at once."""
     workers = [Worker("combat_workers.py", "coachable", sys.executable, threads=1) for _ in range(processes)]
     if not all([worker.ready() for worker in workers]):
         raise SystemExit("a process could not be set up")
@@ -105,7 +105,7 @@ def side_by_side(processes: int, steps: int) -> float:
 
 
 def beside_doom(peers: str, steps: int) -> dict[str, float]:
-    """Steps per second (wall) of one process of each, in turn, median of five rounds."""
+    """Return the steps per second (wall) of one process of each, in turn, median of five rounds."""
     pythons = {"coachable": sys.executable, "vizdoom": peers}
     workers = [Worker("combat_workers.py", name, python, threads=1) for name, python in pythons.items()]
     times = measure(workers, 5, {"coachable": steps, "vizdoom": 20 * steps})

@@ -1,4 +1,4 @@
-"""What makes the fighter learn? Trainings with one thing changed: style score and wins, over seeds (paper, Appendix D).
+"""Trainings of the fighter with one thing changed: style score and wins, over seeds (paper, Appendix D).
 
 python benchmarks/combat_ablations.py                                  trains what is missing, then draws
 python benchmarks/combat_ablations.py --variants base sac --seeds 0    some of it; the figure has every finished run
@@ -72,7 +72,7 @@ SEED = 10_000  # of the fights that evaluate: the same every time
 
 
 def train(variant: str, seed: int, run_dir: Path, args: argparse.Namespace) -> None:
-    """Trains, or continues what was interrupted."""
+    """Train, or continue what was interrupted."""
     common = [f"threads.simulator={args.threads}", f"threads.learner={args.threads}"]
     try:
         state = read_state(find_checkpoint(run_dir))
@@ -127,7 +127,7 @@ def evaluation(training: Trainer, config: dict[str, Any], episodes: int) -> Call
 
 
 def finished(runs: Path) -> dict[str, list[Path]]:
-    """Folders of the trainings that came to their end, by variant."""
+    """Return the folders of the trainings that came to their end, by variant."""
     found: dict[str, list[Path]] = {}
     for variant in VARIANTS:
         for folder in sorted(runs.glob(f"{variant}_[0-9]*")):

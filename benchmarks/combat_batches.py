@@ -1,4 +1,4 @@
-"""How much of a training belongs to each style? Shares of a batch, and the size of returns, by preset.
+"""Share of a training's batches that belongs to each style, and the size of returns, by preset.
 
     python benchmarks/combat_batches.py small middle full_cpu
 

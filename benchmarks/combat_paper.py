@@ -90,7 +90,7 @@ def fight_grids(
 
 
 def grid(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
-    """Fights in every style against every machine, the unseen ones and pairs."""
+    """Fight in every style against every machine, the unseen ones and pairs."""
     space = space_of(agents)
     cells = single_styles(space) + composed_styles(space)
     labels = [style_label(cell) for cell in cells]
@@ -120,7 +120,7 @@ def grid(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
 
 
 def pareto(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
-    """Fights at weights from 0 to the maximum, against every machine."""
+    """Fight at weights from 0 to the maximum, against every machine."""
     space = space_of(agents)
     measured = [name for name in space.names if name in (*SOURCES, *STATES)]
     styles = [name for name in PARETO if name in measured]
@@ -139,7 +139,7 @@ def pareto(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
 
 
 def pairs(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
-    """Fights against every machine in which two weapons are requested at once."""
+    """Fight against every machine in which two weapons are requested at once."""
     space = space_of(agents)
     neutral = dict.fromkeys(space.names, 0.0)
     mixtures = [(*pair, share) for pair in PAIRED if set(pair) <= set(space.names) for share in SHARES]
@@ -160,7 +160,7 @@ def pairs(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
 
 
 def apex(domain: Domain, agents: Agents, out: Path, fights: int) -> None:
-    """Fights under four requests, of which one that was won or came closest to it is drawn, and fights for frost."""
+    """Fight under four requests, of which one that was won or came closest to it is drawn, and for frost."""
     agent = next(iter(agents.values()))
     names = apex_fight.requests_in_turn(agent.space.names)
     log, _ = apex_fight.log_fights(domain, agent, names, fights=fights, seed=0, draw=None)

@@ -1,4 +1,7 @@
-"""Contestants that do the same work in turn, each in a process of its own, so that disturbances strike all alike."""
+"""Contestants that do the same work in turn, so that other load affects all of them equally.
+
+Each of them is a process of its own.
+"""
 
 import json
 import os
@@ -33,6 +36,15 @@ def processor() -> str:
     return f"{known.get('model name', platform.processor())}, family {known.get('cpu family')}, {known.get('model')}"
 
 
+def cpu_seconds(pid: int) -> float:
+    """Return the processor time of a process, 0 if it has ended [s]."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 class Worker:
     """A contestant's process: `python SCRIPT NAME`, fed with numbers of rounds, answering with seconds.
 
@@ -50,7 +62,7 @@ class Worker:
         self.process = subprocess.Popen([python, str(HERE / script), name], env=env, text=True, **pipes)
 
     def ready(self) -> bool:
-        """Whether it could be set up; says why not."""
+        """Return whether it could be set up; if not, write the reason to stderr."""
         if self.process.stdout.readline().strip() == "ready":
             return True
         error = self.process.stderr.read().strip().splitlines()[-1:]
@@ -58,7 +70,7 @@ class Worker:
         return False
 
     def run(self, work: int) -> dict[str, float]:
-        """Do `work` units; returns CPU and wall seconds."""
+        """Do `work` units and return the CPU and wall seconds."""
         self.process.stdin.write(f"{work}\n")
         self.process.stdin.flush()
         return json.loads(self.process.stdout.readline())
@@ -69,7 +81,7 @@ class Worker:
 
 
 def measure(workers: list[Worker], rounds: int, work: Mapping[str, int] | int) -> dict[str, list[dict[str, float]]]:
-    """Seconds per unit of work of each contestant, one entry per round, in turn."""
+    """Return the seconds per unit of work of each contestant, which take turns; one entry per round."""
     contestants = [worker for worker in workers if worker.ready()]
     times = {worker.name: [] for worker in contestants}
     for _ in range(rounds):

@@ -12,7 +12,6 @@ and `results.png`. Published curves, where there are any, stand beside the curve
 """
 
 import argparse
-import csv
 import json
 import os
 import subprocess
@@ -25,6 +24,7 @@ from contest import HERE, thread_settings
 from dmc_workers import CONTESTANTS
 
 from coachable.evaluation.figures import MARKERS, drawing
+from coachable.evaluation.style_grid import write_csv
 
 MINUTES = {"walker-walk": 30.0, "walker-run": 30.0, "quadruped-walk": 30.0, "humanoid-walk": 90.0}
 STEP_MARKS = (100_000, 200_000, 300_000, 500_000, 1_000_000, 2_000_000, 4_000_000)
@@ -167,13 +167,14 @@ def write_results(out: Path) -> str:
     results = collect(out)
     if not results:
         return "no contestant could be trained"
-    with (out / "results.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        for task, contestants in results.items():
-            for name, seeds in contestants.items():
-                for seed, rows in seeds.items():
-                    writer.writerows({"task": task, "contestant": name, "seed": seed, **row} for row in rows)
+    every = [
+        dict.fromkeys(COLUMNS, "") | {"task": task, "contestant": name, "seed": seed, **row}
+        for task, contestants in results.items()
+        for name, seeds in contestants.items()
+        for seed, rows in seeds.items()
+        for row in rows
+    ]
+    write_csv(every, out / "results.csv")
     text = tables(results)
     (out / "results.md").write_text(text, encoding="utf-8")
     draw(results, out / "results.png")

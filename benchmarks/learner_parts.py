@@ -94,7 +94,7 @@ def costly_falls(train: Trainer) -> None:
 
 
 def unit_rows(train: Trainer) -> None:
-    """Keeps every row of the hidden layers at length 1."""
+    """Keep every row of the hidden layers at length 1."""
     loss = train.learner.loss_module
     weights = [w for name, w in loss.named_parameters() if ".blocks." in name and name.endswith("linear.weight")]
 
@@ -108,7 +108,7 @@ def unit_rows(train: Trainer) -> None:
 
 
 def entropy_target(train: Trainer) -> None:
-    """Follows the entropy of a standard deviation of 0.15 with the entropy weight."""
+    """Follow the entropy of a standard deviation of 0.15 with the entropy weight."""
     learner = train.learner
     target = 21 / 2 * math.log(2 * math.pi * math.e * 0.15**2)
 
@@ -121,7 +121,7 @@ def entropy_target(train: Trainer) -> None:
 
 
 def every_second(train: Trainer) -> None:
-    """Updates the policy in every second update of the critics."""
+    """Update the policy in every second update of the critics."""
     learner = train.learner
     update = learner._update_actor
     last: dict[str, Any] = {}

@@ -66,7 +66,7 @@ def main(overrides: list[str]) -> None:
 
 
 def _fill(train, capacity: int) -> None:
-    """Fills the replay buffer with copies of one collected round."""
+    """Fill the replay buffer with copies of one collected round."""
     data = next(iter(train.collector)).contiguous().reshape(-1).select(*train.replay_keys)
     block = data.expand(64, *data.shape).reshape(-1)
     while len(train.replay) < capacity:

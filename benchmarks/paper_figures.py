@@ -10,7 +10,7 @@ import numpy as np
 from paper_tables import KINDS, WEAPON_STYLES
 
 from coachable.domains.combat.coached_fight import SOURCES, STATES
-from coachable.evaluation.figures import MARKERS, drawing
+from coachable.evaluation.figures import MARKERS, draw_heat_map, drawing
 from coachable.evaluation.wording import readable
 
 __all__ = ["draw_matrix", "draw_mixtures", "draw_pareto", "draw_parts", "draw_radars", "draw_wins"]
@@ -28,7 +28,8 @@ def draw_matrix(rows: Rows, path: Path) -> None:
     labels = list(dict.fromkeys(row["requested"] for row in rows))
     damage = {(row["kind"], row["requested"]): row["damage"] for row in rows}
     values = np.array([[damage[kind, label] for label in labels] for kind in KINDS])
-    _heat_map(path, values, KINDS, labels, ".0f", "mean damage per fight [HP]", line=len(SOURCES))
+    kinds, labels = list(map(readable, KINDS)), list(map(readable, labels))
+    draw_heat_map(path, values, kinds, labels, ".0f", "mean damage per fight [HP]", row_line=len(SOURCES))
 
 
 def draw_wins(rows: Rows, path: Path, trained: int) -> None:
@@ -43,34 +44,8 @@ def draw_wins(rows: Rows, path: Path, trained: int) -> None:
     opponents = list(dict.fromkeys(row["opponent"] for row in rows))
     won = {(row["requested"], row["opponent"]): row["won"] for row in rows}
     values = np.array([[won[label, opponent] for opponent in opponents] for label in labels])
-    _heat_map(path, values, labels, opponents, ".0%", "share of fights won", column=trained, high=1.0)
-
-
-def _heat_map(
-    path: Path,
-    values: np.ndarray,
-    rows: Sequence[str],
-    columns: Sequence[str],
-    form: str,
-    title: str,
-    *,
-    line: int = 0,
-    column: int = 0,
-    high: float | None = None,
-) -> None:
-    high = max(float(values.max()), 1e-9) if high is None else high
-    with drawing(path, size=(2.5 + 0.62 * len(columns), 2.2 + 0.33 * len(rows)), grid=False) as ((axes,),):
-        axes.imshow(values, cmap="Blues", vmin=0.0, vmax=high, aspect="auto")
-        for (i, j), value in np.ndenumerate(values):
-            colour = "white" if value > 0.6 * high else "black"
-            axes.text(j, i, format(value, form), ha="center", va="center", fontsize=7, color=colour)
-        if line:
-            axes.axhline(line - 0.5, color="0.4", lw=1)
-        if 0 < column < len(columns):
-            axes.axvline(column - 0.5, color="0.4", lw=1)
-        axes.set_xticks(range(len(columns)), [readable(name) for name in columns], rotation=60, ha="right", fontsize=8)
-        axes.set_yticks(range(len(rows)), [readable(name) for name in rows], fontsize=8)
-        axes.set_title(title, fontsize=10)
+    labels, opponents = list(map(readable, labels)), list(map(readable, opponents))
+    draw_heat_map(path, values, labels, opponents, ".0%", "share of fights won", column_line=trained, high=1.0)
 
 
 def draw_radars(rows: Rows, path: Path) -> None:

@@ -57,7 +57,7 @@ def bench(kind: str, num_cars: int, compiled: bool, device: str, rounds: int) ->
 
 
 def memory(cars: int) -> dict[str, float]:
-    """Bytes per car, beyond the observation: kept between steps, and written by a step for the learner."""
+    """Return the bytes per car, beyond the observation: kept between steps, and written by a step for the learner."""
     env = make_env(1000, False, "cpu", cars)
     kept = [t for name, t in env.simulator_state().items() if name != "observation_now" and isinstance(t, torch.Tensor)]
     written = [t for name, t in env.rand_step(env.reset())["next"].items() if name != "observation"]
@@ -65,7 +65,7 @@ def memory(cars: int) -> dict[str, float]:
 
 
 def beside_peers(peers: str, rounds: int, seconds: float, threads: int) -> dict[str, dict[str, float]]:
-    """Steps per CPU second and per second of one process of each, in turn, median of the rounds.
+    """Return the steps per CPU second and per second of one process of each, in turn, median of the rounds.
 
     Each works about so many seconds per round.
     """

@@ -3,9 +3,9 @@
     python benchmarks/simulator.py --peers .venv-bench/bin/python
 
 A control step is five physics steps of 5 ms. Ours includes observations, task reward, style features, style sampler,
-style reward, episode sums and TensorDict; the peers include their own observations and rewards. Everybody starts
-upright and acts at random for 40 steps, except `torchrl DMControlEnv` and `envpool`, which only know the suite's random
-starts.
+style reward, episode sums and TensorDict; the peers include their own observations and rewards. All contestants
+start upright and act at random for 40 steps, except `torchrl DMControlEnv` and `envpool`, which can start only from the
+suite's random states.
 """
 
 import argparse

@@ -11,7 +11,7 @@ RECIPES = Path(__file__).resolve().parent.parent / "recipes"
 
 
 def train(recipe: str, run_dir: Path, arguments: Sequence[str]) -> None:
-    """Trains with the preset `cpu` on one thread, unless the folder holds the end of that training.
+    """Train with the preset `cpu` on one thread, unless the folder holds the end of that training.
 
     Args:
         recipe: name of a script in recipes/.

@@ -73,6 +73,46 @@ def shade(index: int, count: int) -> Any:
     return plt.get_cmap("viridis")(0.9 * index / max(count - 1, 1))
 
 
+def draw_heat_map(
+    path: Path,
+    values: np.ndarray,
+    rows: Sequence[str],
+    columns: Sequence[str],
+    form: str,
+    title: str,
+    *,
+    row_line: int = 0,
+    column_line: int = 0,
+    high: float | None = None,
+) -> None:
+    """Draw a table of numbers whose cells are the darker, the larger they are.
+
+    Args:
+        path: Image file to write.
+        values: Numbers (rows, columns), at least 0.
+        rows: Labels of the rows.
+        columns: Labels of the columns.
+        form: Format specification of the numbers, such as ".2f".
+        title: Title of the figure.
+        row_line: Number of rows above a horizontal line; 0 for no line.
+        column_line: Number of columns to the left of a vertical line; 0 for no line.
+        high: Number with the darkest colour; by default the largest one.
+    """
+    high = max(float(values.max()), 1e-9) if high is None else high
+    with drawing(path, size=(2.5 + 0.62 * len(columns), 2.2 + 0.33 * len(rows)), grid=False) as ((axes,),):
+        axes.imshow(values, cmap="Blues", vmin=0.0, vmax=high, aspect="auto")
+        for (i, j), value in np.ndenumerate(values):
+            colour = "white" if value > 0.6 * high else "black"
+            axes.text(j, i, format(value, form), ha="center", va="center", fontsize=7, color=colour)
+        if 0 < row_line < len(rows):
+            axes.axhline(row_line - 0.5, color="0.4", lw=1)
+        if 0 < column_line < len(columns):
+            axes.axvline(column_line - 0.5, color="0.4", lw=1)
+        axes.set_xticks(range(len(columns)), columns, rotation=60, ha="right", fontsize=8)
+        axes.set_yticks(range(len(rows)), rows, fontsize=8)
+        axes.set_title(title, fontsize=10)
+
+
 def draw_style_grid(grid: StyleGrid, domain: Domain, space: StyleSpace, path: Path, title: str) -> None:
     """Draw measured over requested style, and the domain's published metrics over the same axis.
 

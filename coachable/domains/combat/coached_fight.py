@@ -122,7 +122,10 @@ class CoachedFights:
 
 
 def requests_of(space: StyleSpace) -> tuple[str, ...]:
-    """Return the styles with which every hit complies or not: those of damage sources and states, but not of parts."""
+    """Return the styles for which every hit either counts or does not: those of damage sources and of states.
+
+    Styles of parts are left out.
+    """
     return tuple(name for name in space.names if name in (*SOURCES, *STATES))
 
 

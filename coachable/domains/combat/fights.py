@@ -21,7 +21,7 @@ from coachable.domains.combat.styles import single_styles
 from coachable.envs.combat.tables import MACHINES, SITES, STYLES, UNSEEN_MACHINES
 from coachable.evaluation.episode_records import record_episodes
 from coachable.evaluation.evaluation_settings import EvaluationSettings
-from coachable.evaluation.figures import drawing
+from coachable.evaluation.figures import draw_heat_map, drawing
 from coachable.evaluation.statistics import rank_correlation
 from coachable.evaluation.style_grid import markdown_table, policy_sentence, rows_where, write_results
 from coachable.evaluation.sweep import WeightSweep, sweep_weights
@@ -162,7 +162,7 @@ def damage_rows(fights: Mapping[str, np.ndarray], labels: Sequence[str]) -> list
     """Return for each requested style the shares of damage by source and elemental state, and parts per fight.
 
     Args:
-        fights: Results of `fight_grid`, (styles, opponents, fights) by name.
+        fights: Results of `fight_matrix`, (styles, opponents, fights) by name.
         labels: Names of the requested styles.
     """
     rows = []
@@ -223,18 +223,9 @@ def draw_damage(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """
     kinds = [*SOURCES, *STATES]
     shares = np.array([[row[kind] for row in rows] for kind in kinds])
-    size = (2.5 + 0.62 * len(rows), 2.2 + 0.36 * len(kinds))
-    with drawing(path, size=size, grid=False) as ((axes,),):
-        axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
-        for (i, j), share in np.ndenumerate(shares):
-            color = "white" if share > 0.6 else "black"
-            axes.text(j, i, f"{share:.2f}", ha="center", va="center", fontsize=7, color=color)
-        axes.axhline(len(SOURCES) - 0.5, color="0.4", lw=1)
-        names = [readable(row["style"]) for row in rows]
-        axes.set_xticks(range(len(rows)), [f"{n}\n{row['won']:.0%} won" for n, row in zip(names, rows, strict=True)])
-        axes.tick_params(axis="x", labelrotation=60, labelsize=8)
-        axes.set_yticks(range(len(kinds)), list(map(readable, kinds)), fontsize=8)
-        axes.set(xlabel="requested style", title="share of the damage (below the line: while the state was active)")
+    labels = [f"{readable(row['style'])}\n{row['won']:.0%} won" for row in rows]
+    title = "share of the damage by requested style (below the line: while the state was active)"
+    draw_heat_map(path, shares, list(map(readable, kinds)), labels, ".2f", title, row_line=len(SOURCES), high=1.0)
 
 
 def draw_sweep(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
@@ -277,7 +268,8 @@ def _report(
     columns = {"style": "", "won": ".0%", "score": "", "damage_per_fight": ".0f", "seconds": ".0f"}
     text += markdown_table(table, columns | dict.fromkeys(PARTS, ".2f"), {"damage_per_fight": "HP", "seconds": "s"})
     text += "\nScore: share of the damage that counts for the requested style. Parts: units removed per fight.\n"
-    for name, title in {"wins": "Wins by machine", "unseen": "Wins against what no training has"}.items():
+    titles = {"wins": "Wins by machine", "unseen": "Wins against machines and pairs that occur in no training"}
+    for name, title in titles.items():
         columns = {column: "" if column == "style" else ".0%" for column in tables[name][0]}
         text += f"\n## {title}\n\n" + markdown_table(tables[name], columns)
     text += "\n## Outcomes\n\n" + markdown_table(tables["outcomes"], dict.fromkeys(tables["outcomes"][0], ""))
@@ -298,5 +290,5 @@ def _switch_report(coached: CoachedFights, rows: Sequence[Mapping[str, Any]]) ->
     return text + (
         "\nComplied: damage that counts for the style was done before the next switch. Median: seconds from the "
         "switch to the first of it (not complied: infinite). Share: of the damage between the switch and the next one. "
-        "Where a fight ends the next one starts, and the way to the machine counts.\n"
+        "When a fight ends, the next one starts at once; the time to reach the machine is included.\n"
     )
