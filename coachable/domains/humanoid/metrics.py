@@ -1,4 +1,4 @@
-"""Measured style of the humanoid: how it walked, beside what was asked."""
+"""Measures of the humanoid's style, for comparison with the requested one."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FORWARD_SPEED = sum(group.width for group in OBSERVATION_GROUPS[:4])  # first of
 
 
 class HumanoidMeasures:
-    """Forward speed, arms in pose, realised step length and its error, and how the walk looks and feels.
+    """Measures of the forward speed, the arms' pose, the step length with its error, and the quality of the walk.
 
     Of the walk: power [W]; at each strike the largest force under the foot during its stance [body weights], how high
     the foot was lifted and how far its toes pointed down [m, deg], and how far the knee of the swinging leg was bent
@@ -35,7 +35,7 @@ class HumanoidMeasures:
     """
 
     needs = "a footstep"
-    """What it takes to tell whether the walker complies."""
+    """Condition under which compliance can be judged."""
 
     def __init__(self) -> None:
         bounds = torch.from_numpy(np.deg2rad(pose_bounds_deg())).float()
@@ -93,7 +93,7 @@ class HumanoidMeasures:
         return (record["pose_held"] > 0) & (record["step_length_error"] < LENGTH_TOLERANCE)
 
     def judged(self, record: Mapping[str, Tensor]) -> Tensor:
-        """(T, N) bool: a foot struck."""
+        """Return the steps (T, N) bool in which a foot struck."""
         return ~torch.isnan(record["step_length"])
 
 

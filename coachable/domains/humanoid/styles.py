@@ -60,7 +60,12 @@ def humanoid_style_space() -> StyleSpace:
         [
             Choice("pose", POSES, help="how the arms are held"),
             Setpoint(
-                "step_length", low, high, unit="m", help="distance between the feet at a strike", encoding="range"
+                "step_length",
+                low,
+                high,
+                unit="m",
+                help="distance along the course from one footprint to the next",
+                encoding="range",
             ),
         ],
         name="humanoid",

@@ -95,6 +95,7 @@ def test_driving_is_measured_in_its_units():
 def test_savings_are_not_judged_by_single_steps():
     measures = RacingMeasures("resources")
     found = measures.step(race([], [0.0, 0.0, 100.0, 1.0]))
+    assert found["complied"].isnan().all()
     assert not measures.judged({name: value[None] for name, value in found.items()}).any()
     assert "whole stints" in measures.needs
 
