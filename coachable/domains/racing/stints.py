@@ -189,7 +189,7 @@ def _stint(measured: Mapping[str, np.ndarray], alive: np.ndarray, row: int, leng
     per_km = float("nan")
     if len(steps) > 1:  # the first lap contains the start
         first, last = steps[0], steps[-1]
-        per_km = abs(left[last] - left[first]) / ((distance[last] - distance[first]) / 1000.0)
+        per_km = float(abs(left[last] - left[first]) / ((distance[last] - distance[first]) / 1000.0))
     return Stint(laps=times, clean=clean, left=left[steps], per_km=per_km)
 
 

@@ -61,9 +61,8 @@ def test_a_higher_price_saves_more_and_costs_more(car, resource, coarse_speeds):
 
 
 def test_a_heavier_car_is_slower_and_wears_its_tyres_more(coarse_speeds):
-    light, heavy = (frontier.sweep("x2019", "tyre", [], track="ring", fuel=fuel)[0] for fuel in (50.0, 100.0))
+    [light], [heavy] = (frontier.sweep("x2019", "tyre", [], **fuel) for fuel in ({}, {"fuel": 100.0}))  # half a tank
     assert heavy["lap_time"] > light["lap_time"] and heavy["wear_per_lap"] > light["wear_per_lap"]
-    assert frontier.sweep("x2019", "tyre", [], track="ring")[0] == light
 
 
 def test_a_ring_is_driven_at_the_speed_that_friction_allows():
