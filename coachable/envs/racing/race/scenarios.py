@@ -24,7 +24,7 @@ _FUEL = (10.0, 100.0)  # [l]
 _HEAT = (30.0, 130.0)  # [°C], as hot as a stint makes them
 _MEDIUM = COMPOUNDS.index("race_medium")
 FUEL = 30.0  # [l], of cars that use none up
-_DRAWS = 16  # random numbers per car and episode
+_DRAWS = 18  # random numbers per car and episode
 _SHARES = {"solo": 0.30, "one_to_one": 0.15, "field": 0.25, "rolling": 0.10, "slipstream": 0.10, "recovery": 0.10}
 _SHARES_ALONE = {"solo": 0.8, "recovery": 0.2}
 
@@ -249,9 +249,9 @@ class Starter:
         state[ROW["fuel"]] = low + (high - low) * u[12] if conditions.fuel is None else conditions.fuel
         if conditions.wear:
             common = _WEAR_MAX * u[13]
-            pair = torch.stack([normal(u[14], u[15]), normal(u[14], (u[15] + 0.25) % 1.0)])
-            other = torch.stack([normal(u[2], u[3]), normal(u[2], (u[3] + 0.25) % 1.0)])
-            state[WEARS] = (common + _WEAR_SPREAD * torch.cat([pair, other])).clamp(0.0, 1.0)
+            front = torch.stack([normal(u[14], u[15]), normal(u[14], (u[15] + 0.25) % 1.0)])
+            rear = torch.stack([normal(u[16], u[17]), normal(u[16], (u[17] + 0.25) % 1.0)])
+            state[WEARS] = (common + _WEAR_SPREAD * torch.cat([front, rear])).clamp(0.0, 1.0)
         return state
 
     def _sensible(self, s: Tensor) -> Tensor:
