@@ -20,6 +20,12 @@ def _check_name(kind: str, name: str) -> None:
         )
 
 
+def _check_texts(what: str, **texts: object) -> None:
+    for name, text in texts.items():
+        if not isinstance(text, str):
+            raise ValueError(f"{name} of {what} is {text!r}: expected a text.")
+
+
 def _check_range(what: str, low: float, high: float) -> None:
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
         raise ValueError(f"{what} has the range [{low}, {high}]: expected finite bounds with low < high.")
@@ -36,12 +42,15 @@ class _Numeric:
     name: str
     low: float
     high: float
+    unit: str
+    help: str
     evaluation: tuple[float, float] | None
     width: ClassVar[int] = 1
     options: ClassVar[tuple[str, ...]] = ()
 
     def _check(self, kind: str) -> None:
         _check_name(kind, self.name)
+        _check_texts(f"{kind} {self.name!r}", unit=self.unit, help=self.help)
         object.__setattr__(self, "low", float(self.low))
         object.__setattr__(self, "high", float(self.high))
         _check_range(f"{kind} {self.name!r}", self.low, self.high)
@@ -71,7 +80,8 @@ class Weight(_Numeric):
         evaluation: Range over which reports vary it, inside `[low, high]`; the whole range if None.
 
     Raises:
-        ValueError: If the name is not an identifier, or the range is empty, infinite or without 0.
+        ValueError: If the name is not an identifier, unit or help is not a text, or the range is empty, infinite or
+            without 0.
 
     Examples:
         >>> Weight("melee", -0.375, 7.5, help="Prefer the spear").default
@@ -114,8 +124,8 @@ class Setpoint(_Numeric):
         evaluation: Range over which reports vary it, inside `[low, high]`; the whole range if None.
 
     Raises:
-        ValueError: If the name is not an identifier, the range is empty or infinite, the default lies outside, or the
-            encoding is unknown.
+        ValueError: If the name is not an identifier, unit or help is not a text, the range is empty or infinite, the
+            default lies outside, or the encoding is unknown.
 
     Examples:
         >>> Setpoint("gap", 0.0, 2.0, unit="m").default
@@ -155,7 +165,8 @@ class Choice:
         default: Option if the coach gives none; None for the first.
 
     Raises:
-        ValueError: If the name is not an identifier, options repeat or are too few, or the default is not an option.
+        ValueError: If the name is not an identifier, help is not a text, options repeat or are too few, or the default
+            is not an option.
 
     Examples:
         >>> Choice("pose", ("front", "t_pose", "up")).width
@@ -175,6 +186,7 @@ class Choice:
 
     def __post_init__(self) -> None:
         _check_name("Choice", self.name)
+        _check_texts(f"Choice {self.name!r}", help=self.help)
         options = (self.options,) if isinstance(self.options, str) else tuple(self.options)
         object.__setattr__(self, "options", options)
         if len(options) < 2 or len(set(options)) != len(options) or not all(isinstance(o, str) and o for o in options):

@@ -328,6 +328,8 @@ def test_encodes_like_ignores_what_networks_do_not_see(space):
         (lambda: Weight("w", 0, 1, evaluation=(0, 2)), "evaluation bound of Weight 'w' is 2.0"),
         (lambda: Setpoint("s", 0, 1, default=2), "default of Setpoint 's' is 2.0"),
         (lambda: Setpoint("s", 0, 1, encoding="log"), "expected 'max' or 'range'"),
+        (lambda: Setpoint("s", 0, 1, unit=3), "unit of Setpoint 's' is 3: expected a text"),  # pyright: ignore
+        (lambda: Choice("c", ("a", "b"), help=None), "help of Choice 'c' is None: expected a text"),  # pyright: ignore
         (lambda: Choice("c", ("a",)), "at least two distinct names"),
         (lambda: Choice("c", ("a", "a")), "at least two distinct names"),
         (lambda: Choice("c", "ab"), "at least two distinct names"),

@@ -14,7 +14,7 @@ from coachable.coach.page.api import CoachApi
 from coachable.coach.page.film import FilmStudio
 from coachable.coach.page.server import serve_api
 from coachable.coach.page.views import View, make_view
-from coachable.coach.page.widgets import Chart, MeasuredText, ParameterWidget, label, write
+from coachable.coach.page.widgets import Chart, MeasuredText, ParameterWidget, escaped, label, write
 from coachable.coach.phrases.grammar import Understanding
 from coachable.coach.session.loop import LiveLoop
 from coachable.coach.session.plan import read_plan
@@ -353,7 +353,8 @@ def listed(domain: Domain, space: StyleSpace, measured: Mapping[str, float]) -> 
         space: The style space.
         measured: Values by name.
     """
-    texts = [f"{domain.words.name(name)} **{measured_text(domain, space, name, v)}**" for name, v in measured.items()]
+    shown = [(domain.words.name(name), measured_text(domain, space, name, value)) for name, value in measured.items()]
+    texts = [f"{escaped(name)} **{escaped(value)}**" for name, value in shown]
     return f"also measured: {', '.join(texts)}" if texts else ""
 
 
@@ -370,8 +371,3 @@ def verdict(report: StyleReport) -> str:
         return f"Request met {first}; nothing to judge in the last {report.seconds:.1f} s."
     now = f"{report.complying:.0%} of what was judged in the last {report.seconds:.1f} s"
     return f"**Request met**, {first}: {now}." if report.complying >= 0.5 else f"Request met {first}, but only {now}."
-
-
-def escaped(text: str) -> str:
-    """Escape the characters that are markup in Markdown."""
-    return "".join(f"\\{c}" if c in "\\`*_{}[]<>#|~" else c for c in text)

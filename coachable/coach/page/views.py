@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from coachable.coach.page.scene_view import PHONE, SceneView, View
+from coachable.coach.page.widgets import escaped
 from coachable.coach.session.session import CoachSession
 
 if TYPE_CHECKING:
@@ -81,5 +82,5 @@ def make_view(server: viser.ViserServer, session: CoachSession) -> View:
             return SceneView(server, session, session.domain.make_stage())
         return PictureView(server, session)
     except (ImportError, RuntimeError) as error:  # an extra or an OpenGL library is missing
-        server.gui.add_markdown(f"**No view:** {error}")
+        server.gui.add_markdown(f"**No view:** {escaped(str(error))}")
         return View()  # coaching works without one

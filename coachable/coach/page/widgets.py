@@ -100,7 +100,7 @@ class MeasuredText:
 
     def __init__(self, server: viser.ViserServer, parameter: Parameter, domain: Domain, space: StyleSpace) -> None:
         self.parameter, self._domain, self._space = parameter, domain, space
-        self.handle = server.gui.add_markdown(trained(parameter))
+        self.handle = server.gui.add_markdown(escaped(trained(parameter)))
 
     def update(self, report: StyleReport, measures: list[str]) -> None:
         """Show the values of the parameter's `measures` in a report, or say why there are none.
@@ -111,14 +111,14 @@ class MeasuredText:
         """
         name, values = self.parameter.name, report.measured
         measured = sorted((m for m in measures if m in values), key=lambda m: m != name)  # the nameless one comes first
-        shown = [f"{self._name(m)}**{self._value(m, values[m])}**" for m in measured]
+        shown = [f"{escaped(self._name(m))}**{escaped(self._value(m, values[m]))}**" for m in measured]
         found = "no measure of its own" if report.seconds and not measures else "not measured yet"
         if shown:
             found = f"measured {', '.join(shown)} in {report.seconds:.1f} s"
-        text = " · ".join(filter(None, [found, trained(self.parameter)]))
+        text = " · ".join(filter(None, [found, escaped(trained(self.parameter))]))
         outside = report.outside.get(name)
         if outside is not None:
-            used, unit = report.requested[name], f" {self.parameter.unit}".rstrip()
+            used, unit = report.requested[name], escaped(f" {self.parameter.unit}".rstrip())
             text += f"\n\n**Outside the trained range:** {outside:g}{unit} was asked for, {used:.3g}{unit} is used."
         write(self.handle, text)
 
@@ -200,7 +200,9 @@ class Chart:
         shown = tuple(columns if measured else columns[:2])
         ends = _ends(self._space[self.shown], shown[1:2] if self._is_apart(bool(measured)) else shown[1:])
         self._plot((self.shown, ends, bool(measured), not shown[-1].any()), shown)
-        write(self.note, f"{self._domain.words.name(self.shown)}: nothing was measured in the last {_SPAN:g} s")
+        write(
+            self.note, f"{escaped(self._domain.words.name(self.shown))}: nothing was measured in the last {_SPAN:g} s"
+        )
         if self.note.visible == bool(measured):
             self.note.visible = not measured
 
@@ -220,7 +222,7 @@ class Chart:
         self._drawn = kind
 
     def _layout(self, name: str, ends: tuple[float, float], measured: bool, nothing_found: bool) -> dict[str, Any]:
-        """Return the layout of the plot; an own axis of zeros, which the plot would let end at 100, ends at 1."""
+        """Return the layout of the plot; a separate axis where every value is 0 ends at 1 instead of the plot's 100."""
         import viser.uplot as uplot
 
         series = [uplot.Series(label="seconds ago"), uplot.Series(label="requested", stroke=_REQUESTED, width=2)]
@@ -279,6 +281,15 @@ def trained(parameter: Parameter) -> str:
     if isinstance(parameter, Choice):
         return ""
     return f"trained {readable_number(parameter.low)} to {readable_number(parameter.high, parameter.unit)}"
+
+
+def escaped(text: str) -> str:
+    """Escape the characters that are markup in Markdown, in which the page would also render HTML.
+
+    Args:
+        text: Text that is to be shown as it is, such as a unit from a weights file.
+    """
+    return "".join(f"\\{c}" if c in "\\`*_{}[]<>#|~&" else c for c in text)
 
 
 def write(handle: Any, text: str) -> None:

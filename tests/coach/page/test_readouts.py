@@ -1,5 +1,6 @@
 """What the page shows of the measured style: charts, read-outs and the verdict."""
 
+import re
 import warnings
 
 import numpy as np
@@ -8,12 +9,13 @@ import pytest
 viser = pytest.importorskip("viser")
 
 
-from coachable.coach.page.coach_page import verdict  # noqa: E402
+from coachable.coach.page.coach_page import listed, verdict  # noqa: E402
 from coachable.coach.page.looks import pad_page  # noqa: E402
-from coachable.coach.page.widgets import _ends  # noqa: E402
+from coachable.coach.page.widgets import MeasuredText, _ends  # noqa: E402
 from coachable.coach.session.readout import StyleReport  # noqa: E402
 from coachable.scene.look import icon_link, stylesheet  # noqa: E402
-from coachable.styles import Choice, Setpoint  # noqa: E402
+from coachable.styles import Choice, Setpoint, StyleSpace  # noqa: E402
+from tests.coach.echo_domain import ECHO  # noqa: E402
 from tests.coach.page.driving import do, say, wait_for  # noqa: E402
 
 
@@ -64,6 +66,17 @@ def test_the_measure_without_a_name_comes_first(page):
     text = page.measured["target"]
     text.update(report(measured={"target": 0.5, "pace": 0.25}), ["pace", "target"])
     assert text.handle.content.startswith("measured **0.5 m**, pace **0.25 m/step** in 2.0 s")
+
+
+def test_texts_of_a_weights_file_are_no_markup(server):
+    """viser renders HTML in Markdown, scripts included."""
+    space = StyleSpace([Setpoint("target", -0.8, 0.8, unit="<img src=x onerror=alert(1)>")])
+    text = MeasuredText(server, space["target"], ECHO, space)
+    shown = [text.handle.content]
+    text.update(report(outside={"target": 2.0}), ["target"])
+    shown += [text.handle.content, listed(ECHO, space, {"target": 0.5})]
+    assert [content.count(r"\<img src=x onerror=alert(1)\>") for content in shown] == [1, 4, 1]
+    assert not any(re.search(r"(?<!\\)[<>]", content) for content in shown)
 
 
 def report(**changes):
