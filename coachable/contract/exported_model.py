@@ -18,7 +18,7 @@ from coachable.extras import how_to_install
 from coachable.files import CheckpointError
 from coachable.keys import STYLE
 
-__all__ = ["OnnxPolicy", "OnnxRun", "read_model"]
+__all__ = ["OnnxPolicy", "OnnxRun", "import_onnx", "parts_of", "read_model"]
 
 _LARGEST = 1 << 30  # [byte]
 _STANDARD = ("", "ai.onnx")  # domains of operators that every runtime has
@@ -173,31 +173,23 @@ def _check_graph(onnx: Any, model: Any) -> None:
     """Refuse operators of other libraries, and weights in other files, which the file could name freely."""
     if not model.graph.node:
         raise ContractError("it has no graph: it is not an ONNX file, or is cut short")
+    parts = list(parts_of(model))
     own = {*_STANDARD, *(function.domain for function in model.functions)}
-    graphs = [*_graphs(model.graph), *(graph for function in model.functions for graph in _graphs(function))]
-    foreign = {node.domain for graph in graphs for node in graph.node} - own
+    foreign = {part.domain for part in parts if isinstance(part, onnx.NodeProto)} - own
     if foreign:
         raise ContractError(f"it has operators of {', '.join(sorted(foreign))}: expected those of ONNX itself")
-    if any(tensor.data_location == onnx.TensorProto.EXTERNAL for graph in graphs for tensor in _tensors(graph)):
+    tensors = (part for part in parts if isinstance(part, onnx.TensorProto))
+    if any(tensor.data_location == onnx.TensorProto.EXTERNAL for tensor in tensors):
         raise ContractError("it has weights in other files: expected all of them inside")
 
 
-def _graphs(graph: Any) -> Iterator[Any]:
-    """Return a graph, or a function, with the graphs inside its operators."""
-    yield graph
-    for node in graph.node:
-        for attribute in node.attribute:
-            for inner in (*([attribute.g] if attribute.HasField("g") else []), *attribute.graphs):
-                yield from _graphs(inner)
-
-
-def _tensors(graph: Any) -> Iterator[Any]:
-    yield from getattr(graph, "initializer", ())
-    for sparse in getattr(graph, "sparse_initializer", ()):
-        yield from (sparse.values, sparse.indices)
-    for node in graph.node:
-        for attribute in node.attribute:
-            yield from (*([attribute.t] if attribute.HasField("t") else []), *attribute.tensors)
+def parts_of(message: Any) -> Iterator[Any]:
+    """Yield a message of the file and all messages inside it, wherever graphs, operators or tensors may be nested."""
+    yield message
+    for field, value in message.ListFields():
+        if field.message_type is not None:
+            for part in (value,) if hasattr(value, "ListFields") else value:
+                yield from parts_of(part)
 
 
 def _output_widths(heads: ActionHeads, names: list[str]) -> dict[str, int]:

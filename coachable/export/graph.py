@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from coachable.contract import exported_model
 from coachable.extras import how_to_install
 
-__all__ = ["graph_of", "import_onnx", "quietly"]
+__all__ = ["forget_sources", "graph_of", "import_onnx", "quietly"]
 
 
 def graph_of(function: nn.Module, example: Mapping[str, Tensor], outputs: Sequence[str]) -> Any:
@@ -56,13 +56,22 @@ def graph_of(function: nn.Module, example: Mapping[str, Tensor], outputs: Sequen
         written: Any = torch.onnx.export(program, **options, **names)
         _simplify(written.model)
     exported = written.model_proto
-    for node in exported.graph.node:  # where in the source it comes from, which names folders
-        node.doc_string = ""
-        del node.metadata_props[:]
+    forget_sources(exported)
     _replace_cosines(onnx, exported.graph)
     del exported.graph.value_info[:]
     onnx.checker.check_model(exported)
     return exported
+
+
+def forget_sources(model: Any) -> None:
+    """Remove, in place, where in the source code each part of a model comes from, which names folders of this machine.
+
+    Args:
+        model: The model, an `onnx.ModelProto`, without its contract.
+    """
+    for part in list(exported_model.parts_of(model)):
+        for name in {"doc_string", "metadata_props"}.intersection(part.DESCRIPTOR.fields_by_name):
+            part.ClearField(name)
 
 
 def _simplify(model: Any) -> None:

@@ -16,7 +16,7 @@ from coachable import __version__
 from coachable.contract.contract import Contract
 from coachable.contract.exported_model import OnnxRun
 from coachable.domain import Domain, domain_names
-from coachable.export.graph import import_onnx, quietly
+from coachable.export.graph import forget_sources, import_onnx, quietly
 from coachable.export.recorder import Rig, record
 from coachable.export.verify import TOLERANCE
 from coachable.files import CheckpointError, space_named
@@ -79,6 +79,7 @@ def write_onnx(agent: LoadedPolicy, domain: Domain | None, out: Path) -> float:
     onnx = import_onnx()
     plain = DeterministicAction(agent.actor).eval()
     model = _trace(plain).model_proto
+    forget_sources(model)
     contract = contract_of(agent, plain, domain)
     if domain is not None:
         with closing(Rig(domain, agent.space)) as rig:

@@ -10,9 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import torchrl
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+import coachable
 from coachable.cli import main
 from coachable.contract.contract import SCHEMA_VERSION
 from coachable.distributions.action_heads import ActionHeads
@@ -70,6 +72,12 @@ def test_rounding_in_the_largest_shipped_network_is_no_difference(tmp_path):
     agent = load_policy("combat_full")
     plain = DeterministicAction(agent.actor)
     assert largest_difference(write(plain, tmp_path / "fighter.onnx"), plain, agent.space) <= TOLERANCE
+
+
+def test_the_file_names_no_folder_of_this_machine(file):
+    content = file.read_bytes()
+    assert not any(str(Path(module.__file__).parent).encode() in content for module in (coachable, torch, torchrl))
+    assert b".py" not in content
 
 
 def test_the_file_describes_itself(file):
