@@ -1,6 +1,8 @@
 """Safe reading and writing of files: no code from a file is executed, and damage is detected."""
 
 import contextlib
+import itertools
+import json
 import os
 import shutil
 import zipfile
@@ -16,6 +18,7 @@ __all__ = [
     "check_contained",
     "check_finite",
     "load_state",
+    "parse_json",
     "refusing",
     "save_state",
     "space_named",
@@ -25,6 +28,7 @@ __all__ = [
 ]
 
 _PLAIN = (bool, int, float, str, type(None))
+_MOST_ENTRIES = 10_000_000  # of the containers of a file
 
 
 class CheckpointError(RuntimeError):
@@ -98,10 +102,11 @@ def save_state(state: Mapping[str, Any], file: Path) -> None:
         CheckpointError: If `state` contains anything else, which could not be read back.
         OSError: If writing fails.
     """
-    _check_plain(state, file.name)
+    state = _written_out(dict(state))
+    _check_plain(state, file.name, itertools.count(1))
     try:
         with file.open("wb") as stream:
-            torch.save(dict(state), stream)
+            torch.save(state, stream)
             stream.flush()
             os.fsync(stream.fileno())
     except RuntimeError as error:  # torch's zip writer reports a failed write this way
@@ -129,7 +134,7 @@ def load_state(file: Path, device: torch.device | str = "cpu") -> dict[str, Any]
                 f"cannot read {file}: it holds something other than tensors, numbers, strings and containers of these, "
                 "which is not loaded because loading could run code"
             ) from error
-        _check_plain(state, str(file))
+        _check_plain(state, str(file), itertools.count(1))
         if not isinstance(state, dict):
             raise CheckpointError(f"{file} holds a {type(state).__name__}: expected a dictionary")
         return state
@@ -159,6 +164,29 @@ def check_finite(values: Any, source: Path | str, name: str = "") -> None:
     elif isinstance(values, list | tuple):
         for i, value in enumerate(values):
             check_finite(value, source, f"{name}.{i}")
+
+
+def parse_json(text: str | bytes, what: str, longest: int) -> Any:
+    """Return the content of a JSON text, which may come from anybody.
+
+    Args:
+        text: The text.
+        what: What it is, for the message, such as "the message".
+        longest: Largest number of characters.
+
+    Raises:
+        ValueError: If the text is longer, or not valid JSON, which has no NaN and no infinity.
+    """
+    if len(text) > longest:
+        raise ValueError(f"{what} has {len(text):,} characters: expected at most {longest:,}")
+    try:
+        return json.loads(text, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError):
+        raise ValueError(f"{what} is not valid JSON") from None
+
+
+def _refuse_constant(constant: str) -> None:
+    raise ValueError(f"{constant} is not valid JSON")
 
 
 def check_contained(folder: Path) -> None:
@@ -215,19 +243,50 @@ def _check_archive(file: Path) -> None:
         )
 
 
-def _check_plain(value: Any, name: str) -> None:
+def _check_plain(value: Any, name: str, visits: Iterator[int]) -> None:
+    """Refuse unusual content, and content that is much larger in use than in the file.
+
+    Args:
+        value: Containers, tensors and anything else.
+        name: Name of `value`, for the message.
+        visits: Count of the entries, from 1. Containers that contain each other several times have many.
+
+    Raises:
+        CheckpointError: If an entry is refused; the message names it.
+    """
+    if next(visits) > _MOST_ENTRIES:
+        raise CheckpointError(f"{name} is one entry too many: expected at most {_MOST_ENTRIES:,} in a file")
     if isinstance(value, dict):
         for key, entry in value.items():
-            _check_plain(entry, f"{name}, {key}")
+            _check_plain(entry, f"{name}, {key}", visits)
             if type(key) not in (str, int):
                 raise CheckpointError(f"{name} has the key {key!r}: expected a string or an integer")
     elif isinstance(value, list | tuple):
         for i, entry in enumerate(value):
-            _check_plain(entry, f"{name}, {i}")
+            _check_plain(entry, f"{name}, {i}", visits)
     elif isinstance(value, Tensor):
         if value.layout != torch.strided or value.is_meta or value.is_quantized:
             raise CheckpointError(f"{name} is a tensor of an unusual kind: expected a dense one")
+        if _is_repetitive(value):
+            stored, shape = value.untyped_storage().nbytes(), tuple(value.shape)
+            raise CheckpointError(
+                f"{name} has {stored:,} bytes for the shape {shape}: expected {tensor_bytes(value):,} bytes"
+            )
     elif type(value) not in _PLAIN:
         raise CheckpointError(
             f"{name} is a {type(value).__name__}: expected tensors, numbers, strings and containers of these"
         )
+
+
+def _written_out(value: Any) -> Any:
+    """Return nested containers in which tensors such as expanded ones have storage for each of their numbers."""
+    if isinstance(value, dict):
+        return {key: _written_out(entry) for key, entry in value.items()}
+    if type(value) in (list, tuple):
+        return type(value)(map(_written_out, value))
+    return value.contiguous() if isinstance(value, Tensor) and _is_repetitive(value) else value
+
+
+def _is_repetitive(tensor: Tensor) -> bool:
+    """Return whether a dense tensor has more numbers than its storage."""
+    return tensor.layout == torch.strided and tensor_bytes(tensor) > tensor.untyped_storage().nbytes()

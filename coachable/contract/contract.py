@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from coachable.files import parse_json
 from coachable.signals import Signal
 from coachable.styles import StyleSpace
 
@@ -82,6 +83,8 @@ class Recorded:
         fits = len(arrays["action"]) == steps and len(arrays["observation"]) == steps + 1 and steps >= 1
         if not fits or len(arrays["probe"]) != len(arrays["probe_action"]) or len(arrays["rest"]) < 1:
             raise ContractError("the arrays of its recording do not have the lengths of one run")
+        if len(arrays["probe"]) < 1:
+            raise ContractError("its recording has no probes: expected a step with each axis and choice of the action")
         return cls(seed, **arrays)
 
 
@@ -190,19 +193,13 @@ def _check_version(version: str | None) -> None:
 
 
 def _json(text: str, what: str, kind: type, longest: int = _LONGEST_TEXT) -> Any:
-    if len(text) > longest:
-        raise ContractError(f"its {what} has {len(text):,} characters: expected at most {longest:,}")
     try:
-        value = json.loads(text, parse_constant=_refuse)
-    except (ValueError, RecursionError):
-        raise ContractError(f"its {what} is not valid JSON") from None
+        value = parse_json(text, f"its {what}", longest)
+    except ValueError as error:
+        raise ContractError(str(error)) from None
     if not isinstance(value, kind):
         raise ContractError(f"its {what} is a {type(value).__name__}: expected a {kind.__name__}")
     return value
-
-
-def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is not valid JSON")
 
 
 def _signals(text: str, what: str) -> tuple[Signal, ...]:

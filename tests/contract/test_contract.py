@@ -150,6 +150,10 @@ BAD = {
     "a bomb": ({"recording": recording(observation=BOMB)}, "does not have the size of its shape"),
     "no base64": ({"recording": recording(rest={"shape": [3, 4], "data": "?"})}, "cannot be unpacked"),
     "infinite": ({"recording": recording(rest=packed(np.full((3, 4), np.inf)))}, "values that are not finite"),
+    "no probes": (
+        {"recording": recording(probe=packed(np.zeros((0, 4))), probe_action=packed(np.zeros((0, 6))))},
+        "recording has no probes: expected a step with each axis and choice",
+    ),
     "another length": ({"recording": recording(style=packed(numbers(2, 3)))}, "do not have the lengths of one run"),
 }
 
@@ -203,6 +207,30 @@ def test_nothing_beside_the_file_is_read_or_run(file, tmp_path):
     foreign.write_bytes(model.SerializeToString())
     with pytest.raises(CheckpointError, match=r"has operators of com\.evil"):
         read_model(foreign)
+
+
+def test_sparse_weights_in_other_files_are_refused(file, tmp_path):
+    """onnxruntime would read them, wherever in the file they are named."""
+    secret = tmp_path / "secret"
+    secret.write_bytes(bytes(4096))
+    outside = onnx.helper.make_tensor("values", onnx.TensorProto.FLOAT, (4,), np.zeros(4, np.float32).tobytes(), True)
+    onnx.external_data_helper.set_external_data(outside, str(secret))
+    outside.ClearField("raw_data")
+    outside.data_location = onnx.TensorProto.EXTERNAL
+    inside = onnx.helper.make_tensor("indices", onnx.TensorProto.INT64, (4,), range(4))
+    constant = onnx.helper.make_sparse_tensor(outside, inside, (1024,))
+    for attributes in ({"sparse_value": constant}, {"sparse_values": [constant]}):
+        model = onnx.load(file)
+        model.graph.node.append(onnx.helper.make_node("Constant", [], ["planted"], **attributes))
+        planted = tmp_path / "planted.onnx"
+        planted.write_bytes(model.SerializeToString())
+        with pytest.raises(CheckpointError, match="has weights in other files"):
+            read_model(planted)
+    model = onnx.load(file)
+    model.graph.sparse_initializer.append(constant)
+    planted.write_bytes(model.SerializeToString())
+    with pytest.raises(CheckpointError, match="has weights in other files"):
+        read_model(planted)
 
 
 def test_a_graph_that_cannot_run_is_one_sentence(file, tmp_path):

@@ -12,10 +12,11 @@ import pytest
 import torch
 from recipe_config import run_recipe
 
+from coachable import files
 from coachable.cli import main
 from coachable.domains.humanoid import humanoid_style_space
 from coachable.evaluation.curves import read_metric
-from coachable.files import CheckpointError
+from coachable.files import CheckpointError, load_state, save_state
 from coachable.networks import make_gaussian_actor
 from coachable.training.checkpoint import CheckpointStore, find_checkpoint, read_state
 from coachable.training.weights import domain_of, load_policy
@@ -220,6 +221,33 @@ def test_weights_that_are_not_finite_replace_no_checkpoint(tmp_path, part, value
             save(bad, {"frames": 2})
     assert [path.name for path in sorted(tmp_path.iterdir())] == ["LATEST", "frames_000000000001"]
     assert read_state(find_checkpoint(tmp_path))["actor"]["x"].tolist() == [1, 1, 1]
+
+
+def test_a_tensor_that_repeats_its_numbers_is_saved_with_all_of_them_and_else_refused(tmp_path):
+    """An expanded tensor of 1.5 kB would become one of gigabytes as soon as it is copied."""
+    file = tmp_path / "state.pt"
+    torch.save({"list": [torch.zeros(1).expand(2**31)]}, file)
+    with pytest.raises(CheckpointError, match=r"state\.pt, list, 0 has 4 bytes for the shape \(2147483648,\)"):
+        load_state(file)
+    save_state({"list": [torch.ones(1).expand(3)], "view": torch.arange(4)[1:]}, file)
+    state = load_state(file)
+    assert state["list"][0].tolist() == [1, 1, 1] and state["view"].tolist() == [1, 2, 3]
+
+
+def test_containers_that_contain_each_other_are_refused(tmp_path, monkeypatch):
+    """Thirty nested lists with two times the same list each have 2 ** 30 entries, and one inside itself has no end."""
+    monkeypatch.setattr(files, "_MOST_ENTRIES", 10_000)
+    nested: list = []
+    for _ in range(30):
+        nested = [nested, nested]
+    torch.save({"nested": nested}, tmp_path / "nested.pt")
+    with pytest.raises(CheckpointError, match="is one entry too many: expected at most 10,000 in a file"):
+        load_state(tmp_path / "nested.pt")
+    endless: list = []
+    endless += [endless, endless]
+    torch.save({"endless": endless}, tmp_path / "endless.pt")
+    with pytest.raises(CheckpointError, match="endless"):
+        load_state(tmp_path / "endless.pt")
 
 
 def test_objects_that_could_not_be_read_back_are_not_saved(tmp_path):

@@ -19,6 +19,7 @@ from coachable.coach.session.bindings import Binding, make_bindings
 from coachable.coach.session.loop import LiveLoop
 from coachable.coach.session.readout import StyleReport
 from coachable.coach.session.session import CoachSession
+from coachable.files import parse_json
 from coachable.styles import StyleRangeWarning
 
 __all__ = ["PATH", "PROTOCOL", "CoachApi"]
@@ -46,8 +47,8 @@ class CoachApi:
 
     def __init__(self, loop: LiveLoop) -> None:
         self._loop = loop
-        self._space = describe(loop.session)
         self._bindings = make_bindings(loop.session.space, loop.session.domain.controls)
+        self._space = _describe(loop.session, self._bindings)
         self._state: dict[str, Any] = {}
         self._rates: dict[object, float] = {}
         self._lock = threading.Lock()  # of the rates, which two threads use
@@ -173,12 +174,8 @@ class CoachApi:
             raise ValueError(f"the request was not carried out within {_PATIENCE:g} s") from None
 
 
-def describe(session: CoachSession) -> dict[str, Any]:
-    """Return the declarations that a program needs to coach a session, as plain values for JSON.
-
-    Args:
-        session: The session.
-    """
+def _describe(session: CoachSession, bindings: Sequence[Binding]) -> dict[str, Any]:
+    """Return the declarations that a program needs to coach a session, as plain values for JSON."""
     space = session.space.to_dict()
     controls = [asdict(c.parameter) | {"circular": c.circular} for c in session.domain.controls]
     push = session.domain.push
@@ -191,26 +188,17 @@ def describe(session: CoachSession) -> dict[str, Any]:
         "presets": dict(session.presets),
         "units": dict(session.domain.units),
         "names": dict(session.domain.words.names),
-        "bindings": [asdict(binding) for binding in make_bindings(session.space, session.domain.controls)],
+        "bindings": [asdict(binding) for binding in bindings],
     }
 
 
 def _parse(message: str | bytes) -> dict[str, Any]:
-    if len(message) > _LONGEST:
-        raise ValueError(f"the message has {len(message):,} characters: expected at most {_LONGEST:,}")
-    try:
-        request = json.loads(message, parse_constant=_refuse)
-    except (ValueError, RecursionError):
-        raise ValueError("the message is not valid JSON") from None
+    request = parse_json(message, "the message", _LONGEST)
     if not isinstance(request, dict):
         raise ValueError(f"the message is a {type(request).__name__}: expected an object with the entry 'do'")
     if not isinstance(request.get("id", 0), int | str):
         raise ValueError("the id of the message is neither a number nor a text")
     return request
-
-
-def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is not valid JSON")
 
 
 def _change_of(what: Any, request: Mapping[str, Any]) -> Callable[[CoachSession], Any]:
