@@ -187,14 +187,16 @@ def _film(
     rollout.begin(thetas[0][None])
     try:
         for request, theta in zip(requests, thetas, strict=True):
-            asked, style = asked_line(space, request, theta), space.describe(theta)
+            style = space.describe(theta)
+            asked = asked_line(space, request, style)
             recent: list[dict[str, Tensor]] = []
             for step in range(1, period + 1):
                 transition = rollout.step(policy, theta[None])
                 recent = [*recent, domain.measures.step(transition)][-window:]
                 last = [1.0] if step == period else []
                 shares = last if fps is None else _shares(next(steps), domain.control_step * fps)
-                measured = _measured_line(domain, space, style, recent, failures, short) if shares else ""
+                found = _summary(domain, recent) if shares else {}
+                measured = measured_line(domain, space, style, found, failures, short)
                 if isinstance(renderer, SceneRenderer):
                     pictures = renderer.draw_way(env, 0, style, shares)
                 else:
@@ -214,16 +216,16 @@ def _shares(step: int, pictures: float) -> list[float]:
     return [min(1.0, number / pictures - step) for number in range(first + 1, last + 1)]
 
 
-def asked_line(space: StyleSpace, request: Mapping[str, Any], theta: Tensor) -> str:
+def asked_line(space: StyleSpace, request: Mapping[str, Any], style: Mapping[str, float | str]) -> str:
     """Return the requested style for a caption, with the requested value of numbers that were clamped.
 
     Args:
         space: The agent's style space.
-        request: Values by parameter name; other parameters have their default.
-        theta: The style (d,) that was made from the request.
+        request: Requested values by parameter name, at least those that were clamped.
+        style: The style in force, by parameter name.
     """
     parts = []
-    for name, value in space.describe(theta).items():
+    for name, value in style.items():
         if isinstance(value, str):
             parts.append(f"{name} {value}")
             continue
@@ -235,18 +237,32 @@ def asked_line(space: StyleSpace, request: Mapping[str, Any], theta: Tensor) -> 
     return readable(f"requested: {', '.join(parts) or 'every weight 0'}")
 
 
-def _measured_line(
+def _summary(domain: Domain, recent: Sequence[Mapping[str, Tensor]]) -> dict[str, float]:
+    """Summarise the measures of the last steps of one environment."""
+    record = {name: torch.stack([row[name] for row in recent]) for name in recent[0]}
+    measured = domain.measures.summarise(record, torch.ones(len(recent), 1, dtype=torch.bool))
+    return {name: value.item() for name, value in measured.items()}
+
+
+def measured_line(
     domain: Domain,
     space: StyleSpace,
     style: Mapping[str, Any],
-    recent: Sequence[Mapping[str, Tensor]],
-    failures: int,
+    measured: Mapping[str, float],
+    failures: int = 0,
     short: bool = False,
 ) -> str:
-    """Return what was measured since the request: what belongs to it, then published quantities that have a unit."""
-    record = {name: torch.stack([row[name] for row in recent]) for name in recent[0]}
-    measured = domain.measures.summarise(record, torch.ones(len(recent), 1, dtype=torch.bool))
-    known = {name: value.item() for name, value in measured.items() if not bool(value.isnan().any())}
+    """Return for a caption what belongs to the request, then published quantities that have a unit.
+
+    Args:
+        domain: The domain.
+        space: The agent's style space.
+        style: The style in force, by parameter name.
+        measured: Measured values by name; NaN is left out.
+        failures: Number of terminated episodes.
+        short: Whether the film is narrow, so that only the most important values fit.
+    """
+    known = {name: value for name, value in measured.items() if not math.isnan(value)}
     owned = measures_by_parameter(space, known, domain.beside)
     asked = [name for name in space.names if style[name] or not isinstance(space[name], Weight)]
     columns = [name.removeprefix("measured_") for name in domain.columns]

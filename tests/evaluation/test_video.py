@@ -1,20 +1,28 @@
 """Films: encoders, captions and the tour of styles."""
 
+import math
 import re
 import warnings
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image, ImageSequence
 
 from coachable.domain import load_domain
 from coachable.domains.humanoid import humanoid_style_space
 from coachable.evaluation import video
-from coachable.evaluation.video import CAPTION, asked_line, caption, default_tour, render, tiled, write_video
+from coachable.evaluation.video import (
+    CAPTION,
+    asked_line,
+    caption,
+    default_tour,
+    measured_line,
+    render,
+    tiled,
+    write_video,
+)
 from coachable.styles import StyleRangeWarning, StyleSpace, Weight
 from coachable.training.weights import domain_of, load_policy
 
@@ -81,10 +89,8 @@ def test_long_lines_of_the_caption_are_written_smaller():
 def test_the_caption_names_what_belongs_to_the_request_first():
     domain, space = load_domain("humanoid"), humanoid_style_space()
     values = {"forward_speed": 1.234, "pose_held": 0.5, "step_length": 0.5, "power": 700.4, "step_length_error": 0.1}
-    found = {name: torch.tensor([value]) for name, value in values.items()} | {"drift": torch.tensor([torch.nan])}
-    measures = SimpleNamespace(summarise=lambda record, alive: found)
-    recent, style = [{"power": torch.zeros(1)}], {"pose": "arms_up", "step_length": 0.4}
-    shown = partial(video._measured_line, replace(domain, measures=measures), space, style, recent)
+    found = values | {"drift": math.nan}
+    shown = partial(measured_line, domain, space, {"pose": "arms_up", "step_length": 0.4}, found)
     assert shown(0) == "measured: pose held 50%, step length 0.500 m, forward speed 1.23 m/s"
     assert shown(2).endswith("; 2 failures")
     assert shown(2, short=True) == "measured: pose held 50%, step length 0.500 m"
@@ -141,7 +147,7 @@ def test_the_caption_shows_what_the_agent_is_asked():
     def line(**request):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", StyleRangeWarning)
-            return asked_line(space, request, space.make(**request))
+            return asked_line(space, request, space.describe(space.make(**request)))
 
     assert line(pose="t_pose", step_length=0.5) == "requested: pose t pose, step length 0.5 m"
     assert line(step_length=9.0) == "requested: pose arms in front, step length 0.65 m (clamped from 9)"
@@ -151,8 +157,8 @@ def test_the_caption_shows_what_the_agent_is_asked():
 
 def test_the_caption_leaves_out_weights_of_zero():
     space = StyleSpace([Weight("fire", 0.0, 1.0), Weight("tire", -60.0, 12000.0)])
-    assert asked_line(space, {"fire": 0.0}, space.make(fire=0.0)) == "requested: every weight 0"
-    assert asked_line(space, {"tire": 6000.0}, space.make(tire=6000.0)) == "requested: tire 6000"
+    assert asked_line(space, {"fire": 0.0}, {"fire": 0.0, "tire": 0.0}) == "requested: every weight 0"
+    assert asked_line(space, {"tire": 6000.0}, {"fire": 0.0, "tire": 6000.0}) == "requested: tire 6000"
 
 
 def test_the_film_of_a_request_outside_the_range_says_so(monkeypatch):

@@ -11,7 +11,8 @@ import numpy as np
 
 from coachable.coach.session.recording import Recording
 from coachable.coach.session.session import CoachSession
-from coachable.evaluation.video import CAPTION, caption, write_video
+from coachable.evaluation.video import CAPTION, asked_line, caption, measured_line, write_video
+from coachable.keys import TASK_REWARD
 
 _LONGEST_SESSION = 600.0  # [s]; the whole session is replayed to film its last seconds
 
@@ -136,6 +137,8 @@ def _frames(
 
 def _lines(session: CoachSession) -> tuple[str, str]:
     report = session.report()
-    asked = ", ".join(f"{n} {v:.2f}" if isinstance(v, float) else f"{v}" for n, v in report.requested.items())
-    shown = ", ".join(f"{name} {value:.2f}" for name, value in report.measured.items())
-    return f"requested: {asked}".replace("_", " "), f"measured: {shown}".replace("_", " ")
+    measured = {name: value for name, value in report.measured.items() if name != TASK_REWARD}
+    return (
+        asked_line(session.space, report.outside, report.requested),
+        measured_line(session.domain, session.space, report.requested, measured),
+    )

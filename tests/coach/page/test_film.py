@@ -1,8 +1,11 @@
 """Films of recorded sessions."""
 
+import warnings
+
 import pytest
 
-from coachable.coach.page.film import film
+from coachable.coach.page.film import _lines, film
+from coachable.styles import StyleRangeWarning
 from tests.coach.echo_domain import echo_session
 
 
@@ -26,6 +29,17 @@ def test_a_film_of_the_last_seconds_of_a_session_that_goes_on(session, tmp_path)
     assert len(frames) == 10 and frames[0].shape == (96, 64, 3)
     assert shares[-1] == 1.0 and shares == sorted(shares)
     assert session.step_count == 50, "the session itself is not touched"
+
+
+def test_the_caption_has_only_what_fits(session):
+    """A caption of everything that is measured runs off the picture where there are many measures."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", StyleRangeWarning)
+        session.set(target=2.0)
+    session.step()
+    asked, measured = _lines(session)
+    assert asked == "requested: target 0.8 m (clamped from 2), mood calm"
+    assert measured == "measured: target 0.8 m, pace 0.8 m/step"
 
 
 def test_what_cannot_be_filmed(session, tmp_path):
