@@ -27,13 +27,45 @@ from coachable.styles import (
     feature,
 )
 
-__all__ = ["EnvPictures", "RewardMeasures", "simulation_of", "steps_per_episode", "style_grid", "time_per_step"]
+__all__ = [
+    "EnvPictures",
+    "RewardMeasures",
+    "WorkedOut",
+    "simulation_of",
+    "steps_per_episode",
+    "style_grid",
+    "time_per_step",
+]
 
 _SLACK = 0.05  # of a set-point's range: a measured value this close to the request complies
 _MET = 0.9  # least tolerance with which a choice counts as met
 _GRID = (5, 3)  # values of a numeric parameter in the grid, of a single one and of several
 _LARGEST_GRID = 36  # cells; beyond it parameters are varied one at a time
 _EPISODE_STEPS = 1000
+
+
+class WorkedOut:
+    """Default of a field of `Domain` that is computed from other fields when it is first read.
+
+    Args:
+        work_out: Function from the domain to the value.
+    """
+
+    def __init__(self, work_out: Callable[[Any], Any]) -> None:
+        self._work_out = work_out
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, domain: Any, owner: type) -> Any:
+        if domain is None:
+            return self  # the dataclass uses it as the field's default
+        if vars(domain)[self._name] is self:
+            vars(domain)[self._name] = self._work_out(domain)
+        return vars(domain)[self._name]
+
+    def __set__(self, domain: Any, value: Any) -> None:
+        vars(domain)[self._name] = value
 
 
 class RewardMeasures:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import entry_points
 from inspect import signature
@@ -16,7 +16,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, Transform
 
-from coachable.defaults import EnvPictures, RewardMeasures, steps_per_episode, style_grid, time_per_step
+from coachable.defaults import EnvPictures, RewardMeasures, WorkedOut, steps_per_episode, style_grid, time_per_step
+from coachable.ranges import around
 from coachable.scene.frame import Stage
 from coachable.signals import Signal
 from coachable.styles import Setpoint, StyleReward, StyleSpace
@@ -98,9 +99,7 @@ class Control:
         low, high = self.parameter.low, self.parameter.high
         if not math.isfinite(value):
             raise ValueError(f"{self.parameter.name} = {value}: expected a number in [{low:g}, {high:g}].")
-        if self.circular and not low <= value <= high:
-            return low + (value - low) % (high - low)
-        return min(max(value, low), high)
+        return around(value, low, high) if self.circular else min(max(value, low), high)
 
 
 @dataclass(frozen=True)
@@ -155,7 +154,7 @@ class Push:
 
 @dataclass(frozen=True)
 class Recorded:
-    """What the exported page of a domain plays whose simulation does not run in a browser.
+    """What the exported page plays if the domain's simulation does not run in a browser.
 
     Attributes:
         grid: Styles of the recordings, as in `Domain.grid`; None for the domain's grid.
@@ -200,30 +199,10 @@ class Words:
         return self.names.get(name, name.replace("_", " "))
 
 
-class _WorkedOut:
-    """Default of a field of `Domain` that is computed from other fields when it is first read."""
-
-    def __init__(self, work_out: Callable[[Domain], Any]) -> None:
-        self._work_out = work_out
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self._name = name
-
-    def __get__(self, domain: Domain | None, owner: type) -> Any:
-        if domain is None:
-            return self  # the dataclass uses it as the field's default
-        if vars(domain)[self._name] is self:
-            vars(domain)[self._name] = self._work_out(domain)
-        return vars(domain)[self._name]
-
-    def __set__(self, domain: Domain, value: Any) -> None:
-        vars(domain)[self._name] = value
-
-
-_MEASURES: Any = _WorkedOut(lambda domain: RewardMeasures(domain.make_reward(domain.make_space())))
-_GRID: Any = _WorkedOut(lambda domain: style_grid(domain.make_space()))
-_CONTROL_STEP: Any = _WorkedOut(lambda domain: time_per_step(domain.make_env))
-_EPISODE_STEPS: Any = _WorkedOut(lambda domain: steps_per_episode(domain.make_env))
+_MEASURES: Any = WorkedOut(lambda domain: RewardMeasures(domain.make_reward(domain.make_space())))
+_GRID: Any = WorkedOut(lambda domain: style_grid(domain.make_space()))
+_CONTROL_STEP: Any = WorkedOut(lambda domain: time_per_step(domain.make_env))
+_EPISODE_STEPS: Any = WorkedOut(lambda domain: steps_per_episode(domain.make_env))
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -232,7 +211,7 @@ class Domain:
 
     Attributes:
         name: Name on the command line.
-        make_env: `(num_envs, ...) -> EnvBase`, without style transforms; it may also take `seed` and `num_threads`.
+        make_env: `(num_envs, ...) -> EnvBase`, without style transforms; it may also take `num_threads`.
         make_space: `() -> StyleSpace`, the styles on which its agents are trained.
         make_reward: `(space) -> StyleReward`; a recipe may pass further settings.
         measures: Measured style; by default `RewardMeasures`, from the terms of the style reward.
@@ -248,10 +227,11 @@ class Domain:
         episode_steps: Length of a full episode; by default from the environment's attributes, or 1000.
         trials: Options of `make_env` by label, such as disturbances, under which `coachable evaluate` counts the
             episodes in the default style that survive.
-        targets: Largest value of a metric that is wanted as its median over the styles, by name.
+        targets: Largest acceptable median of a metric over the styles, by the metric's name.
         columns: Metrics of the published table, in order, with the format of their values; by default all.
         units: Units of measured quantities by name, for the axes of figures and the page of `coachable coach`.
-        beside: Style parameter that a measure tells about, by the measure's name, where its name does not contain it.
+        beside: Style parameter to which a measure belongs, by the measure's name; needed where that name does not
+            contain the parameter's.
         observation_groups: Blocks of the observation, in order, for explanations and exported models; by default every
             entry is explained on its own.
         action_groups: Blocks of the action, in order, for exported models.
@@ -339,7 +319,15 @@ class Domain:
     def with_options(self, options: Mapping[str, Any]) -> Domain:
         """Return this domain with arguments of `make_env` and `make_web`, such as those from `read_options`."""
         make_web = self.make_web and partial(self.make_web, **options)
-        return replace(self, make_env=partial(self.make_env, **options), make_web=make_web)
+        return self.with_fields(make_env=partial(self.make_env, **options), make_web=make_web)
+
+    def with_fields(self, **values: Any) -> Domain:
+        """Return this domain with other values of some fields.
+
+        Other than with `dataclasses.replace`, defaults that are computed from other fields are computed when they are
+        first read, and from the new values.
+        """
+        return Domain(**(vars(self) | values))
 
     def cells(self) -> list[dict[str, Any]]:
         """Return the styles of the evaluation grid, by parameter name."""
@@ -387,7 +375,9 @@ def load_domain(name: str, config: Mapping[str, Any] | None = None) -> Domain:
     entries = list(entry_points(group=_GROUP, name=name))
     if not entries:
         names = domain_names()
-        expected = f"expected one of {names}" if names else "no package registers any; install this one anew with pip"
+        expected = (
+            f"expected one of {names}" if names else "no package registers a domain: reinstall coachable with pip"
+        )
         raise ValueError(f"unknown domain {name!r}: {expected}")
     if len(entries) > 1:
         packages = " and ".join(sorted(entry.dist.name if entry.dist else entry.value for entry in entries))

@@ -7,7 +7,7 @@ import numbers
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["AMOUNT", "COUNT", "FINITE", "NOT_NEGATIVE", "POSITIVE", "SHARE", "Range"]
+__all__ = ["AMOUNT", "COUNT", "FINITE", "NOT_NEGATIVE", "POSITIVE", "SHARE", "Range", "around"]
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,16 @@ class Range:
     def _bounds(self) -> tuple[float, float]:
         low, high = self.interval[1:-1].split(",")
         return float(low), float(high)
+
+
+def around(value: float, low: float, high: float) -> float:
+    """Return a number of a circle, such as an angle, in [low, high], whose ends are the same point.
+
+    Example:
+        >>> around(190.0, -180.0, 180.0), around(180.0, -180.0, 180.0)
+        (-170.0, 180.0)
+    """
+    return value if low <= value <= high else low + (value - low) % (high - low)
 
 
 FINITE = Range("(-inf, inf)")

@@ -93,6 +93,10 @@ def test_time_is_asked_of_the_environment_when_it_is_first_read():
     assert made == []
     assert (domain.control_step, domain.episode_steps, domain.control_step) == (0.25, 20, 0.25)
     assert made == [1, 1]
+    quick = Domain("echo", make_env, echo_space, lambda space: None).with_options({})  # pyright: ignore
+    quicker = quick.with_fields(make_env=lambda num_envs: StyleEchoEnv(num_envs), control_step=0.5)
+    assert made == [1, 1], "and not when a domain is made from another one"
+    assert (quicker.control_step, quicker.episode_steps, quick.control_step) == (0.5, 1000, 0.25)
     assert (time_per_step(StyleEchoEnv), steps_per_episode(StyleEchoEnv)) == (1.0, 1000)
 
 

@@ -1,7 +1,6 @@
 """Agents in files: their description, loading their policy, exporting and reusing their weights."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import wraps
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -162,7 +161,7 @@ def domain_of(agent: LoadedPolicy) -> Domain:
         _check_widths(source, reads, (env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]), name)
         return env
 
-    return replace(domain, make_env=make_env)
+    return domain.with_fields(make_env=make_env)
 
 
 def _check_widths(source: str, reads: tuple[int, int], gives: tuple[int, int], domain: str) -> None:

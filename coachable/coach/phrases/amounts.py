@@ -7,6 +7,7 @@ from typing import cast
 from coachable.coach.phrases.segments import Segment
 from coachable.coach.phrases.vocabulary import ANGLE, ANY, PERCENT, PLAINLY, SLIGHTLY, STRONGLY, TURNS, UNITS, stem
 from coachable.evaluation.wording import readable
+from coachable.ranges import around
 from coachable.styles import Choice, Setpoint, Weight
 
 Last = tuple[tuple[str, ...], float]  # parameters and direction of a change
@@ -65,9 +66,7 @@ def wrapped(p: Weight | Setpoint | Choice, value: float) -> float:
         p: The parameter.
         value: Value in the parameter's unit.
     """
-    if _is_circle(p) and not p.low <= value <= p.high:
-        return p.low + (value - p.low) % 360.0
-    return value
+    return around(value, p.low, p.high) if _is_circle(p) else value
 
 
 def _is_circle(p: Weight | Setpoint | Choice) -> bool:

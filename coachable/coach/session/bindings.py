@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from coachable.coach.session.session import CoachSession
 from coachable.domain import Control
+from coachable.ranges import around
 from coachable.styles import Choice, StyleSpace
 
 __all__ = ["Binding", "make_bindings"]
@@ -55,9 +56,7 @@ class Binding:
             return self.options[(self.options.index(str(value)) + direction) % len(self.options)]
         low, high = self._range()
         stepped = float(value) + direction * _STEP * (high - low)
-        if self.circular and not low <= stepped <= high:
-            return low + (stepped - low) % (high - low)
-        return min(max(stepped, low), high)
+        return around(stepped, low, high) if self.circular else min(max(stepped, low), high)
 
     def at(self, position: float) -> float:
         """Return the value of an axis at a position in [-1, 1]."""
