@@ -80,20 +80,18 @@ def _mujoco() -> list[Check]:
         finding = f"mujoco-core {core} lies beside mujoco {mujoco}, in the same folder: make a new virtual environment"
         return [Check("mujoco", "problem", finding)]
     if mujoco and _major(mujoco) >= 4:
-        return [Check("mujoco", "problem", f"{mujoco} breaks dm_control: pip install 'mujoco>=3.17,<4' afresh")]
+        remedy = "make a new virtual environment with 'mujoco>=3.17,<4'"
+        return [Check("mujoco", "problem", f"{mujoco} breaks dm_control: {remedy}")]
     return []
 
 
 def _rendering() -> list[Check]:
     from coachable.gl import INSTALL_HINT, NO_BACKEND, choose_gl_backend
 
-    before = os.environ.get("MUJOCO_GL")
     backend = choose_gl_backend()
-    if before is None:
-        os.environ.pop("MUJOCO_GL", None)
     if backend == NO_BACKEND:
         return [Check("rendering", "note", f"training works, videos do not: {INSTALL_HINT}")]
-    return [Check("rendering", "ok", f"MUJOCO_GL={backend}" + (" (set by you)" if before else ""))]
+    return [Check("rendering", "ok", f"MUJOCO_GL={backend}")]
 
 
 def _hardware() -> list[Check]:

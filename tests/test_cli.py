@@ -223,13 +223,14 @@ def test_the_doctor_approves_of_this_installation(capsys):
     assert status == 0, text
     for name in ("python", "torch", "mujoco", "rendering", "hardware", "threads", "preset"):
         assert re.search(rf"^(ok|note)\s+{name}\s", text, re.MULTILINE), name
+    assert "set by you" not in text, "which cannot be told: the package has set MUJOCO_GL by then"
 
 
 @pytest.mark.parametrize(
     "versions, message",
     [
         ({"mujoco": "3.17.0", "mujoco-core": "4.0.0"}, "mujoco-core 4.0.0 lies beside mujoco 3.17.0"),
-        ({"mujoco": "4.0.0"}, "4.0.0 breaks dm_control"),
+        ({"mujoco": "4.0.0"}, "4.0.0 breaks dm_control: make a new virtual environment with 'mujoco>=3.17,<4'"),
     ],
 )
 def test_the_doctor_finds_a_broken_mujoco(monkeypatch, capsys, versions, message):
