@@ -78,7 +78,8 @@ class StyleGrammar:
         examples: Suggested phrases, all of which are understood.
 
     Raises:
-        ValueError: If the vocabulary names a parameter or an option that does not exist.
+        ValueError: If the vocabulary names a parameter or an option that does not exist, or names with different signs
+            together.
 
     Example:
         >>> from coachable.styles import Setpoint
@@ -322,10 +323,15 @@ def read_meaning(meaning: str) -> tuple[tuple[str, ...], int, str]:
 
     Returns:
         The names of the parameters, their sign (+1, -1, or 0 for none), and the value ("" for none).
+
+    Raises:
+        ValueError: If the names have different signs.
     """
     names, _, value = meaning.partition("=")
-    signs = {_SIGNS.get(name[0], 0) for name in names.split()}
-    return tuple(name.lstrip("+-") for name in names.split()), signs.pop() if signs else 0, value
+    signs = {_SIGNS.get(name[0], 0) for name in names.split()} or {0}
+    if len(signs) > 1:
+        raise ValueError(f"the vocabulary has words for {meaning!r}: expected the same sign before all names, or none")
+    return tuple(name.lstrip("+-") for name in names.split()), signs.pop(), value
 
 
 def _listed(names: Sequence[str]) -> str:

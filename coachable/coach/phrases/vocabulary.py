@@ -75,7 +75,7 @@ DEGREES = {
     **dict.fromkeys(("much", "lot", "lots", "far", "way", "considerably", "significantly", "strongly"), STRONGLY),
     **dict.fromkeys(("very", "really", "extremely", "super", "ultra"), STRONGLY),
 }
-NEGATIONS = _words("not no never without avoid stop cannot nor neither discourage ban skip forget quit drop dont")
+NEGATIONS = _words("not no never without avoid stop nor neither discourage ban skip forget quit drop dont")
 PREFERENCES = _words("prefer favour favor encourage love focus only mainly mostly use using choose always rather")
 FACTORS = {"double": 2.0, "twice": 2.0, "triple": 3.0, "half": 0.5, "halve": 0.5}
 DEFAULTS = _words("reset normal default usual neutral standard ordinary regular")
@@ -110,6 +110,7 @@ _NUMBERS |= {word: 10.0 * (i + 1) for i, word in enumerate(_TENS)}
 _FRACTIONS = {"half": 0.5, "quarter": 0.25}
 _MIXED = re.compile(rf"\b(\d+|{'|'.join(_NUMBERS)}) and a (half|quarter)\b")
 _RATIO = re.compile(r"(?<![\d./])(\d{1,4})/([1-9]\d{0,3})(?![\d./])")
+_THOUSANDS = re.compile(r"(?<![\d.,])[1-9]\d{0,2}(?:,\d{3})+(?!\d)")  # "1,000", but not "0,400"
 _TOKEN = re.compile(r"[+-]?\d+(?:\.\d+)?|m/s|km/h|[a-z°]+|%|[,;.!?:]")
 
 
@@ -130,6 +131,7 @@ def tokenise(phrase: str) -> list[str]:
     text = re.sub(r"\b(?:instead of|rather than)\b", "not", text)
     text = re.sub(r"n't\b", " not", text).replace("'s", "").replace("'", "")
     text = re.sub(r"(?<=[a-z])[-_](?=[a-z])", " ", text)
+    text = _THOUSANDS.sub(lambda m: m[0].replace(",", ""), text)
     text = re.sub(r"(?<=\d),(?=\d)", ".", text)
     text = re.sub(r"(?<![\d.])\.(?=\d)", "0.", text)
     text = _MIXED.sub(lambda m: f"{(_NUMBERS.get(m[1]) or float(m[1])) + _FRACTIONS[m[2]]:g}", text)  # "one and a half"

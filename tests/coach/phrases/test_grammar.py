@@ -1,5 +1,7 @@
 """Phrases: a table of what each means, and the share of thirty-six requests that is understood."""
 
+import re
+
 import pytest
 
 from coachable.coach.phrases import segments
@@ -235,10 +237,21 @@ def test_the_vocabulary_is_checked():
         StyleGrammar(humanoid_style_space(), {"pose=down": ("arms down",)})
     with pytest.raises(ValueError, match="words for 'stride': expected one of"):
         StyleGrammar(humanoid_style_space(), {"-step_length -stride": ("arms down",)})
+    for meaning in ("+gap -speed", "gap -speed", "-gap +speed"):
+        with pytest.raises(ValueError, match=re.escape(f"words for {meaning!r}: expected the same sign")):
+            StyleGrammar([Setpoint("gap", 0.0, 2.0), Setpoint("speed", 0.0, 2.0)], {meaning: ("patient",)})
 
 
 def test_tokens():
     assert tokenise("Don\u2019t go 0.4m/s, twenty five cm!") == ["do", "not", "go", "0.4", "m/s", ",", "25", "cm", "!"]
+    for number, read in {
+        "1,000": "1000",
+        "1,234,567.5": "1234567.5",
+        "0,400": "0.400",
+        "1,5": "1.5",
+        "1,0000": "1.0000",
+    }.items():
+        assert tokenise(f"{number} mm") == [read, "mm"]
 
 
 def meets(value, wanted) -> bool:
