@@ -27,9 +27,9 @@ from websockets.http11 import Request, Response
 
 from coachable.coach.page.api import PATH, PROTOCOL, CoachApi
 from coachable.coach.page.looks import dressed, pad_page
+from coachable.coach.page.server import EVERYWHERE
 
 _THIS_MACHINE = ("localhost", "127.0.0.1", "::1")
-_EVERYWHERE = ("", "*", "0.0.0.0", "::")
 _HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([^\[\]:@/\s]+))(?::\d{1,5})?", re.IGNORECASE)
 _VISER = re.compile(r"viser-v[\w.+-]{1,32}")
 _PAD = "/pad"  # page for keys and gamepads
@@ -60,7 +60,7 @@ class Guard:
     def __init__(self, host: str) -> None:
         self.active = False
         self.api: CoachApi | None = None
-        self._everywhere = host in _EVERYWHERE
+        self._everywhere = host in EVERYWHERE
         self._names = {*_THIS_MACHINE, host.lower().strip("[]")}
         if self._everywhere:
             self._names.add(socket.gethostname().lower())

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from coachable.coach.page.api import CoachApi
     from coachable.coach.page.guard import Guard
 
+EVERYWHERE = ("", "*", "0.0.0.0", "::")
+"""Hosts that stand for all addresses of this machine."""
+
 _PORTS = 65535
 _GUARDS: WeakKeyDictionary[viser.ViserServer, Guard] = WeakKeyDictionary()
 _TRIED = 100  # ports, before giving up
@@ -54,7 +57,7 @@ def make_server(host: str = "127.0.0.1", port: int = 8080) -> viser.ViserServer:
             """Ignore requests of browsers for viser's tunnel through a public host."""
 
     guard = Guard(host)
-    free = free_port(host, port)  # viser itself tries 1000 ports after any error, and then waits for ever
+    free = free_port(host, port)  # viser itself tries 1000 ports after any error, and then waits forever
     with guard.around(), contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
         server = LocalServer(host=host, port=free, label="coachable", verbose=False)
     _GUARDS[server] = guard
@@ -109,5 +112,5 @@ def page_address(host: str, port: int) -> str:
         host: Host that the server listens on.
         port: Its port.
     """
-    name = "localhost" if host in ("", "0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+    name = "localhost" if host in EVERYWHERE else f"[{host}]" if ":" in host else host
     return f"http://{name}:{port}"

@@ -95,5 +95,5 @@ def test_ctrl_c_ends_it(moment, capsys, monkeypatch):
 
 def test_addresses_for_a_browser():
     assert page_address("127.0.0.1", 80) == "http://127.0.0.1:80"
-    assert page_address("0.0.0.0", 80) == "http://localhost:80"
+    assert {page_address(host, 80) for host in ("", "*", "0.0.0.0", "::")} == {"http://localhost:80"}
     assert page_address("::1", 80) == "http://[::1]:80"
