@@ -15,17 +15,13 @@ from coachable import __version__
 from coachable.domain import Domain
 from coachable.export.graph import import_onnx
 from coachable.export.onnx import write_onnx
-from coachable.export.verify import TOLERANCE
 from coachable.export.web.part import PagePart
 from coachable.export.web.pinned_files import Package, packages, provide
 from coachable.outputs import complete_folder
 from coachable.scene.look import ICON, stylesheet
 from coachable.training.weights import LoadedPolicy
 
-__all__ = ["SCHEMA_VERSION", "about", "copy_page", "export_page", "finish_page", "manifest_of"]
-
-SCHEMA_VERSION = 1
-"""Version of `manifest.json`."""
+__all__ = ["about", "copy_page", "export_page", "finish_page", "manifest_of"]
 
 _POLICY = "policy.onnx"
 _VENDORED = "third_party"
@@ -130,11 +126,9 @@ def _name_preloads(out: Path, manifest: Mapping[str, Any], vendored: Mapping[str
 def about(agent: LoadedPolicy) -> dict[str, Any]:
     """Return what every page has to know of an agent."""
     return {
-        "schema_version": SCHEMA_VERSION,
         "coachable_version": __version__,
         "home": home_page(),
         "domain": agent.metadata["domain"],
-        "frames": agent.metadata["frames"],
     }
 
 
@@ -178,7 +172,6 @@ def manifest_of(agent: LoadedPolicy, domain: Domain, part: PagePart) -> dict[str
         "summary": part.summary,
         "style_space": json.loads(agent.space.to_json()),
         "default_style": agent.space.default.tolist(),
-        "presets": {name: dict(style) for name, style in domain.words.presets.items()},
         "controls": controls,
         "opens": dict(part.opens),
         "idle": list(part.idle),
@@ -191,7 +184,6 @@ def manifest_of(agent: LoadedPolicy, domain: Domain, part: PagePart) -> dict[str
         "picture": part.picture,
         "terminated": part.terminated,
         "starts": [dict(start) for start in part.starts],
-        "largest_difference": TOLERANCE,
     }
 
 

@@ -164,7 +164,7 @@ def test_nothing_is_wider_than_the_window_and_everything_has_a_name(browser, add
     )
     assert browser.evaluate(unnamed) == 0
     assert browser.evaluate(SMALL) == []
-    assert browser.evaluate("document.getElementById('pause').textContent") == "Go on"  # it waits to be started
+    assert browser.evaluate("document.getElementById('pause').textContent") == "Resume"  # it waits to be started
     assert seconds(browser) == 0
 
 

@@ -133,7 +133,9 @@ def test_an_archive_with_another_hash_is_refused():
 SCRIPT = """
 import assert from "node:assert/strict";
 const { approach, entriesOf, defaultsOf, thetaOf, controlsOf, ...links } = await import(REQUEST);
-const { fragmentOf, fromFragment, isOutside } = links;
+const { fixed, fragmentOf, fromFragment, isOutside } = links;
+const shown = [[-0.004, 2], [-0.4, 0], [0, 2], [-0.006, 2], ["1.25", 1]].map((given) => fixed(...given));
+assert.deepEqual(shown, ["0.00", "0", "0.00", "-0.01", "1.3"]);
 const { Readout } = await import(READOUT);
 const manifest = {
   style_space: { parameters: [
@@ -151,7 +153,7 @@ assert.deepEqual(fromFragment(entries, fragmentOf(entries, request), defaultsOf(
 const foreign = fromFragment(entries, "#pose=<b>&step_length=1e9&course=NaN&x=1", request);
 assert.deepEqual(foreign, { pose: "down", step_length: entries[1].to, course: 0 });
 assert.ok(isOutside(entries[1], 0.66) && !isOutside(entries[1], 0.65) && !isOutside(entries[2], 180));
-const readout = new Readout([{ name: "held" }, { name: "length", at_marks: true }]);
+const readout = new Readout([{ name: "held" }, { name: "length", at_marks: true }], 3);
 assert.equal(readout.mean("held"), null);
 [[0, 0, NaN], [2, 1, 0.4], [4, 1, 0.6]].forEach(([time, ...values]) => readout.add(time, values));
 assert.equal(readout.mean("held"), 1); // the first row has left the window
@@ -163,7 +165,7 @@ assert.equal(approach(course, 80, 90, 0.5), 90);
 assert.equal(approach(course, 170, -150, 0.5), -170); // the shorter way
 assert.equal(approach(course, -170, 150, 0.25), 180 - 360);
 assert.equal(approach({ ...course, rate: null }, 0, 90, 0.01), 90);
-const towards = new Readout([{ name: "heading", circular: true }]);
+const towards = new Readout([{ name: "heading", circular: true }], 3);
 [170, -170].forEach((value) => towards.add(0, [value]));
 assert.equal(Math.abs(Math.round(towards.mean("heading"))), 180);
 readout.clear();
@@ -244,7 +246,7 @@ def test_requests_links_and_readouts():
     run_in_node(SCRIPT, "request", "readout")
 
 
-def test_browsers_that_draw_by_software_are_known():
+def test_browsers_that_draw_by_software_are_known(tmp_path):
     script = """
     import assert from "node:assert";
     const { drawnBySoftware } = await import(VIEW);
@@ -259,16 +261,19 @@ def test_browsers_that_draw_by_software_are_known():
     assert.equal(drawnBySoftware(named("ANGLE (Intel, Mesa Intel(R) UHD Graphics 620, OpenGL 4.6)")), false);
     assert.equal(drawnBySoftware(named("WebKit WebGL", true)), false);
     """
-    run_in_node(script, "view")
+    (tmp_path / "third_party/three/build").mkdir(parents=True)
+    (tmp_path / "third_party/three/build/three.module.min.js").touch()
+    shutil.copyfile(STATIC / "view.js", tmp_path / "view.js")
+    run_in_node(script, "view", folder=tmp_path)
 
 
-def run_in_node(script, *modules):
-    """Run a script in which the upper-case names of modules stand for their addresses."""
+def run_in_node(script, *modules, folder=STATIC):
+    """Run a script in which the upper-case names of modules stand for their addresses in a folder."""
     node = shutil.which("node")
     if node is None:
         pytest.skip("node is not installed")
     for name in modules:
-        script = script.replace(f"({name.upper()})", f"({json.dumps((STATIC / f'{name}.js').as_uri())})")
+        script = script.replace(f"({name.upper()})", f"({json.dumps((folder / f'{name}.js').as_uri())})")
     done = subprocess.run(
         [node, "--input-type=module", "--no-warnings"], input=script, capture_output=True, text=True, timeout=60
     )

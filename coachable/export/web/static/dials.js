@@ -1,6 +1,7 @@
 // Gauges and the small map beside a scene.
 
 import { at, make, shape } from "./dom.js";
+import { fixed } from "./request.js";
 
 /** Show gauges: a name, a text, the share of a bar or null, and its colour each. */
 export function showGauges(gauges) {
@@ -22,7 +23,7 @@ export function showGauges(gauges) {
 /** Make a gauge from numbers by name, as `coachable.scene.gauge_form.GaugeForm` does. */
 export function gaugeOf({ name, text, shown, full, colour, alert, alert_text, alert_colour }, values) {
   const unusual = alert !== "" && values[alert] > 0.5;
-  const words = text.replace(/\{(\w+):\.(\d+)f\}/g, (_, key, digits) => values[key].toFixed(digits).replace(/^-(0(\.0*)?)$/, "$1"));
+  const words = text.replace(/\{(\w+):\.(\d+)f\}/g, (_, key, digits) => fixed(values[key], digits));
   return [name, words + (unusual ? alert_text : ""), values[shown] / full, unusual ? alert_colour : colour];
 }
 

@@ -25,7 +25,7 @@ export class Page {
   /** Say that there is no picture, as long as the page is open. */
   cannotDraw(error) {
     console.error(error);
-    this.standing = "This browser cannot draw in 3-D: the numbers go on.";
+    this.standing = "This browser cannot draw in 3-D; the measurements continue.";
     this.tell("");
   }
 
@@ -75,6 +75,13 @@ export class Page {
   }
 }
 
+/** Return the answer to a request of a file of the page. */
+export async function fetched(name) {
+  const answer = await fetch(name);
+  if (!answer.ok) throw new Error(`${name}: ${answer.status} ${answer.statusText}`);
+  return answer;
+}
+
 /**
  * Begin to load files, with a bar that shows how far it is.
  *
@@ -86,8 +93,7 @@ export function download(names, sizes) {
   const total = sizes.filter(({ file }) => names.includes(file)).reduce((sum, { bytes }) => sum + bytes, 0);
   let loaded = 0;
   const read = async (name) => {
-    const answer = await fetch(name);
-    if (!answer.ok) throw new Error(`${name}: ${answer.status} ${answer.statusText}`);
+    const answer = await fetched(name);
     const chunks = [];
     for (const reader = answer.body.getReader(); ; ) {
       const { done, value } = await reader.read();

@@ -1,7 +1,7 @@
 // The coach's panel: requests as controls made from the declaration, and beside each what is measured.
 
 import { listening, make, shape } from "./dom.js";
-import { askedOf, isOutside, textOf, withUnit, words } from "./request.js";
+import { askedOf, fixed, isOutside, textOf, withUnit, words } from "./request.js";
 
 export class Panel {
   /**
@@ -165,7 +165,7 @@ function drawSteps(svg, values, asked, top) {
     const x = i * column;
     return [
       shape("rect", { x: x + 5, y: height - foot - size, width: column - 10, height: size, rx: 3, opacity: 0.45 + 0.55 * ((i + 1) / values.length) }),
-      shape("text", { x: x + column / 2, y: height - 3 }, value.toFixed(2)),
+      shape("text", { x: x + column / 2, y: height - 3 }, fixed(value, 2)),
     ];
   });
   const y = height - foot - asked * scale;
@@ -180,5 +180,5 @@ function placeOf({ from, to }, value) {
 
 function textOfMeasure({ share, unit, circular, digits }, value) {
   if (circular) return withUnit(String(Math.round(value) || 0), unit);
-  return share ? `${Math.round(100 * value)} % of the time` : withUnit(value.toFixed(digits), unit);
+  return share ? `${Math.round(100 * value)} % of the time` : withUnit(fixed(value, digits), unit);
 }

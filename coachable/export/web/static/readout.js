@@ -7,7 +7,7 @@ export class Readout {
    * @param {object[]} measures  The manifest's measures.
    * @param {number} seconds  Time over which shares and means are taken [s].
    */
-  constructor(measures, seconds = 3) {
+  constructor(measures, seconds) {
     this.measures = measures;
     this.seconds = seconds;
     this.clear();

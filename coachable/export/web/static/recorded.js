@@ -2,7 +2,7 @@
 
 import { drawMap, moveDots, showGauges } from "./dials.js";
 import { at } from "./dom.js";
-import { Page, download } from "./page.js";
+import { Page, download, fetched } from "./page.js";
 import { RecordedPanel } from "./recorded_panel.js";
 import { decode, fragmentOf, fromFragment, nearest } from "./recording.js";
 
@@ -157,7 +157,7 @@ class RecordedPage extends Page {
   #read(number) {
     if (!this.loaded.has(number)) {
       const { file } = this.manifest.recordings[number];
-      const recording = fetchBytes(file).then(decode);
+      const recording = fetched(file).then(async (answer) => decode(new Uint8Array(await answer.arrayBuffer())));
       this.loaded.set(number, recording);
       recording.catch(() => this.loaded.delete(number)); // so that it can be tried again
     }
@@ -168,12 +168,6 @@ class RecordedPage extends Page {
   async #prefetch() {
     for (const number of this.manifest.recordings.keys()) await this.#read(number).catch(() => {});
   }
-}
-
-async function fetchBytes(name) {
-  const answer = await fetch(name);
-  if (!answer.ok) throw new Error(`${name}: ${answer.status} ${answer.statusText}`);
-  return new Uint8Array(await answer.arrayBuffer());
 }
 
 /** Start the page of a manifest. */

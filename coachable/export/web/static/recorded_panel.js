@@ -2,7 +2,7 @@
 
 import { listening, make, shape } from "./dom.js";
 import { along, varied } from "./recording.js";
-import { withUnit, words } from "./request.js";
+import { fixed, withUnit, words } from "./request.js";
 
 const SLIDERS = 2; // beyond this number of parameters, whole styles are chosen
 
@@ -175,7 +175,7 @@ function textOfMeasure(measure, value) {
 
 function shortOf({ share, significant, digits }, value) {
   if (share) return `${(100 * value).toFixed(digits === 3 ? 0 : digits)} %`;
-  return significant ? plain(Number(value.toPrecision(digits))) : value.toFixed(digits).replace(/^-(0(\.0*)?)$/, "$1");
+  return significant ? plain(Number(value.toPrecision(digits))) : fixed(value, digits);
 }
 
 /** A number without needless digits, which do not come from the request. */

@@ -3,7 +3,7 @@
 import * as THREE from "./third_party/three/build/three.module.min.js";
 
 import { make } from "./dom.js";
-import { aim, fitting, orbit } from "./view.js";
+import { aim, drawing, fitting, followTheme, orbit } from "./view.js";
 
 const COLOURS = {
   light: { sky: "#dde7f0", sun: 2.4, fill: 1.7 },
@@ -18,7 +18,6 @@ const GEOMETRIES = {
 };
 const GLOW = 0.45; // opacity of translucent primitives
 const TURN = 32767; // a quaternion's 1
-const DEGREE = Math.PI / 180;
 const SLOWLY = 4; // [1/s], how fast the camera follows a heading
 
 export class RecordedScene {
@@ -32,16 +31,11 @@ export class RecordedScene {
     this.canvas = canvas;
     this.labels = labels;
     this.viewpoint = viewpoint;
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true });
-    this.renderer.shadowMap.enabled = true;
-    this.renderer.shadowMap.type = THREE.PCFSoftShadowMap;
+    Object.assign(this, drawing(canvas, viewpoint, 0.4, 1.5 * viewpoint.far));
     this.scene = new THREE.Scene();
     this.scene.background = new THREE.Color();
     this.scene.fog = new THREE.Fog(0, 0.35 * viewpoint.far, viewpoint.far);
-    this.camera = new THREE.PerspectiveCamera(45, 1, 0.4, 1.5 * viewpoint.far);
-    this.camera.up.set(0, 0, 1);
-    const { azimuth, elevation, distance } = viewpoint;
-    this.view = { azimuth: azimuth * DEGREE, elevation: elevation * DEGREE, distance };
+    const { distance } = viewpoint;
     this.sun = new THREE.DirectionalLight("#fff4e2");
     this.sun.castShadow = true;
     this.sun.shadow.mapSize.set(1024, 1024);
@@ -56,9 +50,7 @@ export class RecordedScene {
     this.glows = new Swarm(this.scene, false, GLOW);
     this.still = new THREE.Group();
     this.scene.add(this.still);
-    this.dark = matchMedia("(prefers-color-scheme: dark)");
-    this.dark.addEventListener("change", () => this.#paint());
-    this.#paint();
+    followTheme((theme) => this.#paint(COLOURS[theme]));
     this.fit = fitting(this.renderer, this.camera, canvas, () => this.sparing);
     orbit(canvas, this.view, { near: distance / 3, far: 4 * distance });
   }
@@ -215,8 +207,7 @@ export class RecordedScene {
     });
   }
 
-  #paint() {
-    const { sky, sun, fill } = COLOURS[this.dark.matches ? "dark" : "light"];
+  #paint({ sky, sun, fill }) {
     this.scene.background.set(sky);
     this.scene.fog.color.set(sky);
     this.sun.intensity = sun;

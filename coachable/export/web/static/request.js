@@ -86,6 +86,11 @@ export function askedOf(entry, value) {
   return entry.kind === "weight" ? `weight ${textOf(entry, value)}` : textOf(entry, value);
 }
 
+/** A number with some digits after the point, and zero without a sign. */
+export function fixed(value, digits) {
+  return Number(value).toFixed(digits).replace(/^-(0(\.0*)?)$/, "$1");
+}
+
 /** A number with its unit. */
 export function withUnit(number, unit) {
   return unit === "deg" ? `${number}°` : unit ? `${number} ${unit}` : number;
@@ -99,5 +104,5 @@ export function words(name) {
 
 function plain({ step }, value) {
   const digits = Math.max(0, -Math.floor(Math.log10(step)));
-  return String(Number(value).toFixed(digits)).replace(/^-0(\.0*)?$/, (zero) => zero.slice(1));
+  return fixed(value, digits);
 }

@@ -2,7 +2,7 @@
 
 import * as THREE from "./third_party/three/build/three.module.min.js";
 
-import { aim, drawnBySoftware, fitting, orbit } from "./view.js";
+import { aim, drawnBySoftware, drawing, fitting, followTheme, orbit } from "./view.js";
 
 // Light and sky; everything else has the colours of the manifest.
 const LIGHTS = {
@@ -31,15 +31,9 @@ export class Scene {
     this.data = data;
     this.looks = looks;
     this.body = model.body(followed).id;
-    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true });
-    this.renderer.shadowMap.enabled = true;
-    this.renderer.shadowMap.type = THREE.PCFSoftShadowMap;
+    Object.assign(this, drawing(canvas, looks.viewpoint, 0.1, 60));
     this.scene = new THREE.Scene();
     this.scene.fog = new THREE.Fog(0, 9, looks.viewpoint.far);
-    this.camera = new THREE.PerspectiveCamera(45, 1, 0.1, 60);
-    this.camera.up.set(0, 0, 1);
-    const { azimuth, elevation, distance, height } = looks.viewpoint;
-    this.view = { azimuth: azimuth * DEGREE, elevation: elevation * DEGREE, distance };
     this.sun = new THREE.DirectionalLight("#fff4e2", 2);
     this.sun.castShadow = !drawnBySoftware(this.renderer); // whose shaders for shadows take long to compile
     this.sun.shadow.mapSize.set(1024, 1024);
@@ -55,12 +49,10 @@ export class Scene {
     this.line.visible = false;
     this.arrow = arrowOf(looks.course);
     this.scene.add(this.sun, this.sun.target, this.fill, this.ground, this.marks, this.line, this.arrow, ...this.parts.map(({ mesh }) => mesh));
-    this.target = new THREE.Vector3(0, 0, height);
+    this.target = new THREE.Vector3(0, 0, looks.viewpoint.height);
     this.asked = { length: null, course: 0 };
     this.drawn = 0; // [ms] when the picture was drawn last
-    this.dark = matchMedia("(prefers-color-scheme: dark)");
-    this.dark.addEventListener("change", () => this.#paint());
-    this.#paint();
+    followTheme((theme) => this.#paint(LIGHTS[theme]));
     this.fit = fitting(this.renderer, this.camera, canvas, () => this.sparing);
     orbit(canvas, this.view, DISTANCE);
     this.restart();
@@ -154,9 +146,9 @@ export class Scene {
     this.arrow.position.set(this.target.x, this.target.y, 0.012);
   }
 
-  #paint() {
-    this.colours = LIGHTS[this.dark.matches ? "dark" : "light"];
-    const { sky, sun, fill } = this.colours;
+  #paint(colours) {
+    this.colours = colours;
+    const { sky, sun, fill } = colours;
     this.scene.background = new THREE.Color(sky);
     this.scene.fog.color.set(sky);
     this.sun.intensity = sun;
@@ -164,7 +156,6 @@ export class Scene {
   }
 }
 
-const DEGREE = Math.PI / 180;
 const [up, along] = [new THREE.Vector3(0, 0, 1), new THREE.Vector3()];
 
 const matrix = new THREE.Matrix4();

@@ -24,7 +24,7 @@ export async function runtimeOf(bytes) {
 }
 
 export class SimulatedPage extends Page {
-  resting = "Go on";
+  resting = "Resume";
   behind = 0.25; // [s] that a frame catches up at most; beyond this the agent acts slower than real time
 
   async load() {
@@ -118,7 +118,7 @@ export class SimulatedPage extends Page {
   push() {
     if (this.paused) this.pause(false);
     this.simulator.push(2 * Math.PI * Math.random());
-    this.tell(`pushed with ${this.manifest.push.force} N`, 1000);
+    this.tell(`Pushed with ${this.manifest.push.force} N`, 1000);
   }
 
   /** Time since the episode began [s]. */

@@ -1,9 +1,38 @@
 // What the scenes of all pages share: a camera that the visitor turns, and a picture as large as its place.
 
+import * as THREE from "./third_party/three/build/three.module.min.js";
+
 const LOWEST = 0.03; // [rad], elevation
 const HIGHEST = 1.4;
+const DEGREE = Math.PI / 180;
 const TURN = 0.12; // [rad], per press of an arrow key
 const NEARER = 0.87; // per press of a key
+
+/**
+ * Make a renderer with shadows, a camera, and the view that the visitor changes.
+ *
+ * @param {HTMLCanvasElement} canvas  What to draw on.
+ * @param {{azimuth: number, elevation: number, distance: number}} viewpoint  Angles [deg] and distance [m] at first.
+ * @param {number} near  Distance from which on the camera sees something [m].
+ * @param {number} far  Distance up to which it does [m].
+ * @throws If the browser has no WebGL.
+ */
+export function drawing(canvas, { azimuth, elevation, distance }, near, far) {
+  const renderer = new THREE.WebGLRenderer({ canvas, antialias: true });
+  renderer.shadowMap.enabled = true;
+  renderer.shadowMap.type = THREE.PCFSoftShadowMap;
+  const camera = new THREE.PerspectiveCamera(45, 1, near, far);
+  camera.up.set(0, 0, 1);
+  return { renderer, camera, view: { azimuth: azimuth * DEGREE, elevation: elevation * DEGREE, distance } };
+}
+
+/** Call a function with "dark" or "light" now, and again whenever the visitor changes the browser's theme. */
+export function followTheme(paint) {
+  const dark = matchMedia("(prefers-color-scheme: dark)");
+  const show = () => paint(dark.matches ? "dark" : "light");
+  dark.addEventListener("change", show);
+  show();
+}
 
 /**
  * Turn a view by dragging or with the arrow keys, and come nearer with the wheel, two fingers, plus and minus.
