@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from coachable import __version__
+from coachable.code_version import RECIPES
 from coachable.gl import RenderingError, choose_gl_backend
 from coachable.shipped import SOURCE_HELP, require_agent
 
@@ -139,7 +140,7 @@ def _parser() -> argparse.ArgumentParser:
     export.add_argument("--out", type=Path, help="(default: the file policy.onnx, or the folder site)")
     text = "of a page: folder with the files of other projects, like node_modules (default: npm fetches them)"
     export.add_argument("--assets", type=Path, metavar="FOLDER", help=text)
-    export.epilog = f"{ENV_OPTIONS} They are for pages."
+    export.epilog = f"{ENV_OPTIONS} They apply to pages only."
 
     verify = command("verify", _verify, "check an exported model, and an environment, against the model's contract")
     verify.add_argument("file", type=Path, help="a file of coachable export")
@@ -170,9 +171,8 @@ def _add_rollout(parser: argparse.ArgumentParser) -> None:
 
 def _recipes() -> dict[str, Path]:
     """Return the recipes by name, from the installed package or from the folder beside it in a clone."""
-    here = Path(__file__).resolve().parent
-    folder = here / "recipes" if (here / "recipes").is_dir() else here.parent / "recipes"
-    return {file.stem: folder / f"{file.stem}.py" for file in (folder / "configs").glob("*_*.yaml")}
+    names = (file.stem for file in Path(RECIPES, "configs").glob("*_*.yaml"))
+    return {name: Path(RECIPES, f"{name}.py") for name in names}
 
 
 def _train(options: argparse.Namespace) -> int:

@@ -12,9 +12,9 @@ __all__ = ["repeated"]
 def repeated(before: Any, body: Any, after: Any, times: int) -> Any:
     """Return the model that computes `before` once, then `body` several times, then `after`.
 
-    Values are connected by their names. The first input of `body` is the value that its only output replaces from time
-    to time; the last one is available to `after` under the name of the output. What else `body` and `after` read are
-    outputs of `before`; `before` and `after` may also read inputs of the model.
+    Values are connected by their names. The output of `body` replaces its first input after each repetition; `after`
+    reads the last value under the output's name. What else `body` and `after` read are outputs of `before`; `before`
+    and `after` may also read inputs of the model.
 
     Args:
         before: Model, as from `coachable.export.graph.graph_of`.

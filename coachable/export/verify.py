@@ -56,7 +56,7 @@ def verify(file: str | Path, domain: Domain | str | None = None) -> Verdict:
         raise CheckpointError(f"{file} has no recording: export the agent where its domain is installed")
     checked, problems = [], _replay(contract, recorded, policy)
     if not problems:
-        checked.append(f"onnxruntime repeats the {len(recorded.action)} recorded actions within {TOLERANCE:g}")
+        checked.append(f"onnxruntime reproduces the {len(recorded.action)} recorded actions within {TOLERANCE:g}")
     if domain is None and contract.domain not in domain_names():
         checked.append(f"the environment was not compared: no installed package has the domain {contract.domain!r}")
         return Verdict(tuple(checked), tuple(problems))
@@ -64,7 +64,7 @@ def verify(file: str | Path, domain: Domain | str | None = None) -> Verdict:
     found = _declarations(contract, declared) or _environment(contract, recorded, declared)
     if not found:
         runs = 2 + len(recorded.probe)
-        checked.append(f"the environment of {declared.name} repeats the observations of {runs} recorded runs")
+        checked.append(f"the environment of {declared.name} reproduces the observations of {runs} recorded runs")
     return Verdict(tuple(checked), (*problems, *found))
 
 

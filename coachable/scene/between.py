@@ -10,7 +10,7 @@ import numpy as np
 from coachable.scene.frame import Frame
 from coachable.scene.parts import SHAPES, Batch, Parts
 
-_JUMP = 20.0  # [m], farther apart, the agent was put somewhere else
+_JUMP = 20.0  # [m]; an agent that moved farther than this was put somewhere else
 
 
 def alike(before: Frame, after: Frame) -> bool:

@@ -25,7 +25,7 @@ INK: Colour = (34, 37, 43)
 
 AIR: Colour = (214, 224, 234)
 HAZE: Colour = (195, 202, 210)
-"""Sky above, and at the horizon, where what is far fades."""
+"""Colours of the sky above, and of the horizon, into which distant objects fade."""
 NIGHT_AIR: Colour = (16, 22, 31)
 NIGHT_HAZE: Colour = (30, 38, 48)
 """The same where the page is dark."""

@@ -81,7 +81,8 @@ class SceneRenderer:
             env: The environment.
             row: Row of the environment.
             asked: The style in force, if known.
-            shares: Shares of the way, from 0 to 1. States that do not continue each other have the present one instead.
+            shares: Shares of the way, from 0 to 1. If the two states are not continuous, every picture shows the
+                present one.
 
         Returns:
             An image (height, width, 3) uint8 for each share.

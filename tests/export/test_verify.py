@@ -122,8 +122,8 @@ def test_the_environment_of_the_export_agrees(pendulum_file, humanoid_file):
     for file, domain in ((pendulum_file, pendulum_domain()), (humanoid_file, None)):
         verdict = verify(file, domain)
         assert verdict.problems == ()
-        assert "repeats the 200 recorded actions" in verdict.checked[0]
-        assert "repeats the observations of" in verdict.checked[1]
+        assert "reproduces the 200 recorded actions" in verdict.checked[0]
+        assert "reproduces the observations of" in verdict.checked[1]
 
 
 @pytest.mark.parametrize("mistake", PENDULUM_MISTAKES)

@@ -10,7 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, redirect_stdout, suppress
 from typing import Any
 
-ENV_OPTIONS = "Further options, after the source, are those of its domain; of an unknown one the error lists them."
+ENV_OPTIONS = (
+    "Further options after the source belong to the agent's domain; the error for an unknown one lists the valid ones."
+)
 
 
 def add_parser(commands: Any, source_help: str, run: Callable[[argparse.Namespace], int]) -> None:
@@ -34,7 +36,7 @@ def add_parser(commands: Any, source_help: str, run: Callable[[argparse.Namespac
 
 
 def read_env_options(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> dict[str, str]:
-    """Return options of a domain's environment by name, of which the domain knows whether there are such.
+    """Return options of a domain's environment by name; the domain checks later whether they exist.
 
     Args:
         parser: Parser that does not know them; it ends the program if they are not pairs of a name and a value.

@@ -83,7 +83,7 @@ class Influences:
         """Push the agent in the base environment, if the domain has a push.
 
         Args:
-            env: Environment of the session, with its transforms.
+            env: The base environment, without transforms.
             strength: Strength forward and to the left, in the push's unit.
         """
         if self.push is not None:
