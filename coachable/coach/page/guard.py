@@ -27,7 +27,9 @@ from websockets.http11 import Request, Response
 
 from coachable.coach.page.api import PATH, PROTOCOL, CoachApi
 from coachable.coach.page.looks import dressed, pad_page
-from coachable.coach.page.server import EVERYWHERE
+
+EVERYWHERE = ("", "*", "0.0.0.0", "::")
+"""Hosts that stand for all addresses of this machine."""
 
 _THIS_MACHINE = ("localhost", "127.0.0.1", "::1")
 _HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([^\[\]:@/\s]+))(?::\d{1,5})?", re.IGNORECASE)

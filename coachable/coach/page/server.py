@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from coachable.coach.page.api import CoachApi
     from coachable.coach.page.guard import Guard
 
-EVERYWHERE = ("", "*", "0.0.0.0", "::")
-"""Hosts that stand for all addresses of this machine."""
-
 _PORTS = 65535
 _GUARDS: WeakKeyDictionary[viser.ViserServer, Guard] = WeakKeyDictionary()
 _TRIED = 100  # ports, before giving up
@@ -112,5 +109,7 @@ def page_address(host: str, port: int) -> str:
         host: Host that the server listens on.
         port: Its port.
     """
+    from coachable.coach.page.guard import EVERYWHERE
+
     name = "localhost" if host in EVERYWHERE else f"[{host}]" if ":" in host else host
     return f"http://{name}:{port}"

@@ -39,7 +39,7 @@ def test_the_caption_has_only_what_fits(session):
     session.step()
     asked, measured = _lines(session)
     assert asked == "requested: target 0.8 m (clamped from 2), mood calm"
-    assert measured == "measured: target 0.8 m, pace 0.8 m/step"
+    assert measured == "measured: target 0.8 m"
 
 
 def test_what_cannot_be_filmed(session, tmp_path):
