@@ -210,7 +210,7 @@ def test_messages_that_no_browser_sends_change_nothing(page):
         send(connection, **CAMERA | {"fov": float("nan")})
         send(connection, type="GuiUpdateMessage", uuid=slider._impl.uuid, updates={"value": "much"})
         send(connection, type="GuiUpdateMessage", uuid=dropdown._impl.uuid, updates={"value": "angry"})
-        wait_for(lambda: "no option" in page.loop.problem)
+        wait_for(lambda: "is not an option" in page.loop.problem)
         wait_for(lambda: dropdown.value == "calm")
     assert page.server.scene is not None and not slider._impl.removed
     assert slider.value == page.session.style["target"]
