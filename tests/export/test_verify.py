@@ -284,7 +284,7 @@ def test_another_graph_is_noticed(pendulum_file, tmp_path):
 
 def test_the_command(humanoid_file, pendulum_file, capsys, monkeypatch):
     assert main(["verify", str(humanoid_file)]) == 0
-    assert "the environment of humanoid repeats" in capsys.readouterr().out
+    assert "the environment of humanoid reproduces" in capsys.readouterr().out
     assert main(["verify", str(pendulum_file)]) == 0
     assert "no installed package has the domain 'pendulums'" in capsys.readouterr().out
     assert main(["verify", str(pendulum_file), "--domain", "humanoid"]) == 1
