@@ -175,7 +175,7 @@ def test_bad_requests_change_nothing(env):
     env.set_style({"stride": 0.5})
     for request, message in [
         ({"pace": 1.0}, "unknown style parameter 'pace'"),
-        ({"hat": "green"}, "no option"),
+        ({"hat": "green"}, "is not an option"),
         ([0.5, 1.0], r"expected \(3,\)"),
         ([float("nan"), 1, 0], "NaN"),
     ]:
