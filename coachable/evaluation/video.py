@@ -195,8 +195,9 @@ def _film(
                 recent = [*recent, domain.measures.step(transition)][-window:]
                 last = [1.0] if step == period else []
                 shares = last if fps is None else _shares(next(steps), domain.control_step * fps)
-                found = _summary(domain, recent) if shares else {}
-                measured = measured_line(domain, space, style, found, failures, short)
+                measured = ""
+                if shares:
+                    measured = measured_line(domain, space, style, _summary(domain, recent), failures, short)
                 if isinstance(renderer, SceneRenderer):
                     pictures = renderer.draw_way(env, 0, style, shares)
                 else:

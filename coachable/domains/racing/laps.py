@@ -132,10 +132,8 @@ def circuits_report(rows: Sequence[Mapping[str, Any]]) -> str:
     text += "\nTrained: whether the agent was trained on the circuit. Fuel: at the start; only the family `resources` "
     text += "uses fuel up, and its bound is on half a tank. Laps: completed ones; clean if three wheels were never off "
     text += "the track at once. Mean lap: after the first one; over: above the quasi-steady state of a point mass. "
-    text += (
-        "Off: share of the time off the track. Retired: share of the cars that stopped, drove backwards or left the "
-    )
-    return text + "track for good.\n"
+    text += "Off: share of the time off the track. Retired: share of the cars that stopped, drove backwards or left "
+    return text + "the track for good.\n"
 
 
 def circuits_summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
