@@ -155,7 +155,7 @@ def _frame(
     name = names[int(request[fight])]
     wish = {name: float(agent.space[name].high)}
     hits = [f"{source} {hp:.0f} HP" for source, hp in zip(SOURCES, damage[fight].tolist(), strict=True) if hp > 0]
-    asked = asked_line(agent.space, wish, agent.space.make(strict=True, **wish))
+    asked = asked_line(agent.space, wish, agent.space.describe(agent.space.make(strict=True, **wish)))
     return caption(renderer.draw(env, fight), (asked, f"hits: {', '.join(hits) or 'none'}".replace("_", " ")))
 
 

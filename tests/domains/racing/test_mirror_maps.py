@@ -109,8 +109,9 @@ def test_a_mirrored_race_stays_the_mirror_image(family, cars, make_env):
         varied |= (seen != 0).any(0)
         apart = (image(mirror, seen) - mirrored).abs().amax(0)
         assert (apart < 1e-5).all(), (step, [(names[i], float(apart[i])) for i in (apart >= 1e-5).nonzero()[:, 0]])
-        for key in ("style_features", "task_reward"):
-            torch.testing.assert_close(*halves(after[key]), atol=1e-5, rtol=1e-5)
+        # A spin amplifies rounding, most of all in the wear of its tyres, which is of order 1 kJ a step.
+        torch.testing.assert_close(*halves(after["style_features"]), atol=1e-3, rtol=1e-5)
+        torch.testing.assert_close(*halves(after["task_reward"]), atol=1e-5, rtol=1e-5)
         here, there = halves(after["telemetry"])
         torch.testing.assert_close(here * sign, there, atol=1e-5, rtol=1e-5)
         features = [value.float() for value in halves(after["style_features"])]
