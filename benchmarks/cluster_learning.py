@@ -1,13 +1,13 @@
 """What an agent learns with workers on Ray, and with weights of a certain age, beside the training in one process.
 
     python benchmarks/cluster_learning.py                                  combat, preset small, seeds 0 to 2: hours
-    python benchmarks/cluster_learning.py --env humanoid --only local workers            its preset cpu
+    python benchmarks/cluster_learning.py --env humanoid --only local workers            first stage of cpu
     python benchmarks/cluster_learning.py --frames 20_000 --seeds 0 --only local workers      to try it out
 
 All trainings have the same env-steps and the same updates per env-step. `workers` are 8 on Ray with 16 environments
 each; `every_10`, `every_100` and `every_1000` are the same with that many updates between two offers of weights. A
 training that was interrupted is continued by the same command, one that has ended is not repeated. The table is
-printed, and learning curves with their range over the seeds are drawn in `--out`.
+printed, and learning curves with intervals over the seeds are drawn in `--out`.
 """
 
 import argparse
@@ -16,19 +16,13 @@ import statistics
 import sys
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-import numpy as np
-from matplotlib import pyplot as plt
-
-from coachable.evaluation.curves import read_metric
+from coachable.evaluation.curves import draw_learning_curves, read_metric
 from coachable.evaluation.many_seeds import train_seeds
 
 RECIPES = Path(__file__).resolve().parent.parent / "recipes"
-ENVIRONMENTS = {  # recipe, preset, and what is measured of the style
-    "combat": ("combat_cat_rac.py", "small", "eval/style_score"),
-    "humanoid": ("humanoid_sac.py", "cpu", "eval/step_length_error"),
+ENVIRONMENTS = {  # recipe, its settings, and what is measured of the style
+    "combat": ("combat_cat_rac.py", ["preset=small"], "eval/style_score"),
+    "humanoid": ("humanoid_sac.py", ["preset=cpu", "stage=walk"], "eval/step_length_error"),
 }
 WORKERS = ["collector=ray", "collector.num_collectors=8", "collector.group_size=8", "env.num_envs=16"]
 WORKERS += ["collector.cpus_per_worker=0.1"]
@@ -59,10 +53,10 @@ def main() -> None:
     parser.add_argument("--frames", type=int, help="env-steps of each training; those of the preset")
     parser.add_argument("--out", type=Path, default=Path("runs/cluster_learning"))
     options = parser.parse_args()
-    recipe, preset, style = ENVIRONMENTS[options.env]
+    recipe, settings, style = ENVIRONMENTS[options.env]
     options.out /= options.env
     common = [
-        f"preset={preset}",
+        *settings,
         "wandb.mode=off",
         "threads.learner=1",
         "threads.simulator=1",
@@ -71,6 +65,7 @@ def main() -> None:
     if options.frames:
         common += [f"train.total_frames={options.frames}", f"train.eval_interval={max(1, options.frames // 4)}"]
         common += [f"train.warmup_frames={options.frames // 10}"]
+    curves: dict[str, list[Path]] = {}
     print("| " + " | ".join(HEADINGS) + " |\n|" + "-|" * len(HEADINGS))
     for name in options.only:
         folder = options.out / name
@@ -78,7 +73,8 @@ def main() -> None:
             sys.exit(f"{name}: {failed}")
         runs = [folder / f"seed_{seed}" for seed in options.seeds]
         print("| " + " | ".join([name, f"{len(runs)}", *cells(runs, VARIANTS[name], style)]) + " |", flush=True)
-        draw([name for name in options.only if (options.out / name).exists()], options)
+        curves[name] = runs
+        draw_learning_curves(curves, options.out / "learning.png", x="frames", y="eval/return", smooth=1)
 
 
 def cells(runs: list[Path], arguments: list[str], style: str) -> list[str]:
@@ -96,20 +92,6 @@ def cells(runs: list[Path], arguments: list[str], style: str) -> list[str]:
 
 def spread(values: list[float]) -> float:
     return statistics.stdev(values) if len(values) > 1 else math.nan
-
-
-def draw(names: list[str], options: argparse.Namespace) -> None:
-    figure, axes = plt.subplots(figsize=(7, 4), layout="constrained")
-    for name in names:
-        curves = [read_metric(options.out / name / f"seed_{seed}", "frames", "eval/return") for seed in options.seeds]
-        points = min(len(at) for at, _ in curves)
-        frames, returns = curves[0][0][:points], np.array([values[:points] for _, values in curves])
-        (line,) = axes.plot(frames, returns.mean(0), marker="o", label=name)
-        axes.fill_between(frames, returns.min(0), returns.max(0), color=line.get_color(), alpha=0.15, linewidth=0)
-    axes.set(xlabel="env-steps", ylabel="return of an evaluation", ylim=(None, None))
-    axes.legend()
-    figure.savefig(options.out / "learning.png", dpi=120)
-    plt.close(figure)
 
 
 if __name__ == "__main__":
