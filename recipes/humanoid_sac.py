@@ -1,4 +1,4 @@
-"""Train the DMC humanoid to walk with a requested arm pose and step length (SAC).
+"""Train the DMC humanoid to walk with a requested arm pose and step length (SAC; on a CPU QR-SAC).
 
 python recipes/humanoid_sac.py                            on a CPU or a GPU
 python recipes/humanoid_sac.py preset=smoke               every part once, within a minute

@@ -1,6 +1,6 @@
 """Reach the one of eight small targets that the style names, which needs event tables and task impersonation.
 
-python recipes/rare_targets.py                            both on, a minute on one core
+python recipes/rare_targets.py                            both on, a minute or two on one core
 python recipes/rare_targets.py replay=uniform impersonation.n=0
 python recipes/rare_targets.py preset=smoke
 
