@@ -101,7 +101,7 @@ def _hardware() -> list[Check]:
 
     hardware = detect()
     threads = share_threads(hardware=hardware)
-    slow = "" if hardware.bf16 else "; without bf16 in hardware an update takes two to three times as long"
+    slow = "" if hardware.bf16 else "; without bf16 in hardware an update takes two to four times as long"
     checks = [
         Check("hardware", "ok" if hardware.bf16 else "note", hardware.describe() + slow),
         Check("preset", "ok", f"{choose_preset(hardware)} (what preset=auto chooses)"),
