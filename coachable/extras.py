@@ -1,6 +1,9 @@
 """Extras of an installation, and the commands that install them."""
 
-__all__ = ["EXTRAS", "how_to_install"]
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+__all__ = ["EXTRAS", "from_extra", "how_to_install"]
 
 # Distributions by extra.
 EXTRAS = {
@@ -26,3 +29,16 @@ def how_to_install(extra: str) -> str:
     if extra not in EXTRAS:
         raise ValueError(f"there is no extra {extra!r}: expected one of {list(EXTRAS)}")
     return f"pip install 'coachable[{extra}]' (in a clone: pip install -e '.[{extra}]')"
+
+
+@contextmanager
+def from_extra(extra: str) -> Iterator[None]:
+    """Say how to install an extra if an import in the block fails.
+
+    Raises:
+        ImportError: If a package is not installed; the message names it and the extra.
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise ImportError(f"{error.name} is missing: {how_to_install(extra)}") from error

@@ -14,11 +14,11 @@ from torchrl.envs.utils import exploration_type
 
 from coachable.contract.contract import Contract, ContractError
 from coachable.distributions.action_heads import ActionHeads
-from coachable.extras import how_to_install
+from coachable.extras import from_extra
 from coachable.files import CheckpointError
 from coachable.keys import STYLE
 
-__all__ = ["OnnxPolicy", "OnnxRun", "import_onnx", "parts_of", "read_model"]
+__all__ = ["OnnxPolicy", "OnnxRun", "parts_of", "read_model"]
 
 _LARGEST = 1 << 30  # [byte]
 _STANDARD = ("", "ai.onnx")  # domains of operators that every runtime has
@@ -135,7 +135,9 @@ def read_model(file: Path | str) -> tuple[Contract, OnnxRun]:
             message is one sentence that names the file.
         ImportError: If the extra `export` is not installed.
     """
-    onnx = import_onnx()
+    with from_extra("export"):
+        import onnx
+        import onnxruntime  # noqa: F401
     file = Path(file)
     if not file.is_file():
         raise CheckpointError(f"no such file: {file}")
@@ -153,20 +155,6 @@ def read_model(file: Path | str) -> tuple[Contract, OnnxRun]:
         return contract, OnnxRun(content, contract)
     except ContractError as error:
         raise CheckpointError(f"{file} cannot be used: {error}") from None
-
-
-def import_onnx() -> Any:
-    """Return `onnx`.
-
-    Raises:
-        ImportError: If `onnx` or `onnxruntime` is not installed; the message names the extra to install.
-    """
-    try:
-        import onnx
-        import onnxruntime  # noqa: F401
-    except ImportError as error:
-        raise ImportError(f"{error.name} is missing: {how_to_install('export')}") from error
-    return onnx
 
 
 def _check_graph(onnx: Any, model: Any) -> None:

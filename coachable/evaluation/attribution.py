@@ -12,12 +12,12 @@ from torch import Tensor
 from tqdm import tqdm
 
 from coachable.domain import Domain
-from coachable.extras import how_to_install
+from coachable.extras import from_extra
 from coachable.signals import Signal
 from coachable.styles import StyleSpace
 from coachable.training.rng import preserved_rng, seed_everything
 
-__all__ = ["METHODS", "Group", "Ranking", "import_captum", "input_groups", "rank_groups"]
+__all__ = ["METHODS", "Group", "Ranking", "input_groups", "rank_groups"]
 
 METHODS = ("SHAP", "saliency")
 _SHAP_DRAWS = 8  # baselines per state
@@ -118,7 +118,8 @@ def rank_groups(
     Returns:
         One ranking per method, in the order of `METHODS`.
     """
-    attr = import_captum()
+    with from_extra("explain"):
+        from captum import attr
     states = torch.cat(list(trajectories))
     with torch.no_grad():
         count = outputs(states[:1]).shape[-1]
@@ -148,16 +149,3 @@ def rank_groups(
 def _per_group(values: Tensor, groups: Sequence[Group], pool: Callable[..., Tensor]) -> np.ndarray:
     values = values.detach()
     return torch.stack([pool(values[:, group.columns], dim=-1) for group in groups], -1).double().numpy()
-
-
-def import_captum() -> Any:
-    """Return `captum.attr`.
-
-    Raises:
-        ImportError: If captum is not installed; the message names the extra to install.
-    """
-    try:
-        import captum.attr
-    except ImportError as error:
-        raise ImportError(f"{error.name} is missing: {how_to_install('explain')}") from error
-    return captum.attr

@@ -13,11 +13,12 @@ from torch import Tensor
 
 from coachable.contract.exported_model import OnnxPolicy
 from coachable.domain import Domain
-from coachable.evaluation.attribution import Ranking, import_captum, input_groups, rank_groups
+from coachable.evaluation.attribution import Ranking, input_groups, rank_groups
 from coachable.evaluation.episode_records import RolloutOptions, record_styles
 from coachable.evaluation.figures import drawing
 from coachable.evaluation.style_grid import markdown_table, write_csv
 from coachable.evaluation.wording import readable
+from coachable.extras import from_extra
 from coachable.networks.plain import ActionOutputs
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
@@ -47,7 +48,8 @@ def explain(
         ImportError: If the extra `explain` is not installed.
         ValueError: If the source is an exported model, or the domain's groups do not fit its observation.
     """
-    import_captum()
+    with from_extra("explain"):  # before the agent is loaded
+        import captum.attr  # noqa: F401
     agent = load_policy(source)
     if isinstance(agent.actor, OnnxPolicy):
         raise ValueError(

@@ -12,8 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from coachable.contract import exported_model
-from coachable.extras import how_to_install
+from coachable.contract.exported_model import parts_of
+from coachable.extras import from_extra
 
 __all__ = ["forget_sources", "graph_of", "import_onnx", "quietly"]
 
@@ -69,7 +69,7 @@ def forget_sources(model: Any) -> None:
     Args:
         model: The model, an `onnx.ModelProto`, without its contract.
     """
-    for part in list(exported_model.parts_of(model)):
+    for part in list(parts_of(model)):
         for name in {"doc_string", "metadata_props"}.intersection(part.DESCRIPTOR.fields_by_name):
             part.ClearField(name)
 
@@ -137,8 +137,8 @@ def import_onnx() -> Any:
     Raises:
         ImportError: If the extra `export` is not installed; the message says how to install it.
     """
-    try:
+    with from_extra("export"):
+        import onnx
+        import onnxruntime  # noqa: F401
         import onnxscript  # noqa: F401
-    except ImportError as error:
-        raise ImportError(f"{error.name} is missing: {how_to_install('export')}") from error
-    return exported_model.import_onnx()
+    return onnx
