@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
 from torchrl.data.tensor_specs import ContinuousBox
 
-from coachable.distributions.categorical import HeadLayout, hard_one_hots
+from coachable.distributions.categorical import HeadLayout, hard_one_hots, most_likely_one_hots
 
 
 @dataclass(frozen=True)
@@ -99,11 +99,7 @@ class ActionHeads:
         parts = [torch.nn.functional.one_hot(choice, size).float() for choice, size in heads]
         return torch.cat([*parts, axes] if axes is not None else parts, -1)
 
-    def spec(
-        self,
-        batch_shape: Sequence[int] = (),
-        device: torch.device | str | None = None,
-    ) -> TensorSpec:
+    def spec(self, batch_shape: Sequence[int] = (), device: torch.device | str | None = None) -> TensorSpec:
         """Return the action spec `(*batch_shape, action_dim)`: `Bounded` for axes only, else `MixedActionSpec`.
 
         Args:
@@ -180,9 +176,8 @@ class MixedActionSpec(TensorSpec):
 
     def _project(self, val: Tensor) -> Tensor:
         one_hots, axes = self.heads.split(val)
-        padded = self.heads.layout.pad(one_hots - one_hots.amin(-1, keepdim=True) + 1.0)
-        chosen = torch.zeros_like(padded).scatter_(-1, padded.argmax(-1, keepdim=True), 1.0)
-        return torch.cat((self.heads.layout.concatenate(chosen), axes.clamp(-1.0, 1.0)), -1)
+        weights = one_hots - one_hots.amin(-1, keepdim=True) + 1.0
+        return torch.cat((most_likely_one_hots(weights, self.heads.layout), axes.clamp(-1.0, 1.0)), -1)
 
     def cardinality(self) -> float:
         """Return the number of distinct actions, which is infinite with axes."""
@@ -197,15 +192,7 @@ class MixedActionSpec(TensorSpec):
         return self.heads.from_choices(choices).to(device=self.device, dtype=self.dtype)
 
     def index(self, index: Any, tensor_to_index: Tensor) -> Tensor:
-        """Raise an error, because mixed actions cannot index tensors.
-
-        Args:
-            index: Not used.
-            tensor_to_index: Not used.
-
-        Raises:
-            NotImplementedError: Always.
-        """
+        """Raise a `NotImplementedError`, because mixed actions cannot index tensors."""
         raise NotImplementedError(f"{type(self).__name__} cannot index tensors")
 
     def expand(self, *shape: Any) -> MixedActionSpec:

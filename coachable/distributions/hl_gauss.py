@@ -34,11 +34,7 @@ class HLGauss:
     """
 
     def __init__(
-        self,
-        v_min: float = -600.0,
-        v_max: float = 1000.0,
-        num_atoms: int = 255,
-        sigma_ratio: float = 0.75,
+        self, v_min: float = -600.0, v_max: float = 1000.0, num_atoms: int = 255, sigma_ratio: float = 0.75
     ) -> None:
         if not (math.isfinite(v_min) and math.isfinite(v_max) and v_min < v_max):
             raise ValueError(f"v_min must be less than v_max and both finite, got v_min={v_min}, v_max={v_max}")

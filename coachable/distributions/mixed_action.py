@@ -48,12 +48,7 @@ class MixedAction(Distribution):
     arg_constraints: dict = {}  # noqa: RUF012  # torch reads a class attribute
 
     def __init__(
-        self,
-        probs: Tensor | None = None,
-        loc: Tensor | None = None,
-        scale: Tensor | None = None,
-        *,
-        heads: ActionHeads,
+        self, probs: Tensor | None = None, loc: Tensor | None = None, scale: Tensor | None = None, *, heads: ActionHeads
     ) -> None:
         if (probs is None) != (not heads.categorical) or (loc is None) != (not heads.axes):
             raise ValueError(f"give probs for categorical heads and loc and scale for axes, and only then: {heads}")
@@ -114,14 +109,7 @@ class MixedAction(Distribution):
             return self._expanded(sample_shape).hard_action()
 
     def sample_and_log_prob(self, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
-        """Draw hard actions without gradient.
-
-        Args:
-            sample_shape: Shape before the batch shape.
-
-        Returns:
-            Actions `(*sample_shape, ..., action_dim)` and their differentiable log-densities `(*sample_shape, ...)`.
-        """
+        """Draw hard actions without gradient, with their differentiable log-densities `(*sample_shape, ...)`."""
         action = self.sample(sample_shape)
         return action, self.log_prob(action)
 
@@ -130,13 +118,7 @@ class MixedAction(Distribution):
         return self.rsample_and_log_prob(sample_shape)[0]
 
     def rsample_and_log_prob(self, sample_shape: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
-        """Draw reparameterised axes.
-
-        Args:
-            sample_shape: Shape before the batch shape.
-
-        Returns:
-            Actions `(*sample_shape, ..., axes)` and their log-densities `(*sample_shape, ...)`.
+        """Draw reparameterised axes `(*sample_shape, ..., axes)`, with their log-densities `(*sample_shape, ...)`.
 
         Raises:
             NotImplementedError: If there are categorical heads.

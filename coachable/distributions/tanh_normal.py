@@ -38,26 +38,14 @@ class TanhGaussian(TanhNormal):
         Distribution.__init__(self, loc.shape[:-1], loc.shape[-1:], validate_args=False)
 
     def rsample_and_log_prob(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
-        """Draw reparameterised actions.
-
-        Args:
-            sample_shape: Shape before the batch shape.
-
-        Returns:
-            Actions `(*sample_shape, ..., A)` and their log-densities `(*sample_shape, ...)`.
-        """
+        """Draw reparameterised actions `(*sample_shape, ..., A)`, with their log-densities `(*sample_shape, ...)`."""
         loc, scale = at_least_float32(self.loc), at_least_float32(self.scale)
         return _SampleAndScore.apply(loc, scale, self._noise(sample_shape))  # pyright: ignore[reportReturnType]
 
     def sample_and_log_prob(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
-        """Draw actions without gradient.
+        """Draw actions `(*sample_shape, ..., A)` without gradient.
 
-        Args:
-            sample_shape: Shape before the batch shape.
-
-        Returns:
-            Actions `(*sample_shape, ..., A)`, and their log-densities `(*sample_shape, ...)` with the score-function
-            gradient.
+        Their log-densities `(*sample_shape, ...)`, which are also returned, have the score-function gradient.
         """
         with torch.no_grad():
             u = self.loc + self.scale * self._noise(sample_shape)
@@ -89,25 +77,12 @@ class TanhGaussian(TanhNormal):
         return Normal(self.loc, self.scale)
 
     def expand(self, batch_shape: torch.Size | tuple[int, ...], _instance: None = None) -> TanhGaussian:
-        """Return the distribution with its parameters expanded to a batch shape.
-
-        Args:
-            batch_shape: Batch shape of the result.
-            _instance: Not used.
-
-        Returns:
-            Distribution of batch shape `batch_shape`.
-        """
+        """Return the distribution with its parameters expanded to a batch shape."""
         shape = (*batch_shape, *self.event_shape)
         return TanhGaussian(self.loc.expand(shape), self.scale.expand(shape))
 
     def update(self, loc: Tensor, scale: Tensor) -> None:
-        """Replace the parameters.
-
-        Args:
-            loc: Location `(..., A)` before the tanh.
-            scale: Scale `(..., A)` above 0.
-        """
+        """Replace the parameters, see the class."""
         self.__init__(loc, scale)
 
     def _noise(self, sample_shape: torch.Size | tuple[int, ...]) -> Tensor:
