@@ -83,15 +83,7 @@ class Backend:
         return self._differentiated(losses.actor, batch)
 
     def critic(self, losses: LossFunctions, batch: TensorDictBase) -> tuple[Tensor, Any]:
-        """Evaluate the critics' loss and set its gradients.
-
-        Args:
-            losses: The functions of the loss.
-            batch: Transitions `[B]` or `[B, n + 1]`, into which `td_error` is written.
-
-        Returns:
-            The scalar loss and its metadata.
-        """
+        """Evaluate the critics' loss and set its gradients, like `actor`; `td_error` is written into the batch."""
         return self._differentiated(losses.critic, batch)
 
     def make_optimizer(self, name: str, params: list[nn.Parameter], lr: float, eps: float) -> torch.optim.Adam:

@@ -119,14 +119,6 @@ class CheckpointStore:
     def try_save(self, state: Mapping[str, Any], metadata: Mapping[str, Any], replay: Any | None = None) -> Path | None:
         """Call `save`, but warn and return None if writing fails, because a full disk should not end a long training.
 
-        Args:
-            state: Content of `state.pt`.
-            metadata: Content of `metadata.json`; must contain `frames`.
-            replay: Replay buffer; saved if this store keeps replay buffers.
-
-        Returns:
-            Folder of the checkpoint, or None if it was not written.
-
         Raises:
             CheckpointError: If a weight is NaN or infinite.
         """
@@ -262,9 +254,6 @@ def check_fits(saved: Mapping[str, Tensor], present: Mapping[str, Tensor], what:
 def check_unused(directory: Path | str) -> None:
     """Check that the folder of a new run contains no checkpoints.
 
-    Args:
-        directory: Folder of the new run.
-
     Raises:
         CheckpointError: If it contains checkpoints.
     """
@@ -306,12 +295,9 @@ def check_writable(directory: Path | str, required_bytes: int = 0) -> None:
 
 
 def claim_folder(directory: Path | str) -> None:
-    """Keep trainings of other processes out of a run's folder until this process ends.
+    """Keep trainings of other processes out of a run's existing folder until this process ends.
 
     A file system without locks does not prevent the training.
-
-    Args:
-        directory: The existing folder.
 
     Raises:
         CheckpointError: If another process has claimed it.

@@ -107,11 +107,8 @@ def make_collector(
 def require_same_bounds(env: EnvBase, policy: Any) -> None:
     """Raise a `ValueError` if the actions of a policy have other bounds than those of an environment.
 
-    Such a policy would reach a part of the actions only, or others than there are.
-
-    Args:
-        env: The environment.
-        policy: The actor; without a `spec` of bounded actions it is not checked.
+    Such a policy would reach a part of the actions only, or others than there are. An actor without a `spec` of bounded
+    actions is not checked.
     """
     spec: Any = getattr(policy, "spec", None)
     own, expected = None if spec is None else spec.get("action", None), env.action_spec

@@ -144,26 +144,14 @@ class Progress:
         self._then = (0.0, 0, 0)
 
     def start(self, frames: int, updates: int) -> None:
-        """Start the display.
-
-        Args:
-            frames: Number of env-steps already done.
-            updates: Number of updates already made.
-        """
+        """Start the display of a training that has made some env-steps and updates already."""
         self._last = time.monotonic()
         self._then = (self._last, frames, updates)
         if self.stream.isatty():
             self._bar = tqdm(total=self.total, initial=frames, unit="step", unit_scale=True, file=self.stream)
 
     def update(self, frames: int, updates: int, metrics: Mapping[str, float], *, force: bool = False) -> None:
-        """Show the progress of the training.
-
-        Args:
-            frames: Number of env-steps so far.
-            updates: Number of updates so far.
-            metrics: Metrics to show as well.
-            force: Whether to write even if the last line is recent.
-        """
+        """Show how far the training is, and some metrics; `force` does so even if the last line is recent."""
         now = time.monotonic()
         if self._bar is not None:
             self._bar.update(frames - self._bar.n)

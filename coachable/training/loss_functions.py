@@ -48,15 +48,7 @@ def loss_functions(loss_module: LossModule) -> LossFunctions:
 
 
 def compiled(functions: LossFunctions, device_type: str) -> LossFunctions:
-    """Compile functions with `torch.compile`; on a CPU without a C++ compiler, return them and log a warning.
-
-    Args:
-        functions: Functions to compile.
-        device_type: "cpu" or "cuda".
-
-    Returns:
-        Compiled functions, or the given ones.
-    """
+    """Compile functions with `torch.compile`; on a CPU without a C++ compiler, return them and log a warning."""
     if device_type != "cpu" or any(shutil.which(c) for c in (os.environ.get("CXX"), "g++", "clang++") if c):
         return LossFunctions(*map(torch.compile, functions))
     _LOG.warning("compile=True has no effect: torch.compile needs a C++ compiler on a CPU (g++ or clang++, or set CXX)")

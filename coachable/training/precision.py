@@ -32,9 +32,6 @@ def resolve_precision(precision: Precision, device: torch.device | str = "cpu") 
         precision: `"auto"`, `"fp32"` or `"bf16"`. The last is returned even if it is slow on `device`.
         device: Device of the parameters.
 
-    Returns:
-        `"fp32"` or `"bf16"`.
-
     Raises:
         ValueError: If `precision` is none of the three.
 

@@ -101,10 +101,6 @@ def loaded(loss_module: LossModule, _: Any) -> None:
     """Share the actor and raise the parameters' versions after the loss loaded a state, which does neither.
 
     This hook of a loss uses only its arguments, so that it also works for copies of the loss.
-
-    Args:
-        loss_module: The loss that was loaded.
-        _: Keys that PyTorch passes to the hook; not used.
     """
     share_actor(loss_module)
     increment_version([*loss_module.parameters(), *loss_module.buffers()])

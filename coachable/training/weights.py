@@ -266,12 +266,7 @@ def _widened(saved: Mapping[str, Tensor], seen: int, new: int) -> dict[str, Tens
 
 
 def require_same_agent(saved: Mapping[str, Any], present: Mapping[str, Any], source: Path | str) -> None:
-    """Check that a checkpoint belongs to the agent of this run.
-
-    Args:
-        saved: State of the checkpoint.
-        present: `agent_state` of this run.
-        source: The checkpoint, for the message.
+    """Check that the state of a checkpoint belongs to the agent of this run, whose `agent_state` is `present`.
 
     Raises:
         CheckpointError: If domain, style space or network shapes differ.

@@ -49,10 +49,7 @@ class ReportingCollector:
 
 
 def check_workers(collector: Any) -> None:
-    """Raise the error with which a worker process ends.
-
-    Args:
-        collector: Collector made by `make_collector`, with or without worker processes.
+    """Raise the error with which a worker process of a collector from `make_collector` ends, if there is one.
 
     Raises:
         WorkerError: If a worker sent an error or ended without one.
@@ -71,9 +68,6 @@ def update_workers(collector: Any) -> None:
     """Send the policy's weights to all workers.
 
     TorchRL waits forever for the answer of a worker that has ended, and therefore waits in a thread of its own here.
-
-    Args:
-        collector: Collector made by `make_collector` with worker processes.
 
     Raises:
         WorkerError: If a worker sent an error or ended without one, also while the weights were being sent.
@@ -100,9 +94,6 @@ def update_workers(collector: Any) -> None:
 @contextmanager
 def worker_errors(collector: Any) -> Iterator[None]:
     """Replace an error that follows from the end of a worker process by the error with which that process ended.
-
-    Args:
-        collector: Collector made by `make_collector`, with or without worker processes.
 
     Raises:
         WorkerError: If a worker sent an error or ended without one.
