@@ -244,20 +244,9 @@ class EventTableBuffer(TensorDictReplayBuffer):
             self.update_priority(data.get("index"), data.get(self.priority_key))
 
     def update_priority(self, index: Tensor, priority: Tensor) -> None:
-        """Set priorities of slots; see `StratifiedSampler.update_priority`.
-
-        Args:
-            index: Slots of any shape.
-            priority: TD errors of the same shape, possibly with further dimensions, over which the largest counts.
-
-        Raises:
-            RuntimeError: If the buffer is not prioritised.
-        """
+        """Set priorities of slots; see `StratifiedSampler.update_priority`."""
         with self._replay_lock, self._write_lock:
             self._sampler.update_priority(index, priority)
-
-    def mark_update(self, index: int | Tensor) -> None:
-        """Do nothing, because only `extend` writes records, and it sets their priorities."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return the whole state in tensors and plain containers."""

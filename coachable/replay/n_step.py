@@ -142,12 +142,7 @@ class NStep:
         return {"data": self._data.to_dict(), "steps": self._steps.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any], device: torch.device | None = None) -> None:
-        """Restore the steps that `state_dict` returned.
-
-        Args:
-            state: Result of `state_dict`; empty if no steps were held back.
-            device: Device of the restored steps.
-        """
+        """Restore the steps that `state_dict` returned, on a device."""
         self.clear()
         if state:
             self._steps = Steps.from_state_dict(state["steps"])

@@ -140,14 +140,7 @@ class KeyRoute:
 
 
 def checked_events(predicate: EventPredicate, steps: TensorDictBase) -> Tensor:
-    """Evaluate a predicate and check the result.
-
-    Args:
-        predicate: Function from steps to events.
-        steps: Transitions, batch shape `(steps,)`.
-
-    Returns:
-        Events `(steps, len(names))` bool.
+    """Evaluate a predicate and check the result, booleans `(steps, len(names))`.
 
     Raises:
         ValueError: If the result is not boolean `(steps, len(names))`.
@@ -164,14 +157,7 @@ def checked_events(predicate: EventPredicate, steps: TensorDictBase) -> Tensor:
 
 
 def checked_route(route: Route, steps: TensorDictBase) -> Tensor:
-    """Evaluate a route and check the result.
-
-    Args:
-        route: Function from steps to tables.
-        steps: Transitions, batch shape `(steps,)`.
-
-    Returns:
-        Numbers of tables `(steps,)` int.
+    """Evaluate a route and check the result, numbers of tables `(steps,)` int.
 
     Raises:
         ValueError: If the result is not integer `(steps,)` or names no table.

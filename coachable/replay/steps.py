@@ -123,9 +123,6 @@ def read_steps(data: TensorDictBase, num_envs: int | None, arrived: int) -> Step
         num_envs: Number of environments in the batch; needed if the data has no trajectory numbers.
         arrived: Number of steps received before.
 
-    Returns:
-        One row per step.
-
     Raises:
         ValueError: If the stream of a step is unknown, or the data has no `("next", "done")`.
     """

@@ -134,12 +134,7 @@ class StratifiedSampler(Sampler):
         return slot, info
 
     def can_sample(self, storage: Storage, batch_size: int) -> bool:
-        """Return whether a batch can be drawn.
-
-        Args:
-            storage: Not used.
-            batch_size: Number of slots.
-        """
+        """Return whether a batch of so many slots can be drawn."""
         try:
             self._allot(batch_size)
         except ValueError:

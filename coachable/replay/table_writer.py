@@ -73,14 +73,7 @@ class TableWriter(Writer):
         return self.extend(data.unsqueeze(0))
 
     def extend(self, data: TensorDictBase) -> Tensor:
-        """Write a batch of steps.
-
-        Args:
-            data: Transitions `(steps,)`, time-major, or `(num_envs, time)`.
-
-        Returns:
-            Slots `(slots,)` of the steps, then of their copies in event tables.
-        """
+        """Write a batch of steps; see `EventTableBuffer.extend`."""
         rows, found_envs = flatten_time_major(data)
         rows = rows.exclude("index", TABLE)
         if self._device is not None and rows.device != self._device:

@@ -16,12 +16,7 @@ _WORDS = {
 
 
 def differences(here: Sequence[Parameter], there: Sequence[Parameter]) -> list[str]:
-    """List the differences between parameters as sentences; the list is empty if they are equal.
-
-    Args:
-        here: Parameters that the sentences call "here".
-        there: Parameters that they call "there".
-    """
+    """List the differences between parameters, called "here" and "there", as sentences; none if they are equal."""
     ours, theirs = {p.name: p for p in here}, {p.name: p for p in there}
     found = [f"{name} exists only here." for name in ours if name not in theirs]
     found += [f"{name} exists only there." for name in theirs if name not in ours]

@@ -21,13 +21,6 @@ def own(space: StyleSpace) -> Sampler:
 def single_weight(space: StyleSpace, name: str) -> Sampler:
     """Return the styles in which one weight is uniform between 0 and its upper bound and the others are 0.
 
-    Args:
-        space: Style space of weights.
-        name: Name of the weight.
-
-    Returns:
-        A sampler of the space's dimension.
-
     Raises:
         ValueError: If a parameter is not a weight, or there is none of this name.
     """
@@ -51,9 +44,6 @@ def style_mixture(
             "independent", which draws all weights independently instead (the ablations of Appendix D).
         neutral: Probability that every weight is 0.
         independent: Probability that every weight is drawn, independently.
-
-    Returns:
-        A sampler of the space's dimension.
 
     Raises:
         ValueError: If `single` is unknown, or a parameter is not a weight.
@@ -82,9 +72,6 @@ def with_requests(space: StyleSpace, *, positive: float = 0.25, full: float = 0.
         full: Probability that every weight is at its upper bound.
         neutral: Probability that every weight is 0.
 
-    Returns:
-        A sampler of the space's dimension.
-
     Raises:
         ValueError: If a parameter is not a weight, or the sum of the probabilities exceeds 1.
     """
@@ -108,9 +95,6 @@ def with_extremes(
             default. By default all.
         shared: Whether rows that share a style in the space's own sampler (`Shared`), such as the cars of a race, still
             share it. Otherwise each row has its own style, so that agents meet others of other styles.
-
-    Returns:
-        A sampler of the space's dimension.
 
     Raises:
         ValueError: If a parameter is a choice or unknown, or the share is not in [0, 1].

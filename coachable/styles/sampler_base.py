@@ -14,12 +14,7 @@ _REGISTRY: dict[str, type["Sampler"]] = {}
 
 @lru_cache(maxsize=256)
 def constant(values: tuple[float, ...], device: torch.device) -> Tensor:
-    """Return a float32 constant `(n,)` on a device. The tensor is shared, so do not write to it.
-
-    Args:
-        values: The n numbers.
-        device: Device of the result.
-    """
+    """Return a float32 constant `(n,)` on a device. The tensor is shared, so do not write to it."""
     with torch.inference_mode(False):
         return torch.tensor(values, dtype=torch.float32, device=device)
 
