@@ -97,7 +97,8 @@ def evaluate_trials(domain: Domain, agent: LoadedPolicy, settings: EvaluationSet
         interval of their share.
     """
     rows = []
-    count, style = settings.trial_episodes, agent.space.describe(agent.space.default)
+    count = max(1, round(1.8 * settings.episodes))  # 36 for 20 episodes per style
+    style = agent.space.describe(agent.space.default)
     for label, options in domain.trials.items():
         grid = evaluate_grid(
             domain, agent.actor, agent.space, episodes=count, cells=[style], env_options=options, **settings.rollout

@@ -45,11 +45,6 @@ class EvaluationSettings:
             raise ValueError(f"episodes per style must be at least 1, got {self.episodes}")
 
     @property
-    def trial_episodes(self) -> int:
-        """Number of episodes of each of the domain's trials: 36 for 20 episodes per style."""
-        return max(1, round(1.8 * self.episodes))
-
-    @property
     def rollout(self) -> RolloutOptions:
         """Settings of every rollout, as keyword arguments."""
         return {"steps": self.steps, "seed": self.seed, "num_threads": self.num_threads, "progress": self.progress}

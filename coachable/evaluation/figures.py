@@ -61,15 +61,7 @@ def drawing(
 
 
 def shade(index: int, count: int) -> Any:
-    """Return the colour of line `index` of `count` ordered lines, for example of rising weights.
-
-    Args:
-        index: Number of the line, from 0.
-        count: Number of lines.
-
-    Returns:
-        RGBA colour.
-    """
+    """Return the colour, RGBA, of line `index` of `count` ordered lines, for example of rising weights."""
     return plt.get_cmap("viridis")(0.9 * index / max(count - 1, 1))
 
 
@@ -114,15 +106,7 @@ def draw_heat_map(
 
 
 def draw_style_grid(grid: StyleGrid, domain: Domain, space: StyleSpace, path: Path, title: str) -> None:
-    """Draw measured over requested style, and the domain's published metrics over the same axis.
-
-    Args:
-        grid: The evaluation.
-        domain: Domain with the columns and units.
-        space: Its style space.
-        path: PNG file to write.
-        title: Title of the figure.
-    """
+    """Draw measured over requested style, and the domain's published metrics over the same axis, as a PNG file."""
     axis, lines = grid_lines(grid.cells, space)
     rows, formats = grid.rows(), published(domain, grid.episodes, grid.cells[0])
     columns = {measured_column(name, grid.cells[0]): name for name in grid.episodes}

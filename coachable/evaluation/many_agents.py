@@ -74,12 +74,7 @@ def side_by_side(summaries: Mapping[str, Mapping[str, float]]) -> list[dict[str,
 
 
 def table_of(rows: Sequence[Mapping[str, Any]], form: str) -> str:
-    """Return the rows of `side_by_side` as Markdown, or an empty text if there are none.
-
-    Args:
-        rows: The rows.
-        form: Format of the numbers.
-    """
+    """Return the rows of `side_by_side` as Markdown, numbers in a format, or an empty text if there are none."""
     return markdown_table(rows, {name: "" if name == "quantity" else form for name in rows[0]}) if rows else ""
 
 

@@ -3,7 +3,6 @@
 import ctypes
 import json
 import math
-import os
 import signal
 import subprocess
 import sys
@@ -116,7 +115,6 @@ def _start(script: Path, arguments: Sequence[str], seed: int, folder: Path) -> "
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
-            env=os.environ,
             preexec_fn=_stop_with_parent,
         )
 

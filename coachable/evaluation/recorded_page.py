@@ -110,14 +110,7 @@ def export_recordings(agent: LoadedPolicy, domain: Domain, out: Path, assets: Pa
 
 
 def record(agent: LoadedPolicy, domain: Domain, requests: Sequence[Mapping[str, Any]], steps: int) -> list[Recording]:
-    """Record one episode in each style, all of them in one batch.
-
-    Args:
-        agent: The agent.
-        domain: Its domain, which has a scene.
-        requests: The styles by parameter name.
-        steps: Largest number of steps.
-    """
+    """Record one episode of at most `steps` steps in each style, all of them in one batch."""
     make_stage, alike = domain.make_stage, domain.recorded.alike
     assert make_stage is not None
     options = {**domain.coached, **(alike(len(requests)) if alike else {})}

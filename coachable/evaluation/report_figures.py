@@ -59,14 +59,7 @@ def draw_metrics(
 
 
 def draw_requests(table: StyleTable, space: StyleSpace, parameters: Sequence[str], path: Path) -> None:
-    """Draw measured over requested values of some parameters, one line per option of the first choice.
-
-    Args:
-        table: Estimates by style cell.
-        space: The style space.
-        parameters: Names of the set-points, one panel each.
-        path: Image file to write.
-    """
+    """Draw measured over requested values of some set-points, a panel each, one line per option of the first choice."""
     choice = next((p for p in space.parameters if isinstance(p, Choice) and p.name in table.cells[0]), None)
     options: Sequence[Any] = choice.options if choice else (None,)
     with _panels(path, len(parameters)) as panels:
@@ -87,10 +80,7 @@ def draw_requests(table: StyleTable, space: StyleSpace, parameters: Sequence[str
 def draw_switches(runs: Sequence[Run], period_seconds: float, path: Path) -> None:
     """Draw the share of the switches that the agent complied with over the time since the switch.
 
-    Args:
-        runs: Evaluations, over which the 95 % interval is estimated.
-        period_seconds: Time between two switches [s].
-        path: Image file to write.
+    The 95 % interval is over the runs; `period_seconds` is the time between two switches [s].
     """
     with _panels(path, 1) as (panel,):
         times = np.linspace(0.0, period_seconds, _GROWTH_POINTS)

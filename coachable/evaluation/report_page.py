@@ -75,12 +75,7 @@ class Page:
         self._sections: list[tuple[str, str]] = []
 
     def section(self, title: str, *parts: str) -> None:
-        """Add a section of parts from `paragraph`, `picture` and `table`.
-
-        Args:
-            title: Heading of the section.
-            *parts: HTML in order.
-        """
+        """Add a section of parts from `paragraph`, `picture` and `table`."""
         self._sections.append((title, "\n".join(parts)))
 
     def text(self, footer: str) -> str:

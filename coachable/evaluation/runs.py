@@ -66,17 +66,7 @@ def evaluate_run(
     sweep_points: int,
     **options: Any,
 ) -> Run:
-    """Evaluate one agent with one seed.
-
-    Args:
-        label: Label of the run.
-        domain: Domain in which the agent acts.
-        agent: The agent's policy and styles.
-        episodes: Number of episodes per style and per value of a weight.
-        switch_episodes: Number of episodes in which the style switches.
-        sweep_points: Number of values of each weight.
-        **options: See `RolloutOptions`.
-    """
+    """Evaluate one agent with one seed; see `coachable.evaluation.report.write_report` for the numbers."""
     return Run(
         label,
         evaluate_grid(domain, agent.actor, agent.space, episodes=episodes, **options),
@@ -93,16 +83,7 @@ def estimate(scores: np.ndarray | Sequence[float]) -> Estimate:
 
 
 def sweep_estimate(sweeps: Sequence[WeightSweep], metric: str, position: int) -> Estimate:
-    """Aggregate a metric over the runs' sweeps of one weight, at one of its values.
-
-    Args:
-        sweeps: The same sweep of every run.
-        metric: Name of the metric.
-        position: Index of the weight's value.
-
-    Returns:
-        Interquartile mean with its 95 % interval over the runs.
-    """
+    """Aggregate a metric over the runs' sweeps of one weight, at the value of the weight with an index."""
     return estimate([mean_of(sweep.episodes[metric][position]) for sweep in sweeps])
 
 
@@ -129,15 +110,7 @@ class StyleTable:
         return measured_column(metric, self.cells[0])
 
     def of(self, metric: str, cells: Sequence[int]) -> Estimate:
-        """Estimate a metric over some of the cells.
-
-        Args:
-            metric: Name of the metric.
-            cells: Numbers of the style cells.
-
-        Returns:
-            Interquartile mean with its 95 % interval over runs and cells.
-        """
+        """Estimate a metric over the runs and some of the cells."""
         return estimate(self.scores[metric][:, list(cells)])
 
     def rows(self, metrics: Sequence[str]) -> list[dict[str, Any]]:

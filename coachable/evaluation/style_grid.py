@@ -115,12 +115,7 @@ def evaluate_grid(
 
 
 def measured_column(name: str, cell: Mapping[str, Any]) -> str:
-    """Return the column of a metric; a measured style parameter gets a prefix to tell it from the request.
-
-    Args:
-        name: Name of the metric.
-        cell: The requested style by name.
-    """
+    """Return the column of a metric; a measured style parameter gets a prefix to tell it from the request, `cell`."""
     return f"measured_{name}" if name in cell else name
 
 
@@ -130,11 +125,7 @@ def mean_of(values: np.ndarray) -> float:
 
 
 def rows_where(rows: Sequence[Mapping[str, Any]], **values: Any) -> list[Mapping[str, Any]]:
-    """Return the rows that have the given values.
-
-    Args:
-        rows: Rows with the same keys.
-        **values: Values by column name.
+    """Return the rows that have the given values, by column name.
 
     Example:
         >>> rows_where([{"weight": 0, "lap": 90.1}, {"weight": 1, "lap": 91.7}], weight=1)
@@ -144,12 +135,7 @@ def rows_where(rows: Sequence[Mapping[str, Any]], **values: Any) -> list[Mapping
 
 
 def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Write rows with the same keys as CSV.
-
-    Args:
-        rows: Rows with the same keys.
-        path: File to write.
-    """
+    """Write rows with the same keys as CSV."""
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
@@ -216,10 +202,7 @@ def training_counts(agent: LoadedPolicy) -> str:
 def published(domain: Domain, episodes: Mapping[str, Any], cell: Mapping[str, Any]) -> dict[str, str]:
     """Return the format of each column of a domain's table: of those that it declares, otherwise of every metric.
 
-    Args:
-        domain: The domain.
-        episodes: Metrics by name, as in `StyleGrid.episodes`.
-        cell: A style of the table.
+    Metrics are given by name, as in `StyleGrid.episodes`, together with one style of the table.
     """
     everything = {measured_column(name, cell): ".3g" for name in episodes}
     return dict(domain.columns) or everything | {"survived": ".0%"}

@@ -116,13 +116,6 @@ def default_tour(domain: Domain, space: StyleSpace) -> list[dict[str, Any]]:
 
     A space without weights has every option of each choice with low, middle and high set-points. A space with weights
     has the domain's evaluation grid.
-
-    Args:
-        domain: The domain.
-        space: The agent's style space.
-
-    Returns:
-        Styles by name, in the order of the film.
     """
     if any(isinstance(p, Weight) for p in space.parameters):
         return domain.cells()
@@ -136,13 +129,7 @@ def default_tour(domain: Domain, space: StyleSpace) -> list[dict[str, Any]]:
 
 
 def write_video(frames: Iterable[np.ndarray], out: Path, fps: float) -> None:
-    """Write frames (height, width, 3) uint8 as mp4 (H.264), gif or animated WebP.
-
-    Args:
-        frames: The frames.
-        out: File to write, `.mp4`, `.gif` or `.webp`.
-        fps: Frames per second.
-    """
+    """Write frames (height, width, 3) uint8, `fps` of them per second, as `.mp4` (H.264), `.gif` or `.webp`."""
     if out.suffix != ".mp4":
         images = [Image.fromarray(frame) for frame in frames]
         ends = np.round(np.arange(len(images) + 1) * 100 / fps) * 10  # [ms], in the hundredths of a second of a gif

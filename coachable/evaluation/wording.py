@@ -13,12 +13,7 @@ def readable(name: Any) -> str:
 
 
 def readable_number(value: float, unit: str = "") -> str:
-    """Return a number with three significant digits, or as a whole number from 1000 on, and its unit.
-
-    Args:
-        value: The number.
-        unit: Unit to append, or "".
-    """
+    """Return a number with three significant digits, or as a whole number from 1000 on, and its unit if it has one."""
     number = f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"
     return f"{number} {unit}".rstrip()
 
@@ -29,12 +24,7 @@ def with_unit(name: str, unit: str) -> str:
 
 
 def counted(count: int, noun: str) -> str:
-    """Return a number of things, such as "1 episode" or "20 episodes".
-
-    Args:
-        count: The number.
-        noun: What is counted, in the singular.
-    """
+    """Return a number of things, given in the singular, such as "1 episode" or "20 episodes"."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
@@ -65,24 +55,15 @@ def measures_by_parameter(
 
 
 def unit_of(domain: Domain, space: StyleSpace, name: str) -> str:
-    """Return the unit of a measure: the domain's, or that of the parameter that the measure or its error belongs to.
-
-    Args:
-        domain: The domain.
-        space: The style space.
-        name: Name of the measure.
-    """
+    """Return the unit of a measure: the domain's, or that of the parameter that the measure or its error belongs to."""
     parameter = name.removesuffix("_error")
     return domain.units.get(name) or (space[parameter].unit if parameter in space else "")
 
 
 def units_of(domain: Domain, space: StyleSpace, columns: Mapping[str, str]) -> dict[str, str]:
-    """Return the units of a table's columns, without those that have none.
+    """Return the units of a table's columns, without those that have none, such as shares.
 
-    Args:
-        domain: The domain.
-        space: The style space.
-        columns: Formats by the name of the column, which may begin with `measured_`; shares have no unit.
+    Names of columns, by which formats are given, may begin with `measured_`.
     """
     names = [name for name, form in columns.items() if not form.endswith("%")]
     units = {name: unit_of(domain, space, name.removeprefix("measured_")) for name in names}
@@ -90,28 +71,14 @@ def units_of(domain: Domain, space: StyleSpace, columns: Mapping[str, str]) -> d
 
 
 def heading_of(domain: Domain, space: StyleSpace, column: str, form: str = "") -> str:
-    """Return the heading of a published column with its unit, such as "power [W]".
-
-    Args:
-        domain: The domain.
-        space: The style space.
-        column: Name of the column, which may begin with `measured_`.
-        form: Format of its values; shares have no unit.
-    """
+    """Return the heading of a published column with its unit, such as "power [W]"; see `units_of`."""
     name = column.removeprefix("measured_")
     text = f"measured {domain.words.name(name)}" if name != column else domain.words.name(name)
     return with_unit(text, units_of(domain, space, {column: form}).get(column, ""))
 
 
 def measured_text(domain: Domain, space: StyleSpace, name: str, value: float) -> str:
-    """Return a measured value with its unit, in the format in which the domain publishes it or else with three digits.
-
-    Args:
-        domain: The domain.
-        space: The style space.
-        name: Name of the measure.
-        value: Its value.
-    """
+    """Return a measured value with its unit, in the format in which the domain publishes it, or with three digits."""
     form = domain.columns.get(name, domain.columns.get(f"measured_{name}", ""))
     if form.endswith("%"):
         return format(value, form)
