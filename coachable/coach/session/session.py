@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase
 
 from coachable.coach.phrases.fitting import fitting
 from coachable.coach.phrases.grammar import StyleGrammar, Understanding
-from coachable.coach.session.influences import Influences
+from coachable.coach.session.live_controls import LiveControls
 from coachable.coach.session.live_episodes import LiveEpisodes
 from coachable.coach.session.readout import MeasuredWindow, StyleReport
 from coachable.coach.session.recording import Recording, check_seed, is_trained
@@ -77,7 +77,7 @@ class CoachSession:
         self._episodes = LiveEpisodes(domain, space, terminated=words.terminated)
         self.presets: dict[str, dict[str, Any]] = {"default": space.describe(space.default)}
         self.presets |= {name: dict(style) for name, style in words.presets.items()}
-        self._influences = Influences(domain)
+        self._controls = LiveControls(domain)
         self.grammar = StyleGrammar(parameters, words.vocabulary, words.examples)
         self._understood: Understanding | None = None
         self._recent = MeasuredWindow(domain.measures, round(window / domain.control_step))
@@ -111,7 +111,7 @@ class CoachSession:
     @property
     def controls(self) -> dict[str, float]:
         """Requested values of the live controls, by name, in their units."""
-        return dict(self._influences.wanted)
+        return dict(self._controls.wanted)
 
     def set(self, **values: float | str) -> None:
         """Request another style from the next observation on; parameters that are not named keep their values.
@@ -141,9 +141,9 @@ class CoachSession:
         Raises:
             ValueError: For an unknown control or NaN.
         """
-        fitted = self._influences.fitted(values)
+        fitted = self._controls.fitted(values)
         self._timeline.take_over()
-        self._influences.wanted |= fitted
+        self._controls.wanted |= fitted
 
     def push(self, forward: float = 0.0, left: float = 0.0) -> None:
         """Push the agent before the next step; see `coachable.domain.Push`, whose largest strength limits the push.
@@ -151,9 +151,11 @@ class CoachSession:
         Raises:
             ValueError: If the domain has no push, or a strength is not finite.
         """
-        fitted = self._influences.fitted_push(forward, left)
+        if (push := self.domain.push) is None:
+            raise ValueError(f"{self.domain.name} has no push")
+        fitted = push.fit(float(forward), float(left))
         self._timeline.take_over()
-        self._apply({"push": fitted})
+        self._apply({"push": list(fitted)})
 
     def say(self, phrase: str) -> Understanding:
         """Request a style in words: "shorter steps, arms up", "0.4 m", "a bit more", or a preset's name.
@@ -176,11 +178,7 @@ class CoachSession:
         return self.grammar.read(phrase, self.style | self.controls, self._understood)
 
     def follow(self, understood: Understanding) -> None:
-        """Request the changes of an understood phrase.
-
-        Raises:
-            ValueError: In strict mode, for a number outside the trained range.
-        """
+        """Request the changes of an understood phrase; see `say`."""
         style = {name: value for name, value in understood.changes.items() if name in self.space}
         controls = {name: float(value) for name, value in understood.changes.items() if name not in style}
         if style:
@@ -231,13 +229,13 @@ class CoachSession:
             self._apply({"reset": True})
             return
         check_seed(seed)
-        self._influences.values |= self._influences.wanted
+        self._controls.values |= self._controls.wanted
         start = Recording(self.domain.name, self.source, seed, self.style, self.controls)
         self._timeline = Timeline(start)
         self._steps_at_request, self._complied_at, self.seed = 0, None, seed
         self._generator = torch.Generator().manual_seed(seed)
         self._episodes.seed(seed)
-        self._influences.steer(self.base_env)
+        self._controls.steer(self.base_env)
         self._begin_episode()
 
     @property
@@ -262,7 +260,7 @@ class CoachSession:
         """
         for event in self._timeline.due():
             self._apply(event)
-        if changes := self._influences.approached(self.domain.control_step):
+        if changes := self._controls.approached(self.domain.control_step):
             self._apply({"controls": changes})
         if self.ended is not None:
             self._begin_episode()
@@ -343,9 +341,9 @@ class CoachSession:
             ValueError: If the recording belongs to another domain, style space or set of controls; the session is
                 then unchanged.
         """
-        recording.check(self.domain.name, self.space, self._influences.controls, self._influences.push)
+        recording.check(self.domain.name, self.space, self._controls.controls, self.domain.push)
         self._theta, self._outside = self.space.make(strict=True, **recording.style), {}
-        self._influences.change(recording.controls, settled=True)
+        self._controls.change(recording.controls, settled=True)
         self.reset(recording.seed)
         self._timeline.repeat(recording)
 
@@ -364,11 +362,11 @@ class CoachSession:
         if "style" in event:
             self._request(self.space.make(**(self.style | event["style"])), event["style"])
         if "controls" in event:
-            self._influences.change(event["controls"], settled=self.replaying)  # a recording has all of the way
-            self._influences.steer(self.base_env)
+            self._controls.change(event["controls"], settled=self.replaying)  # a recording has all of the way
+            self._controls.steer(self.base_env)
             self._timeline.note({"controls": dict(event["controls"])})
-        if "push" in event:
-            self._influences.shove(self.base_env, event["push"])
+        if self.domain.push is not None and "push" in event:
+            self.domain.push.apply(self.base_env, *event["push"])
             self._timeline.note({"push": list(event["push"])})
         if "reset" in event:
             self._timeline.note({"reset": True})

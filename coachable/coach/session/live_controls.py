@@ -1,9 +1,9 @@
-"""What acts on the agent beside its style: live controls and pushes."""
+"""Live controls of a session: their values, and how they approach requested ones."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import cast
 
 from torchrl.envs import EnvBase
@@ -11,8 +11,8 @@ from torchrl.envs import EnvBase
 from coachable.domain import Control, Domain
 
 
-class Influences:
-    """Live controls of a domain with their values, and its push.
+class LiveControls:
+    """Live controls of a domain with their values.
 
     Args:
         domain: The domain.
@@ -21,11 +21,10 @@ class Influences:
         controls: Live controls by name.
         values: Their values in force by name, in their units.
         wanted: The values that they approach.
-        push: The push, or None if the domain has none.
     """
 
     def __init__(self, domain: Domain) -> None:
-        self._domain, self.push = domain.name, domain.push
+        self._domain = domain.name
         self.controls = {control.parameter.name: control for control in domain.controls}
         self.values = {name: cast(float, c.parameter.default) for name, c in self.controls.items()}
         self.wanted = dict(self.values)
@@ -57,37 +56,10 @@ class Influences:
                 raise ValueError(f"no live control named {name!r}: {self._domain} has {list(self.controls)}")
         return {name: self.controls[name].fit(float(value)) for name, value in values.items()}
 
-    def fitted_push(self, forward: float, left: float) -> list[float]:
-        """Return a push, scaled down to the largest strength.
-
-        Args:
-            forward: Strength in the agent's direction, in the push's unit.
-            left: Strength to its left.
-
-        Returns:
-            Strength forward and to the left.
-
-        Raises:
-            ValueError: If the domain has no push, or a strength is not finite.
-        """
-        if self.push is None:
-            raise ValueError(f"{self._domain} has no push")
-        return list(self.push.fit(float(forward), float(left)))
-
     def steer(self, env: EnvBase) -> None:
         """Write the values of the controls into the base environment."""
         for name, value in self.values.items():
             self.controls[name].apply(env, value)
-
-    def shove(self, env: EnvBase, strength: Sequence[float]) -> None:
-        """Push the agent in the base environment, if the domain has a push.
-
-        Args:
-            env: The base environment, without transforms.
-            strength: Strength forward and to the left, in the push's unit.
-        """
-        if self.push is not None:
-            self.push.apply(env, *strength)
 
 
 def _approach(control: Control, present: float, wanted: float, seconds: float) -> float:
