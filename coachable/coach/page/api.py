@@ -64,11 +64,7 @@ class CoachApi:
             self.publish(self._loop.session.report())
 
     def publish(self, report: StyleReport) -> None:
-        """Replace the state that other programs read, in the loop's thread.
-
-        Args:
-            report: Report of the session.
-        """
+        """Replace the state that other programs read, in the loop's thread."""
         session = self._loop.session
         self._state = {
             "step": session.step_count,

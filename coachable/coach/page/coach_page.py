@@ -346,13 +346,7 @@ def _read_recording(content: bytes) -> Recording:
 
 
 def listed(domain: Domain, space: StyleSpace, measured: Mapping[str, float]) -> str:
-    """Return measured values with their names as Markdown.
-
-    Args:
-        domain: The domain.
-        space: The style space.
-        measured: Values by name.
-    """
+    """Return measured values with their names as Markdown."""
     shown = [(domain.words.name(name), measured_text(domain, space, name, value)) for name, value in measured.items()]
     texts = [f"{escaped(name)} **{escaped(value)}**" for name, value in shown]
     return f"also measured: {', '.join(texts)}" if texts else ""

@@ -255,12 +255,7 @@ class _Node:
 
 
 def fit_camera(camera: viser.CameraHandle, view: Viewpoint) -> None:
-    """Move a browser's camera if its window has become narrow or wide, unless somebody has moved it by hand.
-
-    Args:
-        camera: Camera of one browser.
-        view: The stage's viewpoint.
-    """
+    """Move a browser's camera if its window has become narrow or wide, unless somebody has moved it by hand."""
     wide, narrow = camera_of(view), camera_of(view, narrow=True)
     phone = camera.image_width <= PHONE
     expected = (wide[0], _START) if phone else (narrow[0],)
@@ -317,14 +312,9 @@ def _map_html(small: Map) -> str:
 
 
 def _light(scene: viser.SceneApi, view: Viewpoint, brightness: str) -> None:
-    """Set the lights, and a sky into which distant objects fade.
+    """Set the lights of the scene of all browsers, or of one, and a sky into which distant objects fade.
 
     There is an even and a directed light; shadows are several times slower without a graphics card.
-
-    Args:
-        scene: The scene of all browsers, or of one.
-        view: The stage's viewpoint.
-        brightness: `DAY` or `NIGHT`.
     """
     even, directed = _LIGHTS[brightness]
     air, haze = _SKIES[brightness]

@@ -68,12 +68,7 @@ def make_server(host: str = "127.0.0.1", port: int = 8080) -> viser.ViserServer:
 
 
 def serve_api(server: viser.ViserServer, api: CoachApi) -> None:
-    """Let other programs use an API on the port of a server from `make_server`.
-
-    Args:
-        server: Server of the page.
-        api: The API.
-    """
+    """Let other programs use an API on the port of a server from `make_server`."""
     _GUARDS[server].api = api
 
 
@@ -103,12 +98,7 @@ def free_port(host: str, port: int) -> int:
 
 
 def page_address(host: str, port: int) -> str:
-    """Return the address of the page for a browser on this machine.
-
-    Args:
-        host: Host that the server listens on.
-        port: Its port.
-    """
+    """Return the address of the page for a browser on this machine, from the host and port of `make_server`."""
     from coachable.coach.page.guard import EVERYWHERE
 
     name = "localhost" if host in EVERYWHERE else f"[{host}]" if ":" in host else host

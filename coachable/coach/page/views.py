@@ -71,12 +71,7 @@ def padded(picture: np.ndarray, aspect: float, upper_left: bool = False) -> np.n
 
 
 def make_view(server: viser.ViserServer, session: CoachSession) -> View:
-    """Make the domain's 3-D view if it has one, else a view of its renderer's pictures, else a note with the reason.
-
-    Args:
-        server: Server of the page.
-        session: The coached session.
-    """
+    """Make the domain's 3-D view if it has one, else a view of its renderer's pictures, else a note with the reason."""
     try:
         if session.domain.make_stage is not None:
             return SceneView(server, session, session.domain.make_stage())

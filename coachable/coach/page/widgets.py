@@ -103,12 +103,7 @@ class MeasuredText:
         self.handle = server.gui.add_markdown(escaped(trained(parameter)))
 
     def update(self, report: StyleReport, measures: list[str]) -> None:
-        """Show the values of the parameter's `measures` in a report, or say why there are none.
-
-        Args:
-            report: The session's report.
-            measures: Names of the parameter's measures.
-        """
+        """Show the values of the parameter's measures in a report of the session, or say why there are none."""
         name, values = self.parameter.name, report.measured
         measured = sorted((m for m in measures if m in values), key=lambda m: m != name)  # the nameless one comes first
         shown = [f"{escaped(self._name(m))}**{escaped(self._value(m, values[m]))}**" for m in measured]
@@ -176,12 +171,7 @@ class Chart:
             self.choice.value = title
 
     def add(self, time: float, report: StyleReport) -> None:
-        """Add a report as a further point and draw the chart.
-
-        Args:
-            time: Simulated time of the session [s].
-            report: The report.
-        """
+        """Add a report at a simulated time of the session [s] as a further point, and draw the chart."""
         if self._history and time < self._history[-1][0]:
             self._history.clear()  # the session started over
         elif self._history and time == self._history[-1][0]:
@@ -267,12 +257,7 @@ def _ends(parameter: Parameter, lines: Sequence[np.ndarray]) -> tuple[float, flo
 
 
 def label(parameter: Parameter, words: Words) -> str:
-    """Return the name and unit of a parameter.
-
-    Args:
-        parameter: The parameter.
-        words: Words of its domain.
-    """
+    """Return the name and unit of a parameter, in the words of its domain."""
     return with_unit(words.name(parameter.name), parameter.unit)
 
 
@@ -284,20 +269,11 @@ def trained(parameter: Parameter) -> str:
 
 
 def escaped(text: str) -> str:
-    """Escape the characters that are markup in Markdown, in which the page would also render HTML.
-
-    Args:
-        text: Text that is to be shown as it is, such as a unit from a weights file.
-    """
+    """Escape the characters that are markup in Markdown, in which the page would also render HTML."""
     return "".join(f"\\{c}" if c in "\\`*_{}[]<>#|~&" else c for c in text)
 
 
 def write(handle: Any, text: str) -> None:
-    """Set the content of a text widget; only changes are sent to the browsers.
-
-    Args:
-        handle: Widget of the page.
-        text: Its new content.
-    """
+    """Set the content of a text widget of the page; only changes are sent to the browsers."""
     if handle.content != text:
         handle.content = text

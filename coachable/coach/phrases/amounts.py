@@ -60,12 +60,7 @@ def dimension_of(parameter: Weight | Setpoint | Choice) -> str:
 
 
 def wrapped(p: Weight | Setpoint | Choice, value: float) -> float:
-    """Return the equivalent angle in the range of a full-circle parameter; return other values unchanged.
-
-    Args:
-        p: The parameter.
-        value: Value in the parameter's unit.
-    """
+    """Return the equivalent angle in the range of a full-circle parameter; return other values unchanged."""
     return around(value, p.low, p.high) if _is_circle(p) else value
 
 

@@ -64,21 +64,11 @@ class Binding:
         return low + 0.5 * (min(max(position, -1.0), 1.0) + 1.0) * (high - low)
 
     def press(self, session: CoachSession, direction: int) -> None:
-        """Request the value after a key or button; see `stepped`.
-
-        Args:
-            session: The coached session.
-            direction: -1 for less or the previous option, 1 for more or the next option.
-        """
+        """Request the value after a key or button; see `stepped`."""
         self._ask(session, self.stepped((session.style | session.controls)[self.name], direction))
 
     def move(self, session: CoachSession, position: float) -> None:
-        """Request the value of an axis.
-
-        Args:
-            session: The coached session.
-            position: Position of the axis in [-1, 1], which spans the parameter's range.
-        """
+        """Request the value of an axis; see `at`."""
         self._ask(session, self.at(position))
 
     def _ask(self, session: CoachSession, value: float | str) -> None:

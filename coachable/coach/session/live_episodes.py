@@ -57,15 +57,7 @@ class LiveEpisodes(Rollout):
         self.ended = None
 
     def step(self, policy: TensorDictModuleBase, style: Tensor) -> TensorDictBase:
-        """Make one step.
-
-        Args:
-            policy: Policy that writes `action`.
-            style: Raw style (d,) to act under.
-
-        Returns:
-            Transition, batch shape (1,).
-        """
+        """Make one step under a raw style (d,), and return the transition, batch shape (1,)."""
         transition = super().step(policy, style[None])
         self.steps += 1
         if transition["next", "terminated"].any():

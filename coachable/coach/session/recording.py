@@ -78,13 +78,7 @@ class Recording:
         return recording
 
     def check(self, domain: str, space: StyleSpace, controls: Mapping[str, Control], push: Push | None) -> None:
-        """Check that a session can replay this recording.
-
-        Args:
-            domain: Name of the session's domain.
-            space: Its style space.
-            controls: Its live controls, by name.
-            push: Its push, if it has one.
+        """Check that a session can replay this recording, from the declarations of its domain.
 
         Raises:
             ValueError: If the session has another domain, or lacks a style parameter, a control, a push or a value.
@@ -134,12 +128,7 @@ def check_seed(seed: int) -> None:
 
 
 def is_trained(parameter: Parameter, value: float | str) -> bool:
-    """Return whether a value is one of the options, or a number in the range of the parameter, as float32.
-
-    Args:
-        parameter: The parameter.
-        value: Name of an option, or a number in the parameter's unit.
-    """
+    """Return whether a value is one of the options, or a number in the range of the parameter, as float32."""
     if isinstance(parameter, Choice):
         return value in parameter.options
     with np.errstate(over="ignore"):  # a larger number becomes infinite, which no range holds
