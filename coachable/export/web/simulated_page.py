@@ -125,11 +125,7 @@ def _name_preloads(out: Path, manifest: Mapping[str, Any], vendored: Mapping[str
 
 def about(agent: LoadedPolicy) -> dict[str, Any]:
     """Return what every page has to know of an agent."""
-    return {
-        "coachable_version": __version__,
-        "home": home_page(),
-        "domain": agent.metadata["domain"],
-    }
+    return {"coachable_version": __version__, "home": home_page(), "domain": agent.metadata["domain"]}
 
 
 def home_page() -> str:
@@ -143,24 +139,10 @@ def home_page() -> str:
 
 
 def manifest_of(agent: LoadedPolicy, domain: Domain, part: PagePart) -> dict[str, Any]:
-    """Return what the page has to know besides models and graphs.
-
-    Args:
-        agent: Agent from `load_policy`.
-        domain: Its domain.
-        part: The domain's part of the page.
-    """
+    """Return what the page has to know of an agent and its domain besides models and graphs."""
+    kept = ("name", "low", "high", "unit", "help", "default")
     controls = [
-        {
-            "name": control.parameter.name,
-            "low": control.parameter.low,
-            "high": control.parameter.high,
-            "unit": control.parameter.unit,
-            "help": control.parameter.help,
-            "default": control.parameter.default,
-            "circular": control.circular,
-            "rate": control.rate,
-        }
+        {key: getattr(control.parameter, key) for key in kept} | {"circular": control.circular, "rate": control.rate}
         for control in domain.controls
     ]
     told = part.told()
@@ -170,7 +152,7 @@ def manifest_of(agent: LoadedPolicy, domain: Domain, part: PagePart) -> dict[str
         "kind": part.kind,
         "title": part.title,
         "summary": part.summary,
-        "style_space": json.loads(agent.space.to_json()),
+        "style_space": agent.space.to_dict(),
         "default_style": agent.space.default.tolist(),
         "controls": controls,
         "opens": dict(part.opens),
