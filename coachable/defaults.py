@@ -110,15 +110,7 @@ class RewardMeasures:
         return found
 
     def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
-        """Compute means over the steps that count; see `StyleMeasures.summarise`.
-
-        Args:
-            record: Outputs of `step` (T, N), by name.
-            alive: Steps that count (T, N) bool.
-
-        Returns:
-            Means (N,) by name.
-        """
+        """Return means (N,) over the steps that count, by name; see `StyleMeasures.summarise`."""
         return {name: torch.where(alive, values, torch.nan).nanmean(0) for name, values in record.items()}
 
     def complies(self, record: Mapping[str, Tensor]) -> Tensor:
@@ -161,10 +153,6 @@ class EnvPictures:
 
     def draw(self, env: EnvBase, row: int = 0) -> np.ndarray:
         """Draw a picture (height, width, 3) uint8 of one row of a batch.
-
-        Args:
-            env: Environment of any batch size.
-            row: Row of the batch.
 
         Raises:
             RenderingError: If the environment draws no pictures; the message says what to declare instead.
@@ -281,9 +269,6 @@ def style_grid(space: StyleSpace) -> list[dict[str, Any]]:
 
     These are all combinations if there are at most 36. Otherwise one parameter is varied at a time, with the others at
     their defaults.
-
-    Args:
-        space: The style space.
     """
     numeric = [p for p in space.parameters if not isinstance(p, Choice)]
     count = _GRID[0] if len(numeric) == 1 else _GRID[1]

@@ -61,12 +61,7 @@ class Renderer(Protocol):
     """Renderer of one env of a batch."""
 
     def draw(self, env: EnvBase, row: int = 0) -> np.ndarray:
-        """Draw a picture (height, width, 3) uint8 of one row of the batch.
-
-        Args:
-            env: The environment.
-            row: Row of the batch.
-        """
+        """Draw a picture (height, width, 3) uint8 of one row of the batch."""
         ...
 
     def close(self) -> None:
@@ -133,14 +128,7 @@ class Push:
     unit: str
 
     def fit(self, forward: float, left: float) -> tuple[float, float]:
-        """Scale a push down to the largest strength.
-
-        Args:
-            forward: Strength in the agent's direction, in `unit`.
-            left: Strength to its left.
-
-        Returns:
-            Strength forward and to the left.
+        """Scale a push, by its strength forward and to the left, down to the largest strength.
 
         Raises:
             ValueError: If a component is not finite.

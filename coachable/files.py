@@ -207,12 +207,7 @@ def check_contained(folder: Path) -> None:
 
 
 def write_text(file: Path, text: str) -> None:
-    """Write a text file and sync it to disk.
-
-    Args:
-        file: File to write.
-        text: Its content.
-    """
+    """Write a text file and sync it to disk."""
     with file.open("w", encoding="utf-8") as stream:
         stream.write(text)
         stream.flush()

@@ -23,9 +23,6 @@ def located(source: Path | str) -> Path:
 
     A file of this name, or a folder that holds a run or a checkpoint, goes before the shipped agent. Any other folder
     does not.
-
-    Args:
-        source: Path, or name of a shipped agent.
     """
     path = Path(source).expanduser()
     if str(source) not in shipped_agents() or path.is_file() or any(any(path.glob(name)) for name in _OF_RUNS):
@@ -34,10 +31,7 @@ def located(source: Path | str) -> Path:
 
 
 def require_agent(source: str) -> None:
-    """Check that a source can be an agent.
-
-    Args:
-        source: What the command line names.
+    """Check that a source from the command line can be an agent.
 
     Raises:
         ValueError: If it cannot; the message lists the agents that ship with weights.

@@ -35,9 +35,9 @@ class Signal:
     def __post_init__(self) -> None:
         if self.width < 1:
             raise ValueError(f"signal {self.name!r} has the width {self.width}: expected at least 1")
-        given = {"units": self.width if isinstance(self.unit, str) else len(self.unit), "names": len(self.entries)}
-        for what, count in given.items():
-            if count not in ((self.width,) if what == "units" else (0, self.width)):
+        units = self.width if isinstance(self.unit, str) else len(self.unit)
+        for what, count in (("units", units), ("names", len(self.entries) or self.width)):
+            if count != self.width:
                 raise ValueError(f"signal {self.name!r} has {count} {what}: expected one for each of {self.width}")
 
     def label(self, index: int) -> str:

@@ -66,8 +66,7 @@ def graph_of(function: nn.Module, example: Mapping[str, Tensor], outputs: Sequen
 def forget_sources(model: Any) -> None:
     """Remove, in place, where in the source code each part of a model comes from, which names folders of this machine.
 
-    Args:
-        model: The model, an `onnx.ModelProto`, without its contract.
+    The model, an `onnx.ModelProto`, must not have its contract yet.
     """
     for part in list(parts_of(model)):
         for name in {"doc_string", "metadata_props"}.intersection(part.DESCRIPTOR.fields_by_name):

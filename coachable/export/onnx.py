@@ -101,13 +101,7 @@ def write_onnx(agent: LoadedPolicy, domain: Domain | None, out: Path) -> float:
 
 
 def contract_of(agent: LoadedPolicy, plain: DeterministicAction, domain: Domain | None) -> Contract:
-    """Return the contract of an agent, without a recording.
-
-    Args:
-        agent: Agent from `load_policy`.
-        plain: Its deterministic policy.
-        domain: Its domain, if it is known.
-    """
+    """Return the contract of an agent with a deterministic policy, without a recording."""
     observed, acted = widths_of(agent)
     signals = domain.observation_groups if domain else (), domain.action_groups if domain else ()
     environment = agent.config.get("env", {})
@@ -126,12 +120,7 @@ def contract_of(agent: LoadedPolicy, plain: DeterministicAction, domain: Domain 
 
 
 def largest_difference(file: Path, plain: DeterministicAction, space: StyleSpace) -> float:
-    """Compare the file, run by onnxruntime, with torch on random inputs, in batches of 1 and of all.
-
-    Args:
-        file: The ONNX file.
-        plain: The policy that it was made from.
-        space: Style space from whose training distribution styles are drawn.
+    """Compare a file, run by onnxruntime, with its policy in torch on random inputs, in batches of 1 and of all.
 
     Returns:
         Largest absolute difference of actions, axes and probabilities; for choices, by how much the file's choice is

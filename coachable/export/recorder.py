@@ -96,13 +96,7 @@ def neutral_action(contract: Contract) -> np.ndarray:
 
 
 def record(rig: Rig, contract: Contract, policy: OnnxRun) -> Recorded:
-    """Record the runs of a contract: the policy's, one at rest, and one step for each entry of the action.
-
-    Args:
-        rig: The environment.
-        contract: Contract without a recording.
-        policy: The exported policy.
-    """
+    """Record the runs of a contract: the exported policy's, one at rest, and a step for each entry of the action."""
     styles = [contract.space.default]
     styles += contract.space.sample((STEPS // STYLE_STEPS,), torch.Generator().manual_seed(SEED)).unbind()
     asked: list[np.ndarray] = []

@@ -57,17 +57,7 @@ class Steps:
 
 
 def step_graph(steps: Steps) -> Any:
-    """Return the graph of a control step, with the inputs `memory`, `action` and `style` and the outputs `OUTPUTS`.
-
-    Args:
-        steps: The control step.
-
-    Returns:
-        The model, an `onnx.ModelProto`.
-
-    Raises:
-        ImportError: If the extra `export` is not installed.
-    """
+    """Return the graph of a control step, with the inputs `memory`, `action` and `style` and the outputs `OUTPUTS`."""
     given = {"memory": steps.memory, "action": steps.action}
     launched, inputs = steps.command(*given.values())
     moved = {_LAUNCHED: launched, "constants": inputs}
