@@ -43,7 +43,7 @@ def save_object(thing: Any, known: dict[int, tuple[int, Any]] | None = None) -> 
         UnsavableError: If an attribute is of an unknown kind.
     """
     kind = type(thing).__name__
-    changing = {name: value for name, value in vars(thing).items() if not _is_constant(value)}
+    changing = {n: v for n, v in vars(thing).items() if not (isinstance(v, _CODE) or _is_one_of(v, _CONSTANT))}
     known = {} if known is None else known
     return {name: _pack(value, f"{kind}.{name}", known) for name, value in changing.items()}
 
@@ -137,10 +137,6 @@ def _unpack(saved: Any, present: Any, where: str, known: list[Any]) -> Any:
     else:
         raise UnsavableError(f"{where} is of type {type(present).__name__} here, and was of another kind when saved")
     return present
-
-
-def _is_constant(value: Any) -> bool:
-    return isinstance(value, _CODE) or _is_one_of(value, _CONSTANT)
 
 
 def _is_one_of(value: Any, kinds: dict[str, tuple[str, ...]]) -> bool:

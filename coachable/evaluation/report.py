@@ -235,7 +235,7 @@ class _Sections:
         """Add task success over the amount of style along each weight, if there are weights."""
         if not self.runs[0].sweeps:
             return
-        success = _success(self.runs, self.formats)
+        success = next((name for name in self.formats if name in self.runs[0].sweeps[0].episodes), "survived")
         draw_tradeoffs(self.runs, success, self.formats.get(success, ""), self.out / "tradeoffs.png", self.titles)
         rows = [
             {"weight": sweeps[0].weight, "value": float(value), "style": sweep_estimate(sweeps, sweeps[0].score, i)}
@@ -282,11 +282,6 @@ def _number(text: str) -> float | str:
         return float(text)
     except ValueError:
         return text
-
-
-def _success(runs: Sequence[Run], formats: Mapping[str, str]) -> str:
-    """Return the first published metric, which measures success at the task."""
-    return next((name for name in formats if name in runs[0].sweeps[0].episodes), "survived")
 
 
 def _text(styles: StyleTable, runs: Sequence[Run], formats: Mapping[str, str], out: Path) -> str:

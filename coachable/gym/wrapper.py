@@ -116,9 +116,7 @@ class StyleWrapper(gymnasium.Wrapper, RecordConstructorArgs):
         observation, info = self.env.reset(seed=seed, options=options)
         if seed is not None:
             self._generator.manual_seed(derive_seed(seed, STYLE))
-        drawn = self.space.sampler.sample(
-            (), self._generator
-        )  # also where one is held, so that seeded draws stay aligned
+        drawn = self.space.sample((), self._generator)  # also where one is held, so that seeded draws stay aligned
         self._style = drawn if self._held is None else self._held
         return self._shown(observation), {**info, STYLE: self._style.numpy().copy()}
 

@@ -2,8 +2,7 @@
 
 import pytest
 
-from coachable.coach.phrases.fitting import fitting
-from coachable.coach.phrases.grammar import StyleGrammar
+from coachable.coach.phrases.grammar import StyleGrammar, fitting
 from coachable.domain import load_domain
 from coachable.domains.combat.styles import combat_style_space
 from coachable.domains.humanoid import gait_style_space, humanoid_style_space

@@ -14,7 +14,7 @@ from coachable.coach.page.api import CoachApi
 from coachable.coach.page.film import FilmStudio
 from coachable.coach.page.server import serve_api
 from coachable.coach.page.views import View, make_view
-from coachable.coach.page.widgets import Chart, MeasuredText, ParameterWidget, escaped, label, write
+from coachable.coach.page.widgets import Chart, MeasuredText, ParameterWidget, escaped, write
 from coachable.coach.phrases.grammar import Understanding
 from coachable.coach.session.loop import LiveLoop
 from coachable.coach.session.plan import read_plan
@@ -22,7 +22,7 @@ from coachable.coach.session.readout import StyleReport
 from coachable.coach.session.recording import Recording
 from coachable.coach.session.session import CoachSession
 from coachable.domain import Domain, Push
-from coachable.evaluation.wording import measured_text, measures_by_parameter
+from coachable.evaluation.wording import measured_text, measures_by_parameter, with_unit
 from coachable.keys import TASK_REWARD
 from coachable.styles import Parameter, StyleSpace
 
@@ -125,7 +125,7 @@ class CoachPage:
 
     def _add_widget(self, parameter: Parameter, value: float | str, request: Callable[[ParameterWidget], None]) -> None:
         name = parameter.name
-        title = label(parameter, self.session.domain.words)
+        title = with_unit(self.session.domain.words.name(name), parameter.unit)
         self.widgets[name] = ParameterWidget(self.server, parameter, value, lambda: request(self.widgets[name]), title)
 
     def _add_push(self, push: Push) -> None:

@@ -10,14 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from coachable.coach.session.readout import StyleReport
-from coachable.domain import Domain, Words
-from coachable.evaluation.wording import (
-    measured_text,
-    measures_by_parameter,
-    readable,
-    readable_number,
-    with_unit,
-)
+from coachable.domain import Domain
+from coachable.evaluation.wording import measured_text, measures_by_parameter, readable, readable_number
 from coachable.scene import palette
 from coachable.scene.palette import css
 from coachable.styles import Choice, Parameter, StyleSpace, Weight
@@ -254,11 +248,6 @@ def _ends(parameter: Parameter, lines: Sequence[np.ndarray]) -> tuple[float, flo
     below = max(0.5, math.ceil((low - min(line.min() for line in lines)) / step))
     above = max(0.5, math.ceil((max(line.max() for line in lines) - high) / step))
     return low - below * step, high + above * step
-
-
-def label(parameter: Parameter, words: Words) -> str:
-    """Return the name and unit of a parameter, in the words of its domain."""
-    return with_unit(words.name(parameter.name), parameter.unit)
 
 
 def trained(parameter: Parameter) -> str:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import cast
+from dataclasses import dataclass, field, replace
+from typing import Any, cast
 
 from coachable.coach.phrases import segments
 from coachable.coach.phrases.amounts import Last, amount, dimension_of, wrapped
 from coachable.coach.phrases.segments import Mention, Segment
 from coachable.coach.phrases.vocabulary import FILLERS, RESERVED, stem, tokenise
+from coachable.domain import Words
 from coachable.evaluation.wording import readable, readable_number
 from coachable.styles import Choice, Parameter, StyleSpace, Weight
 
@@ -332,6 +333,30 @@ def read_meaning(meaning: str) -> tuple[tuple[str, ...], int, str]:
     if len(signs) > 1:
         raise ValueError(f"the vocabulary has words for {meaning!r}: expected the same sign before all names, or none")
     return tuple(name.lstrip("+-") for name in names.split()), signs.pop(), value
+
+
+def fitting(words: Words, parameters: Sequence[Parameter]) -> Words:
+    """Leave out the words and presets of parameters and options that an agent does not have.
+
+    Args:
+        words: Words of the domain.
+        parameters: Parameters of the agent's style space and of the live controls.
+
+    Returns:
+        The words of the domain that name only these parameters and their options.
+    """
+    options = {p.name: p.options for p in parameters}
+
+    def known(name: str, value: Any) -> bool:
+        return name in options and (not options[name] or value in ("", *options[name]))
+
+    def means(meaning: str) -> bool:
+        named, _, value = read_meaning(meaning)
+        return all(known(name, value) for name in named)
+
+    vocabulary = {meaning: phrases for meaning, phrases in words.vocabulary.items() if means(meaning)}
+    presets = {name: style for name, style in words.presets.items() if all(known(*item) for item in style.items())}
+    return replace(words, vocabulary=vocabulary, presets=presets)
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -13,8 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from coachable.coach.phrases.fitting import fitting
-from coachable.coach.phrases.grammar import StyleGrammar, Understanding
+from coachable.coach.phrases.grammar import StyleGrammar, Understanding, fitting
 from coachable.coach.session.live_controls import LiveControls
 from coachable.coach.session.live_episodes import LiveEpisodes
 from coachable.coach.session.readout import MeasuredWindow, StyleReport

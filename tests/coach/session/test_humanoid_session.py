@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from coachable.coach.phrases.fitting import fitting
+from coachable.coach.phrases.grammar import fitting
 from coachable.coach.session.recording import Recording
 from coachable.coach.session.session import CoachSession
 from coachable.domain import load_domain
