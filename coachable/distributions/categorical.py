@@ -180,14 +180,9 @@ def hard_one_hots(pi: Tensor, layout: HeadLayout) -> Tensor:
 
 
 def most_likely_one_hots(weights: Tensor, layout: HeadLayout) -> Tensor:
-    """Return one-hots of the largest weight of each head, of the first one if several are equal.
+    """Return one-hots `(..., layout.total)` of each head's largest weight, of the first one if several are equal.
 
-    Args:
-        weights: Weights of all heads `(..., sum of sizes)`, at least 0.
-        layout: Layout of the heads.
-
-    Returns:
-        One-hots `(..., sum of sizes)`.
+    Weights `(..., layout.total)` must not be negative.
     """
     padded = layout.pad(weights.detach())
     one_hots = torch.zeros_like(padded).scatter_(-1, padded.argmax(-1, keepdim=True), 1.0)

@@ -59,13 +59,8 @@ def evaluate_styles(
 ) -> tuple[str, StyleGrid]:
     """Evaluate an agent in the styles of its domain's grid, in the domain's trials, and while the style switches.
 
-    The files are `grid.csv`, `response.csv`, `medians.csv`, `trials.csv`, `report.md`, `grid.png` and `summary.json`.
-
-    Args:
-        domain: Domain of the agent.
-        agent: Policy and its style space.
-        out: Existing folder for the results.
-        settings: Numbers of episodes and settings of the rollouts.
+    The files in the existing folder `out` are `grid.csv`, `response.csv`, `medians.csv`, `trials.csv`, `report.md`,
+    `grid.png` and `summary.json`.
 
     Returns:
         The report as Markdown, and the measurements in the styles of the grid.
@@ -87,11 +82,6 @@ def evaluate_styles(
 def evaluate_trials(domain: Domain, agent: LoadedPolicy, settings: EvaluationSettings) -> list[dict[str, Any]]:
     """Count the episodes that survive in each of a domain's trials, in the agent's default style.
 
-    Args:
-        domain: Domain with the trials.
-        agent: Policy and its style space.
-        settings: Number of episodes and settings of the rollouts.
-
     Returns:
         One row per trial with its label, the number of episodes, how many of them survived, and the 95 % Wilson
         interval of their share.
@@ -111,10 +101,6 @@ def evaluate_trials(domain: Domain, agent: LoadedPolicy, settings: EvaluationSet
 
 def median_rows(domain: Domain, grid: StyleGrid) -> list[dict[str, Any]]:
     """Return the median, the lowest and the highest style of each published metric of a domain that has targets.
-
-    Args:
-        domain: Domain with the columns and the targets.
-        grid: Measurements in all styles.
 
     Returns:
         Rows with the metric, its unit, the three values, its target and whether the median meets it; the last two are

@@ -91,13 +91,7 @@ def train_seeds(script: Path, arguments: Sequence[str], seeds: Sequence[int], fo
 
 
 def seed_table(folder: Path, seeds: Sequence[int], failed: Mapping[int, str]) -> str:
-    """Return the last metrics of the trainings as a table, with the mean and the standard deviation over the seeds.
-
-    Args:
-        folder: Folder of the trainings.
-        seeds: The seeds.
-        failed: From `train_seeds`.
-    """
+    """Return the last metrics of the trainings of `train_seeds`, with their mean and standard deviation, as a table."""
     last = {f"seed {seed}": {name: _last(folder / f"seed_{seed}", name) for name in _SHOWN} for seed in seeds}
     return table_of(side_by_side(last), ".6g") + "".join(f"seed {seed}: {why}\n" for seed, why in failed.items())
 

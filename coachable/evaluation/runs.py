@@ -83,7 +83,7 @@ def estimate(scores: np.ndarray | Sequence[float]) -> Estimate:
 
 
 def sweep_estimate(sweeps: Sequence[WeightSweep], metric: str, position: int) -> Estimate:
-    """Aggregate a metric over the runs' sweeps of one weight, at the value of the weight with an index."""
+    """Aggregate a metric over the runs' sweeps of one weight, at its value number `position`."""
     return estimate([mean_of(sweep.episodes[metric][position]) for sweep in sweeps])
 
 

@@ -50,14 +50,8 @@ def evaluate_switching(
 ) -> SwitchReport:
     """Evaluate a policy with a new style from the training distribution every `SWITCH_PERIOD` steps.
 
-    No switch counts if compliance cannot be judged in any step, such as savings of fuel without a comparison.
-
-    Args:
-        domain: Domain in which the policy acts.
-        policy: Policy that reads `observation` and `style`.
-        space: Its style space.
-        episodes: Number of episodes.
-        **options: See `RolloutOptions`.
+    No switch counts if compliance cannot be judged in any step, such as savings of fuel without a comparison. The
+    arguments are those of `evaluate_grid`, but `episodes` is the number of all episodes.
     """
     generator = torch.Generator().manual_seed(options.get("seed", 0))
     steps = options.get("steps") or domain.episode_steps

@@ -36,10 +36,6 @@ def checked_features(features: ArrayLike) -> np.ndarray:
 def flat_observation(space: spaces.Space, observation: Any) -> np.ndarray:
     """Return an observation as a vector (D,), where D is `flatdim(space)`.
 
-    Args:
-        space: Space of the observation.
-        observation: An element of it.
-
     Raises:
         ValueError: If the observation is not of that kind, such as a dictionary without one of the space's keys.
     """

@@ -31,7 +31,7 @@ class RowStorage(LazyTensorStorage):
         return self._storage.apply(lambda entry: entry.index_select(0, indices), batch_size=indices.shape)
 
     def _has_rows(self, indices: Any) -> bool:
-        """Whether `indices` are numbers of records in one dimension, none of them negative."""
+        """Return whether `indices` are numbers of records in one dimension, none of them negative."""
         if not isinstance(self._storage, TensorDictBase) or not isinstance(indices, Tensor):
             return False
         if indices.dtype != torch.long or indices.ndim != 1 or not indices.numel():

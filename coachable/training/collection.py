@@ -181,11 +181,7 @@ def collector_state(collector: BaseCollector | AsyncCollector) -> dict[str, Any]
 
 
 def load_collector_state(collector: BaseCollector | AsyncCollector, state: dict[str, Any]) -> None:
-    """Restore what `collector_state` returned.
-
-    Args:
-        collector: A new collector, made like the saved one.
-        state: From `collector_state`.
+    """Restore what `collector_state` returned, into a new collector that was made like the saved one.
 
     Raises:
         UnsavableError: If the running episodes cannot be continued. They restart, and everything else is restored.

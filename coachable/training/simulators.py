@@ -48,11 +48,7 @@ def save_simulator(env: EnvBase) -> dict[str, Any]:
 
 
 def load_simulator(env: EnvBase, state: dict[str, Any]) -> None:
-    """Restore what `save_simulator` returned.
-
-    Args:
-        env: Environment made like the saved one, and reset.
-        state: From `save_simulator`.
+    """Restore what `save_simulator` returned, into an environment that was made like the saved one, and reset.
 
     Raises:
         UnsavableError: If a part cannot be restored. Reset the environment then.

@@ -131,12 +131,9 @@ def _exported(file: Path) -> LoadedPolicy:
 
 
 def domain_of(agent: LoadedPolicy) -> Domain:
-    """Return the domain of an agent, configured as in its training.
+    """Return the domain of an agent from `load_policy`, configured as in its training.
 
     The returned domain's `make_env` raises a `CheckpointError` if an environment does not fit the agent.
-
-    Args:
-        agent: From `load_policy`.
 
     Raises:
         ValueError: If there is no such domain.

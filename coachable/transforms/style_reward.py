@@ -39,19 +39,16 @@ class StyleRewardTransform(Transform):
         theta = tensordict.get(STYLE, None)
         features = next_tensordict.get(STYLE_FEATURES, None)
         task_reward = next_tensordict.get(TASK_REWARD, None)
-        if theta is None or features is None or task_reward is None:
-            raise KeyError(self._what_is_missing(tensordict, next_tensordict))
-        value = self.style_reward(features, theta)
-        next_tensordict.set(STYLE_REWARD, value)
-        return next_tensordict.set("reward", task_reward + value)
-
-    def _what_is_missing(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> str:
-        if STYLE not in tensordict.keys(True):
-            return (
+        if theta is None:
+            raise KeyError(
                 f"step got no {STYLE}, only {_listed(tensordict.keys())}: "
                 "put a StyleSampler before StyleRewardTransform, and keep its key in the tensordict."
             )
-        return f"after a step the environment emitted {_listed(next_tensordict.keys())}: {_EXPECTED}"
+        if features is None or task_reward is None:
+            raise KeyError(f"after a step the environment emitted {_listed(next_tensordict.keys())}: {_EXPECTED}")
+        value = self.style_reward(features, theta)
+        next_tensordict.set(STYLE_REWARD, value)
+        return next_tensordict.set("reward", task_reward + value)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         task_reward = tensordict_reset.get(TASK_REWARD, None)
