@@ -62,11 +62,7 @@ class Recorded:
 
     @classmethod
     def from_json(cls, text: str, widths: tuple[int, int, int]) -> Recorded:
-        """Read the output of `to_json`.
-
-        Args:
-            text: The JSON text.
-            widths: Widths of observation, style and action.
+        """Read the output of `to_json`, given the widths of observation, style and action.
 
         Raises:
             ContractError: If it is something else, or if its arrays do not fit the widths or each other.

@@ -122,13 +122,7 @@ class OnnxPolicy(TensorDictModuleBase):
 
 
 def read_model(file: Path | str) -> tuple[Contract, OnnxRun]:
-    """Read an exported model, which may come from anybody.
-
-    Args:
-        file: ONNX file.
-
-    Returns:
-        The contract and the graph.
+    """Read an exported model, an ONNX file that may come from anybody: its contract and its graph.
 
     Raises:
         CheckpointError: If there is no such file, it is damaged, or it has no contract that this release reads; the

@@ -100,12 +100,7 @@ class ActionHeads:
         return torch.cat([*parts, axes] if axes is not None else parts, -1)
 
     def spec(self, batch_shape: Sequence[int] = (), device: torch.device | str | None = None) -> TensorSpec:
-        """Return the action spec `(*batch_shape, action_dim)`: `Bounded` for axes only, else `MixedActionSpec`.
-
-        Args:
-            batch_shape: Shape before the action's dimension.
-            device: Device of the spec.
-        """
+        """Return the action spec `(*batch_shape, action_dim)`: `Bounded` for axes only, else `MixedActionSpec`."""
         shape = torch.Size((*batch_shape, self.action_dim))
         if not self.categorical:
             return Bounded(-1.0, 1.0, shape=shape, device=device, dtype=torch.float32)
@@ -150,14 +145,7 @@ class MixedActionSpec(TensorSpec):
         return MixedActionSpec(self.heads, shape, device=self.device, dtype=self.dtype)
 
     def rand(self, shape: Sequence[int] | None = None) -> Tensor:
-        """Draw every head and every axis uniformly and independently.
-
-        Args:
-            shape: Batch shape before that of the spec.
-
-        Returns:
-            Actions `(*shape, ..., action_dim)`.
-        """
+        """Draw actions `(*shape, ..., action_dim)`, every head and every axis uniformly and independently."""
         full = torch.Size((*(() if shape is None else shape), *self.shape))
         action = torch.empty(full, device=self.device, dtype=self.dtype)
         one_hots, axes = self.heads.split(action)

@@ -68,11 +68,6 @@ class Ranking:
 def input_groups(domain: Domain, space: StyleSpace, observation_dim: int) -> list[Group]:
     """List the domain's observation groups, or every entry as a group of its own, followed by the style parameters.
 
-    Args:
-        domain: Domain that declares the groups.
-        space: Style space of the policy.
-        observation_dim: Width of the observation.
-
     Raises:
         ValueError: If the widths of the groups do not add up to that of the observation.
     """

@@ -22,11 +22,6 @@ def read_metric(run: Path, x: str, y: str) -> tuple[np.ndarray, np.ndarray]:
 
     The stages of a run follow one another: each begins where the one before ended.
 
-    Args:
-        run: The run's folder.
-        x: Column of the horizontal axis.
-        y: Column to draw.
-
     Returns:
         The values (n,) of both columns.
 
@@ -78,13 +73,7 @@ def _numbers(table: Path, rows: list[dict[str, str]], x: str, y: str) -> tuple[l
 
 
 def summarise_runs(runs: Sequence[Path], x: str, y: str, smooth: int = 5) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute the mean curve of several runs and its 95 % bootstrap interval.
-
-    Args:
-        runs: The runs' folders, one per seed.
-        x: Column of the horizontal axis.
-        y: Column to draw.
-        smooth: Number of rows of the moving average over each run.
+    """Compute the mean curve of the runs of several seeds and its 95 % bootstrap interval; see `draw_learning_curves`.
 
     Returns:
         Horizontal positions (P,) that all runs cover, means (P,), and intervals (2, P).

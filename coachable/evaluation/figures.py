@@ -146,11 +146,7 @@ def draw_style_grid(grid: StyleGrid, domain: Domain, space: StyleSpace, path: Pa
 
 
 def grid_lines(cells: Sequence[dict[str, Any]], space: StyleSpace) -> tuple[str | None, dict[str, list[int]]]:
-    """Choose the horizontal axis and the lines of a figure of a style grid.
-
-    Args:
-        cells: Styles by parameter name.
-        space: Their style space.
+    """Choose the horizontal axis and the lines of a figure of a style grid, whose cells are styles by parameter name.
 
     Returns:
         The numeric parameter with most values, and the cells of each combination of the others, by label. None and an

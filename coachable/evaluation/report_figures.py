@@ -99,12 +99,8 @@ def draw_switches(runs: Sequence[Run], period_seconds: float, path: Path) -> Non
 def draw_tradeoffs(runs: Sequence[Run], success: str, form: str, path: Path, titles: Mapping[str, str]) -> None:
     """Draw task success over the amount of style along each weight, from neutral to maximum (Pareto curves).
 
-    Args:
-        runs: Evaluations, over which the 95 % intervals are estimated.
-        success: Metric of task success.
-        form: Format of its values, such as ".0%".
-        path: Image file to write.
-        titles: Labels of the axes by metric.
+    The 95 % intervals are over the runs. `success` names a metric and `form` the format of its values, such as ".0%";
+    `titles` are labels of the axes by metric.
     """
     with _panels(path, len(runs[0].sweeps)) as panels:
         for panel, sweeps in zip(panels, zip(*(run.sweeps for run in runs), strict=True), strict=False):

@@ -103,12 +103,7 @@ def paragraph(text: str) -> str:
 
 
 def picture(path: Path, description: str) -> str:
-    """Return a PNG file as inline HTML, at the scale that all pictures share.
-
-    Args:
-        path: PNG file.
-        description: Text for readers who do not see it.
-    """
+    """Return a PNG file as inline HTML with a description in words, at the scale that all pictures share."""
     content = path.read_bytes()
     width = int.from_bytes(content[16:20], "big")  # from the header (PNG specification, IHDR)
     data = base64.b64encode(content).decode()

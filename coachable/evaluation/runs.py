@@ -144,11 +144,7 @@ class StyleTable:
 
 
 def response_rows(runs: Sequence[Run], space: StyleSpace) -> list[dict[str, Any]]:
-    """Estimate over the runs how measured set-points follow their requests (`StyleGrid.response`).
-
-    Args:
-        runs: Evaluations of the same grid.
-        space: The style space.
+    """Estimate over runs of the same grid how measured set-points follow their requests (`StyleGrid.response`).
 
     Returns:
         One row per set-point; `slope`, `rank_correlation` and `mean_error` are estimates over the runs.

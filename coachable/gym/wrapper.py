@@ -123,9 +123,6 @@ class StyleWrapper(gymnasium.Wrapper, RecordConstructorArgs):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Make a step and add the reward of the style in the observation before it.
 
-        Args:
-            action: Action of the environment.
-
         Returns:
             Observation, the environment's reward plus the style reward, terminated, truncated, and the environment's
             info with the raw style `(d,)` of the next observation, `task_reward` and `style_reward`.

@@ -107,11 +107,7 @@ class StratifiedSampler(Sampler):
         self._pending_leaves: Tensor | None = None
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict[str, Any]]:
-        """Draw slots, grouped by table.
-
-        Args:
-            storage: The buffer's storage.
-            batch_size: Number of slots.
+        """Draw slots of the buffer's storage, grouped by table.
 
         Returns:
             Slots `(batch_size,)`, and a dictionary that contains `priority_weight` of that shape if prioritised. The

@@ -202,11 +202,7 @@ def find_checkpoint(path: Path | str) -> Path:
 
 
 def read_state(path: Path | str, device: torch.device | str = "cpu") -> dict[str, Any]:
-    """Read `state.pt` of a checkpoint, or a weights file, without executing anything from it.
-
-    Args:
-        path: A checkpoint's folder, or a file.
-        device: Device of the tensors.
+    """Read `state.pt` of a checkpoint's folder, or a weights file, without executing anything from it.
 
     Raises:
         CheckpointError: If the file is damaged, has another schema, would need pickle, or contains weights that are not

@@ -250,12 +250,7 @@ class Learner:
         self._watch.look()
 
     def _step(self, losses: dict[str, Tensor], *names: str) -> dict[str, Tensor]:
-        """Clip and step, unless a number is not finite; return the norms of the gradients before clipping.
-
-        Args:
-            losses: Losses whose gradients are applied, by name.
-            names: Groups of parameters to step.
-        """
+        """Clip and step groups of parameters unless a number is not finite; return their gradients' norms before."""
         norms = {f"grad_norm_{name}": self.backend.gradient_norm(name, self._params[name]) for name in names}
         self._require_finite({**losses, **norms}, names)
         for name, norm in zip(names, norms.values(), strict=True):

@@ -107,12 +107,7 @@ def loaded(loss_module: LossModule, _: Any) -> None:
 
 
 def follow(optimizer: torch.optim.Optimizer, params: list[nn.Parameter]) -> None:
-    """Replace the parameters of an optimiser with one group; its state is kept and cast to their dtype.
-
-    Args:
-        optimizer: Optimiser with one group.
-        params: New parameters, in the order of the present ones.
-    """
+    """Replace the parameters of an optimiser with one group, in their order; its state is kept in their dtype."""
     (group,) = optimizer.param_groups
     moment = optimizer.state[params[0]].get("exp_avg") if params[0] in optimizer.state else None
     same = all(new is old for new, old in zip(params, group["params"], strict=True))

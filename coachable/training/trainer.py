@@ -326,13 +326,7 @@ class Trainer:
         }
 
     def resume(self, path: Path | str) -> Path:
-        """Restore the state of a checkpoint of the same agent.
-
-        Args:
-            path: A run's folder or a checkpoint.
-
-        Returns:
-            The checkpoint's folder.
+        """Restore the state of a checkpoint, or of a run's newest one, of the same agent, and return its folder.
 
         Raises:
             CheckpointError: If there is no checkpoint, it is damaged, or style space or network shapes differ.

@@ -19,16 +19,9 @@ _MASK = (1 << 64) - 1
 
 
 def derive_seed(seed: int, salt: str) -> int:
-    """Combine a seed with a name, so that streams with the same seed are independent.
+    """Combine a seed with the name of a stream to a seed below 2^63, so that streams are independent.
 
     The bits are mixed by the finaliser of splitmix64 (Steele et al. 2014).
-
-    Args:
-        seed: Seed of the run.
-        salt: Name of the stream.
-
-    Returns:
-        A seed below 2^63.
     """
     z = (int(seed) * 0x9E3779B97F4A7C15 + zlib.crc32(salt.encode())) & _MASK
     z = ((z ^ (z >> 30)) * 0xBF58476D1CE4E5B9) & _MASK

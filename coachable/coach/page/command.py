@@ -16,13 +16,7 @@ ENV_OPTIONS = (
 
 
 def add_parser(commands: Any, source_help: str, run: Callable[[argparse.Namespace], int]) -> None:
-    """Add the sub-command `coach` to the command line.
-
-    Args:
-        commands: Sub-parsers of the command line.
-        source_help: Help text of the argument that names the agent.
-        run: Function that runs the sub-command and returns its exit status.
-    """
+    """Add the sub-command `coach` to the sub-parsers of the command line; `run` returns its exit status."""
     text = "coach an agent while it acts, on a page in the browser"
     parser = commands.add_parser("coach", help=text, epilog=ENV_OPTIONS)
     parser.add_argument("source", help=source_help)

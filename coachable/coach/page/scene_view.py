@@ -104,11 +104,7 @@ class SceneView(View):
         self._look(stage.viewpoint)
 
     def update(self, share: float = 1.0) -> None:
-        """Show the present state, or one between the last two states.
-
-        Args:
-            share: Share of the control step that has passed.
-        """
+        """Show the present state, or one between the last two states; see `View.update`."""
         if not self._server.get_clients():
             return
         session = self._session

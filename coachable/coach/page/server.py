@@ -73,11 +73,7 @@ def serve_api(server: viser.ViserServer, api: CoachApi) -> None:
 
 
 def free_port(host: str, port: int) -> int:
-    """Find the first free port of an address.
-
-    Args:
-        host: Address to listen on.
-        port: First port to try; 0 finds any free one.
+    """Find the first free port of an address, from `port` on; 0 finds any free one.
 
     Raises:
         OSError: If one cannot listen at that address, or if 100 ports in a row are in use.

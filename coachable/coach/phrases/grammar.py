@@ -336,15 +336,7 @@ def read_meaning(meaning: str) -> tuple[tuple[str, ...], int, str]:
 
 
 def fitting(words: Words, parameters: Sequence[Parameter]) -> Words:
-    """Leave out the words and presets of parameters and options that an agent does not have.
-
-    Args:
-        words: Words of the domain.
-        parameters: Parameters of the agent's style space and of the live controls.
-
-    Returns:
-        The words of the domain that name only these parameters and their options.
-    """
+    """Return the words and presets of a domain, without those of parameters and options that an agent does not have."""
     options = {p.name: p.options for p in parameters}
 
     def known(name: str, value: Any) -> bool:

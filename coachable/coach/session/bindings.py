@@ -88,10 +88,6 @@ def make_bindings(space: StyleSpace, controls: Sequence[Control] = ()) -> list[B
 
     Live controls come first, because they are changed most often.
 
-    Args:
-        space: The style space.
-        controls: Live controls of the domain.
-
     Example:
         >>> from coachable.styles import Setpoint
         >>> (binding,) = make_bindings(StyleSpace([Setpoint("gap", 0.0, 2.0)]))

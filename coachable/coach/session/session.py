@@ -329,12 +329,9 @@ class CoachSession:
         return self._timeline.recording(self._episodes.observation)
 
     def replay(self, recording: Recording) -> None:
-        """Start over as recorded; the following `recording.steps` steps repeat the session bit for bit.
+        """Start over as recorded with the same agent; the next `recording.steps` steps repeat the session bit for bit.
 
         A request, a changed control or a reset ends the replay.
-
-        Args:
-            recording: Recording of the same agent.
 
         Raises:
             ValueError: If the recording belongs to another domain, style space or set of controls; the session is
