@@ -99,10 +99,6 @@ class OnnxPolicy(TensorDictModuleBase):
 
     Choices are drawn by default, as the exported actor draws them. Axes are always the deterministic ones, because the
     file does not have their spread.
-
-    Args:
-        run: The model.
-        contract: Its contract.
     """
 
     def __init__(self, run: OnnxRun, contract: Contract) -> None:

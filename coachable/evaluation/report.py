@@ -17,15 +17,7 @@ from coachable.evaluation.episode_records import RolloutOptions
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.report_figures import draw_metrics, draw_requests, draw_switches, draw_tradeoffs
 from coachable.evaluation.report_page import Page, paragraph, picture, shown, table
-from coachable.evaluation.runs import (
-    Run,
-    StyleTable,
-    estimate,
-    evaluate_run,
-    flat_row,
-    response_rows,
-    sweep_estimate,
-)
+from coachable.evaluation.runs import Run, StyleTable, estimate, evaluate_run, flat_row, response_rows, sweep_estimate
 from coachable.evaluation.style_grid import acting, training_counts, write_csv
 from coachable.evaluation.switching import SWITCH_PERIOD
 from coachable.evaluation.wording import counted, heading_of, readable

@@ -63,12 +63,7 @@ footer { margin: 2rem 0 0; color: var(--soft); font-size: .8rem; overflow-wrap: 
 
 
 class Page:
-    """HTML page that is made of sections.
-
-    Args:
-        title: Title of the page.
-        lead: Paragraph below the title.
-    """
+    """HTML page of a title, a paragraph below it, and sections."""
 
     def __init__(self, title: str, lead: str) -> None:
         self.title, self.lead = title, lead

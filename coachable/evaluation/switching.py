@@ -41,12 +41,7 @@ class SwitchReport:
 
 
 def evaluate_switching(
-    domain: Domain,
-    policy: TensorDictModuleBase,
-    space: StyleSpace,
-    *,
-    episodes: int,
-    **options: Unpack[RolloutOptions],
+    domain: Domain, policy: TensorDictModuleBase, space: StyleSpace, *, episodes: int, **options: Unpack[RolloutOptions]
 ) -> SwitchReport:
     """Evaluate a policy with a new style from the training distribution every `SWITCH_PERIOD` steps.
 

@@ -28,10 +28,6 @@ SEED = 0
 class Rig:
     """One environment that can be run again and again from the same start; `close` it at the end.
 
-    Args:
-        domain: Domain of the environment.
-        space: Style space of the policy.
-
     Attributes:
         widths: Widths of its observation and action.
     """

@@ -52,12 +52,7 @@ class StyleWrapper(gymnasium.Wrapper, RecordConstructorArgs):
     """
 
     def __init__(
-        self,
-        env: gymnasium.Env,
-        style_reward: StyleReward,
-        features: Features,
-        *,
-        flat: bool = False,
+        self, env: gymnasium.Env, style_reward: StyleReward, features: Features, *, flat: bool = False
     ) -> None:
         _check_observation(env.observation_space, flat)
         RecordConstructorArgs.__init__(

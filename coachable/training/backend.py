@@ -23,11 +23,6 @@ class Backend:
     `torch.optim.Adam` and moves the target networks with TorchRL's `SoftUpdate`. To replace it, pass a subclass to
     :meth:`coachable.training.Learner.use_backend`, as `coachable.fast.accelerate` does.
 
-    Args:
-        loss_module: The loss.
-        precision: Precision of the matrix products.
-        target_updater: Moves the target networks.
-
     Attributes:
         compiles: Whether `torch.compile` may be applied to the loss functions.
     """

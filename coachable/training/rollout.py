@@ -63,10 +63,7 @@ class Rollout:
         return transition
 
     def episode(
-        self,
-        policy: Callable[[TensorDictBase], TensorDictBase],
-        steps: int,
-        style: StyleSchedule | None = None,
+        self, policy: Callable[[TensorDictBase], TensorDictBase], steps: int, style: StyleSchedule | None = None
     ) -> Iterator[tuple[TensorDictBase, Tensor]]:
         """Step the episodes that `begin` began until each one has ended.
 

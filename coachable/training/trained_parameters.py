@@ -37,9 +37,6 @@ class Watch:
     """Detector of parameters of a loss or its policy that were replaced, moved in memory or cast to another dtype.
 
     A parameter gets other memory by `tensor.data = other` or `.to(dtype)`, and its memory moves by `share_memory_()`.
-
-    Args:
-        loss_module: The loss.
     """
 
     def __init__(self, loss_module: LossModule) -> None:

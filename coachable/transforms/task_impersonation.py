@@ -52,11 +52,7 @@ class TaskImpersonation(Transform):
     """
 
     def __init__(
-        self,
-        style_reward: StyleReward,
-        n: int = 4,
-        seed: int = 0,
-        tables: Mapping[int, Sampler] | None = None,
+        self, style_reward: StyleReward, n: int = 4, seed: int = 0, tables: Mapping[int, Sampler] | None = None
     ) -> None:
         super().__init__(in_keys=[], out_keys=[])
         AMOUNT.check("n of TaskImpersonation", n)

@@ -40,9 +40,6 @@ class CoachApi:
 
     Requests are JSON objects with the entry `do`; docs/guides/coach_from_code.md lists them. Every change is made in
     the loop's thread before the next step, as those of the page are.
-
-    Args:
-        loop: Loop that steps the session.
     """
 
     def __init__(self, loop: LiveLoop) -> None:

@@ -49,10 +49,7 @@ _log.addHandler(logging.NullHandler())  # refused content must not be printed to
 
 
 class Guard:
-    """Guard that serves viser's page to its own origin and host names only.
-
-    Args:
-        host: Address that the server listens on.
+    """Guard that serves viser's page, at the address `host`, to its own origin and host names only.
 
     Attributes:
         active: Whether a guarded server was started.

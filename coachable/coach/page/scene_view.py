@@ -60,11 +60,6 @@ class SceneView(View):
 
     The world moves instead of the camera, because each viewer controls their own camera.
 
-    Args:
-        server: Server of the page.
-        session: The session.
-        stage: Description of the domain's scene.
-
     Attributes:
         frame: The frame of the last update.
         mode: Dropdown of what the camera does.
@@ -158,10 +153,7 @@ class SceneView(View):
         scene, name = self._server.scene, f"{_ROOT}/ground"
         self._still = [
             scene.add_mesh_simple(
-                f"{name}/{surface.name}",
-                surface.vertices.astype(np.float32),
-                surface.faces,
-                color=surface.colour,
+                f"{name}/{surface.name}", surface.vertices.astype(np.float32), surface.faces, color=surface.colour
             )
             for surface in backdrop.surfaces
         ]

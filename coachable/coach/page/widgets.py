@@ -28,12 +28,7 @@ _REQUESTED, _MEASURED = css(palette.REQUESTED), css(palette.MEASURED)
 class ParameterWidget:
     """Slider or dropdown of one parameter, which follows the session and requests changes.
 
-    Args:
-        server: Server of the page.
-        parameter: The parameter.
-        value: Current value.
-        ask: Called in viser's threads after the user changed the value.
-        title: What the widget is called.
+    It is called `title` on the page. Threads of viser call `ask` after the user changed the value.
     """
 
     def __init__(
@@ -83,14 +78,7 @@ class ParameterWidget:
 
 
 class MeasuredText:
-    """Line below a widget: the measured values, the trained range, and whether the request lay outside.
-
-    Args:
-        server: Server of the page.
-        parameter: The widget's parameter.
-        domain: The domain.
-        space: The style space.
-    """
+    """Line below a widget: the measured values, the trained range, and whether the request lay outside."""
 
     def __init__(self, server: viser.ViserServer, parameter: Parameter, domain: Domain, space: StyleSpace) -> None:
         self.parameter, self._domain, self._space = parameter, domain, space
@@ -132,12 +120,7 @@ class Chart:
     first points were drawn, and may show a part of the axis without data. The axis of the request shows the whole
     trained range, so that small deviations look small.
 
-    Args:
-        server: Server of the page.
-        folder: Folder of the page that contains the chart.
-        space: The style space.
-        domain: The domain.
-        redraw: Called in viser's threads after the user chose another parameter; `add` has to follow.
+    Threads of viser call `redraw` after the user chose another parameter; `add` has to follow.
     """
 
     def __init__(
@@ -221,11 +204,7 @@ class Chart:
         scales = {"x": uplot.Scale(time=False, range=(-_SPAN, 0.0)), "y": uplot.Scale(range=ends)}
         if apart and nothing_found:
             scales["right"] = uplot.Scale(range=(0.0, 1.0))
-        return {
-            "series": tuple(series),
-            "scales": scales,
-            "axes": tuple(axes),
-        }
+        return {"series": tuple(series), "scales": scales, "axes": tuple(axes)}
 
     def _requested(self, report: StyleReport) -> float:
         value = report.requested[self.shown]

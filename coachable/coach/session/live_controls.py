@@ -14,9 +14,6 @@ from coachable.domain import Control, Domain
 class LiveControls:
     """Live controls of a domain with their values.
 
-    Args:
-        domain: The domain.
-
     Attributes:
         controls: Live controls by name.
         values: Their values in force by name, in their units.
