@@ -20,9 +20,9 @@ REWARDS = (("next", "reward"), ("next", TASK_REWARD), ("next", STYLE_REWARD))
 class NStep:
     """Assembler of n-step transitions, which sum rewards over up to `n_steps` steps.
 
-    The transition at t gets `R_t = sum_{l<k} gamma^l r_{t+l}`, the `next` entries of step t+k-1, `steps_to_next_obs =
-    k` (TorchRL's key, which its value estimators read) and `discount = gamma^k`, both `(..., 1)`. k is `n_steps`, or
-    less if the episode ends first, terminated or truncated. A loss bootstraps unless `("next", "terminated")`.
+    The transition at t gets `R_t = sum_{l<k} gamma^l r_{t+l}`, the `next` entries of step t+k-1, and `steps_to_next_obs
+    = k` `(..., 1)` (TorchRL's key, from which losses compute the discount `gamma^k`). k is `n_steps`, or less if the
+    episode ends first, terminated or truncated. A loss bootstraps unless `("next", "terminated")`.
 
     Steps whose sum is incomplete are held back until the following steps arrive, so that several calls per episode give
     the same transitions as one. `flush` completes all sums at the end of the data.
@@ -127,8 +127,6 @@ class NStep:
                 total += torch.where(mask, self.gamma**lag * value[at], 0.0)
             out.set(key, total)
         out.set("steps_to_next_obs", count.unsqueeze(-1))
-        discount = torch.as_tensor(self.gamma, dtype=torch.float64).pow(count.cpu()).float()
-        out.set("discount", discount.to(device).unsqueeze(-1))
         return out
 
     def clear(self) -> None:

@@ -28,13 +28,12 @@ def test_n_step_closed_forms():
     plain = run(3)
     assert plain["next", "reward"].squeeze(-1).tolist() == [3.0, 6.0, 8.0, 8.0]
     assert plain["next", "task_reward"].squeeze(-1).tolist() == [30.0, 60.0, 80.0, 80.0]
-    assert plain["discount"].squeeze(-1).tolist() == [0.125, 0.125, 0.25, 0.5]
     assert plain["steps_to_next_obs"].squeeze(-1).tolist() == [3, 3, 2, 1]
     assert ("next", "style_features") not in plain.keys(True)
 
     cut = run(3, done=[1], terminated=[1])
     assert cut["next", "reward"].squeeze(-1).tolist() == [2.0, 2.0, 8.0, 8.0]
-    assert cut["discount"].squeeze(-1).tolist() == [0.25, 0.5, 0.25, 0.5]
+    assert cut["steps_to_next_obs"].squeeze(-1).tolist() == [2, 1, 2, 1]
     assert cut["next", "terminated"].squeeze(-1).tolist() == [True, True, False, False]
 
     truncated = run(3, done=[1])
@@ -85,7 +84,7 @@ def test_trajectories_that_were_interrupted_are_ended_alone():
     table = buffer.table("default")
     assert table["collector", "traj_ids"].tolist() == [8, 8]
     assert table["next", "reward"].flatten().tolist() == [2.0, 2.0]
-    assert table["discount"].flatten().tolist() == [0.25, 0.5] and not table["next", "terminated"].any()
+    assert table["steps_to_next_obs"].flatten().tolist() == [2, 1] and not table["next", "terminated"].any()
     buffer.extend(step([7, 9], 4.0))  # 9 is the environment of 8 after the interruption
     buffer.extend(step([7, 9], 8.0, hit=True))
     buffer.finish()
