@@ -120,20 +120,11 @@ def record_styles(
     progress: bool = True,
     **env_options: Any,
 ) -> EpisodeRecord:
-    """Run one episode per style in a domain, all of them in one batch.
+    """Run one episode per style in a domain, all of them in one batch, and record the domain's or other measures.
 
-    Args:
-        domain: Domain in which the policy acts.
-        policy: Policy that reads `observation` and `style`.
-        space: Its style space.
-        style: Theta (N, d) for whole episodes, or a function from the step to theta, for styles that change.
-        label: Label of the progress bar.
-        measures: Measures to record; by default the domain's measured style.
-        steps: See `RolloutOptions`.
-        seed: See `RolloutOptions`.
-        num_threads: See `RolloutOptions`.
-        progress: See `RolloutOptions`.
-        **env_options: Further arguments of `Domain.styled_env`.
+    Styles are theta (N, d) for whole episodes, or a function from the step to theta, for styles that change. The label
+    is that of the progress bar. `RolloutOptions` describes `steps`, `seed`, `num_threads` and `progress`; other options
+    are those of `Domain.styled_env`.
     """
     count = len(style(0) if callable(style) else style)
     return record_episodes(

@@ -54,13 +54,7 @@ def read_replay(replay: ReplayBuffer, folder: Path) -> int:
 
 
 def replay_bytes(replay: ReplayBuffer, env: EnvBase, keys: Iterable[NestedKey]) -> int:
-    """Return the size of a full buffer [bytes].
-
-    Args:
-        replay: The buffer, whose records may also hold the number of their table.
-        env: Batched environment whose transitions are stored.
-        keys: Keys of the stored entries of a transition.
-    """
+    """Return the size of a full buffer [bytes] of the entries `keys` of an environment's transitions."""
     transitions = env.fake_tensordict().select(*keys, strict=False)
     values = transitions.values(include_nested=True, leaves_only=True)
     record = sum(v.element_size() * v.numel() for v in values) // max(1, transitions.numel())

@@ -146,14 +146,7 @@ def estimate_update_seconds(parameters: int, batch_size: int, bf16: bool, device
     over policy, twin critics and twin targets). At width 512 these products take half of its time (measured); layer
     norms and small calls take the rest.
 
-    Args:
-        parameters: Number of weights of one network.
-        batch_size: Transitions per update.
-        bf16: Whether the update runs in bfloat16.
-        device: Device of the update.
-
-    Returns:
-        Seconds per update, correct to a factor of about two.
+    The result [s] is correct to a factor of about two; `parameters` is the number of weights of one network.
     """
     device = torch.device(device)
     dtype = torch.bfloat16 if bf16 else torch.float32
