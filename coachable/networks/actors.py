@@ -99,8 +99,15 @@ class GaussianPolicy(StyleNetwork):
     """Network of location and scale of a diagonal Gaussian over actions before the tanh.
 
     The trunk's input is `cat(observation, encode(theta))`. The scale is `exp(l + (h - l)/2 (tanh(raw) + 1))` with
-    `log_scale_range=(l, h)`; with `(-2, 2)` it is `exp(2 tanh(raw))`, as in the paper's RAC. The arguments are those of
-    :func:`make_gaussian_actor`.
+    `log_scale_range=(l, h)`; with `(-2, 2)` it is `exp(2 tanh(raw))`, as in the paper's RAC.
+
+    Args:
+        obs_dim: Width of the observation.
+        action_dim: Number of action dimensions.
+        space: Style space that encodes theta; None for a policy without style.
+        widths: Widths of the residual layers.
+        log_scale_range: Bounds of the logarithm of the scale.
+        **trunk: Further arguments of :class:`~coachable.networks.residual.ResidualMLP`.
     """
 
     def __init__(
@@ -120,7 +127,19 @@ class GaussianPolicy(StyleNetwork):
         self.log_scale_range = (float(low), float(high))
 
     def forward(self, observation: Tensor, style: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return location and scale of the tanh-Gaussian, both `(..., action_dim)` float32; see `head`."""
+        """Return location and scale of the tanh-Gaussian.
+
+        Args:
+            observation: Observation `(..., obs_dim)`.
+            style: Raw style `(..., d)`, encoded here; None without a style space.
+
+        Returns:
+            Location and scale, both `(..., action_dim)` float32. The scale is `exp(l + (h - l)(tanh(raw) + 1) / 2)`
+            with the bounds (l, h) of its logarithm.
+
+        Raises:
+            ValueError: If the network has a style space and `style` is None.
+        """
         loc, raw = self.head(observation, style).chunk(2, -1)
         low, high = self.log_scale_range
         return loc, torch.exp(torch.tanh(raw) * (0.5 * (high - low)) + 0.5 * (high + low))

@@ -51,7 +51,19 @@ class StyleCritic(StyleNetwork):
         self.action_features = action_features
 
     def forward(self, observation: Tensor, action: Tensor, style: Tensor | None = None) -> Tensor:
-        """Return the output `(..., outputs)` float32 for actions `(..., action_dim)`; see `head` for the others."""
+        """Return the critic's output.
+
+        Args:
+            observation: Observation `(..., obs_dim)`.
+            action: Action `(..., action_dim)`.
+            style: Raw style `(..., d)`, encoded here; None without a style space.
+
+        Returns:
+            Output `(..., outputs)` float32.
+
+        Raises:
+            ValueError: If the network has a style space and `style` is None.
+        """
         if self.action_features is None:
             return self.head(observation, style, action)
         return self.head(observation, style, action, self.action_features(action))

@@ -21,22 +21,40 @@ class MixedPolicy(StyleNetwork):
     """Network of the probabilities of the categorical heads, and of location and scale of the axes.
 
     The trunk's input is `cat(observation, encode(theta))`. Heads run in float32, also under autocast. The scale of the
-    axes is `exp(2 tanh(raw))` (paper). Their location is unbounded, and its tanh is the deterministic action. The
-    arguments are those of `make_mixed_actor`.
+    axes is `exp(2 tanh(raw))` (paper). Their location is unbounded, and its tanh is the deterministic action.
+
+    Args:
+        obs_dim: Width of the observation.
+        heads: Components of the action.
+        space: Style space that encodes theta; None for a policy without style.
+        widths: Widths of the residual layers.
+        **trunk: Further arguments of `ResidualMLP`.
     """
 
     def __init__(
-        self, obs_dim: int, heads: ActionHeads, space: StyleEncoding | None, widths: Sequence[int], **trunk: Any
+        self,
+        obs_dim: int,
+        heads: ActionHeads,
+        space: StyleEncoding | None,
+        widths: Sequence[int],
+        **trunk: Any,
     ) -> None:
         super().__init__(space, obs_dim, heads.num_parameters, widths, **trunk)
         self.heads = heads
 
     def forward(self, observation: Tensor, style: Tensor | None = None) -> tuple[Tensor, ...]:
-        """Return the parameters of the action's distribution; see `head` for the arguments.
+        """Return the parameters of the action's distribution.
+
+        Args:
+            observation: Observation `(..., obs_dim)`.
+            style: Raw style `(..., d)`, encoded here; None without a style space.
 
         Returns:
             `probs` `(..., sum of head sizes)` if there are categorical heads, by regret matching (paper, Appendix B),
-            then `loc` and `scale` `(..., axes)` if there are axes, all float32.
+            then `loc` and `scale` `(..., axes)` if there are axes, all float32. The scale is `exp(2 tanh(raw))`.
+
+        Raises:
+            ValueError: If the network has a style space and `style` is None.
         """
         raw = at_least_float32(self.head(observation, style))
         preferences, loc, raw_scale = raw.split((self.heads.num_categorical, self.heads.axes, self.heads.axes), -1)
