@@ -257,7 +257,8 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
         run = _run_of(checkpoint, staged=bool(saved.get("stages")))
         replaced = {"init_from": None, "run_dir": run, **said, "resume": str(checkpoint)}
         if run is not None and replaced["run_dir"] == run:
-            check_contained(Path(run))  # the training writes into this folder
+            # The training writes into this folder. W&B makes a folder for itself, with a link to its log elsewhere.
+            check_contained(Path(run), passed_over="wandb")
         with refusing(checkpoint, "a configuration"):
             for key, value in replaced.items():
                 OmegaConf.update(before, key, value, merge=False)

@@ -278,6 +278,18 @@ def test_links_within_a_run_are_fine(run):
     check_contained(run)
 
 
+def test_a_run_that_was_logged_at_wandb_is_resumed(run):
+    (run.parent / "elsewhere").mkdir()
+    logs = run / "wandb" / "run-20260101_000000-abc" / "logs"
+    logs.mkdir(parents=True)
+    (logs / "debug-core.log").symlink_to(run.parent / "elsewhere" / "core-debug.log")  # as W&B does
+    resume(run)
+    shutil.rmtree(run / "wandb")
+    (run / "wandb").symlink_to(run.parent / "elsewhere")
+    with pytest.raises(CheckpointError, match=r"is a link to \S+elsewhere, outside of"):
+        resume(run)
+
+
 @pytest.mark.parametrize("key", ["../../outside", "/tmp/outside", "..", ""])
 def test_entries_of_a_replay_buffer_lie_in_its_folder(run, key):
     replay = find_checkpoint(run) / "replay"
