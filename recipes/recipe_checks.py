@@ -121,9 +121,12 @@ def _in_words(entry: Field[Any]) -> str:
     return _KINDS.get(entry.type, "a list" if "list" in str(entry.type) else "a group of settings")  # pyright: ignore
 
 
-def _typed(kind: Any, value: Any) -> Any:
+def _typed(kind: Any, value: Any, *path: str) -> Any:
     if kind is Target:
+        if "_target_" not in value:
+            raise ValueError(f"{'.'.join(path)} has no _target_: expected the name of a function or class")
         return Target(value)
     if not is_dataclass(kind):
         return value
-    return kind(**{entry.name: _typed(entry.type, value[entry.name]) for entry in fields(kind)})  # pyright: ignore
+    entries = fields(kind)
+    return kind(**{entry.name: _typed(entry.type, value[entry.name], *path, entry.name) for entry in entries})  # pyright: ignore

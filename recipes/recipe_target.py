@@ -22,8 +22,8 @@ class Target(dict[str, Any]):
         """Call the function or class with the arguments of the configuration, and with further ones.
 
         Raises:
-            ValueError: If it cannot be imported or takes no such argument, or an argument is `true` or `false` and the
-                value is not.
+            ValueError: If it cannot be imported, takes no such argument or needs others, or an argument is `true` or
+                `false` and the value is not.
         """
         try:
             made = instantiate(self, _convert_="all", _partial_=True)
@@ -37,6 +37,11 @@ class Target(dict[str, Any]):
                 raise ValueError(f"{self['_target_']} takes no {name!r}.{choices(name, valid)}")
             if name in known and known[name].annotation in (bool, "bool") and not isinstance(value, bool):
                 raise ValueError(f"{name}={value} of {self['_target_']}: expected true or false")
+        method = made.func.__init__ if isclass(made.func) else made.func  # TorchRL's classes seem to take any argument
+        try:
+            signature(method).bind(*[None] * isclass(made.func), *args, **{**made.keywords, **arguments})
+        except TypeError as error:
+            raise ValueError(f"{self['_target_']} does not take what the recipe gives it: {error}") from error
         try:
             return made(*args, **arguments)
         except TypeError as error:  # of a function to which the target passes its further arguments on

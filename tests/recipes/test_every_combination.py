@@ -286,11 +286,20 @@ def test_runs_with_tables_resume_bit_for_bit(loss, replay, tmp_path):
         ("rare_targets", ["network=gamepad"], r"continuous actions only, network.actor has buttons"),
         ("cheetah_speed", ["mirror=0.5"], r"cheetah has no mirror images, expected mirror=0"),
         ("racing_qr_sac", ["mirror=0.5", "env.curvature=false"], r"mirror images need env.curvature=true"),
+        ("cheetah_speed", ["+network.actor.heads.axes=6"], r"make_gaussian_actor .* required .*'action_dim'"),
+        ("cheetah_speed", ["~env._target_"], r"^env has no _target_: expected the name of a function or class"),
+        ("cheetah_speed", ["~network.critic._target_"], r"^network.critic has no _target_"),
     ],
 )
 def test_what_makes_no_sense_fails_at_the_start_with_one_sentence(recipe, arguments, message, tmp_path):
     with pytest.raises((ValueError, RuntimeError), match=message):
         _train(recipe, tmp_path, *arguments)
+
+
+def test_an_environment_of_ones_own_that_takes_no_seed_is_named(monkeypatch, tmp_path):
+    monkeypatch.setattr(import_module("cheetah_speed"), "cheetah_env", lambda num_envs, seconds: None)
+    with pytest.raises(ValueError, match=r"^cheetah_speed.cheetah_env does not take .* unexpected .*'seed'"):
+        _train("cheetah_speed", tmp_path)
 
 
 @pytest.mark.parametrize("recipe", ["humanoid_sac", "racing_qr_sac"])
