@@ -269,7 +269,10 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
     elif cfg.get("stages") or cfg.stage is not None:
         stages = composed_stages(cfg, {key: OmegaConf.select(cfg, key) for key in _said(overrides)})
         cfg = _chosen_stage(cfg, stages)
-    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)  # pyright: ignore
+    try:
+        config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)  # pyright: ignore
+    except OmegaConfBaseException as error:
+        raise ValueError(mistake_in(error)) from None
     config.pop("hydra", None)
     config["run_dir"] = str(Path(config["run_dir"] or _new_run_dir(config["domain"])).expanduser().absolute())
     try:

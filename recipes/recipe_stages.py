@@ -30,21 +30,20 @@ def composed_stages(cfg: DictConfig, said: Mapping[str, Any]) -> list[dict[str, 
         name = change.pop("name", None)
         if name is None:
             raise ValueError(f"a stage has no name: expected {{name: NAME, total_frames: N, ...}}, got {change}")
-        if "total_frames" in change:
-            change.setdefault("train", {})["total_frames"] = change.pop("total_frames")
+        length = {"train": {"total_frames": change.pop("total_frames")}} if "total_frames" in change else {}
         known = {str(key) for key in cfg}.difference(_OF_THE_RUN) | {"init_new_observations"}
         if unknown := sorted(set(change) - known):
             raise ValueError(
                 f"stage {name} changes {', '.join(unknown)}: expected name, total_frames, {', '.join(sorted(known))}"
             )
         try:
-            current = OmegaConf.merge(current, change)
+            current = OmegaConf.merge(current, change, length)
+            for key, value in said.items():
+                if key.split(".")[0] not in _OF_THE_RUN:
+                    OmegaConf.update(current, key, value, merge=False, force_add=True)
+            stage: dict[str, Any] = OmegaConf.to_container(current, resolve=True, throw_on_missing=True)  # pyright: ignore
         except OmegaConfBaseException as error:
             raise ValueError(f"stage {name}: {mistake_in(error)}") from None
-        for key, value in said.items():
-            if key.split(".")[0] not in _OF_THE_RUN:
-                OmegaConf.update(current, key, value, merge=False, force_add=True)
-        stage: dict[str, Any] = OmegaConf.to_container(current, resolve=True, throw_on_missing=True)  # pyright: ignore
         stage = {key: value for key, value in stage.items() if key not in ("hydra", "stages")}
         stage = checked_values({**stage, "stage": name})
         typed_settings(stage)

@@ -172,6 +172,13 @@ def test_what_the_command_line_says_holds_in_all_stages():
     assert [stage["train"]["total_frames"] for stage in config["stages"]] == [8, 8]
 
 
+def test_a_group_that_is_removed_is_named():
+    with pytest.raises(ValueError, match=r"^replay: Missing mandatory value"):
+        compose_config("rare_targets", [*TINY, "~replay"])
+    with pytest.raises(ValueError, match=r"^stage first: replay: Missing mandatory value"):
+        compose_config("rare_targets", [*TINY, STAGES, "~replay"])
+
+
 def test_one_stage_can_be_trained_on_its_own():
     config = compose_config("rare_targets", [*TINY, STAGES, "stage=second"])
     assert config["stages"] == [] and config["alpha"] == 0.2 and config["train"]["total_frames"] == 40
@@ -188,6 +195,7 @@ def test_one_stage_can_be_trained_on_its_own():
         ("[{name: a, alhpa: 0.1}]", "stage a changes alhpa"),
         ("[{name: a, train: {batchsize: 3}}]", "batchsize"),
         ("[{name: a, total_frames: 0}]", "train.total_frames=0: expected a whole number"),
+        ("[{name: a, total_frames: 8, train: 7}]", "stage a: .*int is not a subclass of Loop"),
     ],
 )
 def test_mistakes_in_a_stage_are_named_at_the_start(stages, message):
