@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
 from functools import lru_cache
+from importlib.metadata import entry_points
 from typing import Any
 
 import torch
@@ -91,16 +92,26 @@ class Sampler:
         """Build a sampler from the description that `to_dict` returned.
 
         Raises:
-            ValueError: If the type is unknown, for instance because the module that defines it was not imported.
+            ValueError: If the type is unknown, for instance because the module that defines it was not imported. Those
+                of the registered domains are.
         """
         arguments = dict(description)
         kind = arguments.pop("type", None)
+        if kind not in _REGISTRY:
+            _import_domains_of_others()
         if kind not in _REGISTRY:
             raise ValueError(
                 f"unknown sampler type {kind!r}: expected one of {sorted(_REGISTRY)}. "
                 "Import the module that defines a sampler of your own."
             )
         return _REGISTRY[kind](**{name: _revived(value) for name, value in arguments.items()})
+
+
+def _import_domains_of_others() -> None:
+    """Import the domains that other packages register, which may define samplers of their own."""
+    for entry in entry_points(group="coachable.domains"):
+        if not entry.value.startswith("coachable."):
+            entry.load()
 
 
 def _plain(value: Any) -> Any:

@@ -11,6 +11,7 @@ import pytest
 from coachable.cli import main
 from coachable.coach.session.session import CoachSession
 from coachable.domain import domain_names, load_domain
+from coachable.styles import Setpoint, StyleSpace
 
 pytest.importorskip("gymnasium")
 
@@ -137,6 +138,21 @@ def test_the_documentation_shows_the_files_as_they_are(name):
     source = (SOURCES / f"{name}.py").read_text()
     assert any(f"```python\n{source}```" in page.read_text() for page in DOCS.rglob("*.md"))
     assert source.count("\n") < 60
+
+
+def test_a_sampler_that_the_package_of_a_domain_defines_is_found(monkeypatch, tmp_path):
+    sampler = ("@dataclass(frozen=True)", "class OfTheGuest(PointMass):", "    pass", "DOMAIN = OfTheGuest([1.0])")
+    imports = ("from dataclasses import dataclass", "from coachable.styles import PointMass")
+    (tmp_path / "sampling_guest.py").write_text("\n".join((*imports, *sampler)))
+    install(tmp_path, package="sampling_guest", domain="sampling_guest")
+    description = {
+        **StyleSpace([Setpoint("pace", 0.0, 2.0)]).to_dict(),
+        "sampler": {"type": "OfTheGuest", "values": [1]},
+    }
+    with pytest.raises(ValueError, match="unknown sampler type 'OfTheGuest'"):
+        StyleSpace.from_dict(description)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert StyleSpace.from_dict(description).sample().tolist() == [1.0]
 
 
 def test_two_packages_with_one_name_of_a_domain_are_refused(monkeypatch, tmp_path):
