@@ -22,8 +22,8 @@ class Target(dict[str, Any]):
         """Call the function or class with the arguments of the configuration, and with further ones.
 
         Raises:
-            ValueError: If it cannot be imported, takes no such argument or needs others, or an argument is `true` or
-                `false` and the value is not.
+            ValueError: If it cannot be imported, takes no such argument or needs others, an argument is `true` or
+                `false` and the value is not, or the configuration has an argument that the recipe gives itself.
         """
         try:
             made = instantiate(self, _convert_="all", _partial_=True)
@@ -37,6 +37,8 @@ class Target(dict[str, Any]):
                 raise ValueError(f"{self['_target_']} takes no {name!r}.{choices(name, valid)}")
             if name in known and known[name].annotation in (bool, "bool") and not isinstance(value, bool):
                 raise ValueError(f"{name}={value} of {self['_target_']}: expected true or false")
+            if name in arguments and name != "num_envs":  # one environment, for example, shows the sizes
+                raise ValueError(f"{name}={value} of {self['_target_']}: the recipe sets it, expected no {name} here")
         method = made.func.__init__ if isclass(made.func) else made.func  # TorchRL's classes seem to take any argument
         try:
             signature(method).bind(*[None] * isclass(made.func), *args, **{**made.keywords, **arguments})
