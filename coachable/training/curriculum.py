@@ -66,6 +66,9 @@ class Curriculum:
 
         Returns:
             The latest value of every metric of the last stage that ran.
+
+        Raises:
+            CheckpointError: If a stage cannot start.
         """
         while True:
             latest = self.train.run()
@@ -83,7 +86,11 @@ class Curriculum:
             # raises the number of threads, which must happen before the next stage sets it.
             del self.train
             gc.collect()
-            self.train = self._start(None)
+            try:
+                self.train = self._start(None)
+            except (ValueError, ImportError) as error:
+                name = self.stages[self.number]["stage"]
+                raise CheckpointError(f"stage {name} cannot start, those before it are kept: {error}") from error
 
     def folder(self, number: int) -> Path:
         """Return the folder of stage `number`, counted from 0; the folder's name counts from 1."""

@@ -105,6 +105,12 @@ def test_a_finished_stage_keeps_no_replay_buffer(whole):
     assert [folder.parents[2].name for folder in whole.glob("stages/*/checkpoints/*/replay")] == ["2_second"]
 
 
+def test_a_later_stage_that_cannot_start_is_one_sentence(tmp_path):
+    second = STAGES.replace("name: second", "name: second, mirror: 0.5")
+    with pytest.raises(CheckpointError, match=r"^stage second cannot start, those before it are kept: mirror=0.5"):
+        start(*TINY, second, f"run_dir={tmp_path}").run()
+
+
 @pytest.mark.filterwarnings("ignore:.*was not written")
 def test_a_stage_whose_end_is_not_saved_is_followed_by_none(tmp_path, monkeypatch):
     run, save = tmp_path / "run", CheckpointStore.save
