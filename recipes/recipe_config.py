@@ -100,7 +100,7 @@ def run_recipe(config_name: str, build: Callable[[dict[str, Any]], Trainer]) -> 
         try:
             config = plain_config(cfg, overrides, config_name)
             train = start_training(build, config)
-        except (CheckpointError, ValueError, ImportError) as error:
+        except (CheckpointError, WorkerError, ValueError, ImportError) as error:
             if "HYDRA_FULL_ERROR" in os.environ:
                 raise
             # You can fix these errors without a traceback, including the one that TorchRL appends from a worker.

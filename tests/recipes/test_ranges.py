@@ -15,6 +15,7 @@ from recipe_checks import checked_values, declared, range_of
 from recipe_config import compose_config
 
 from coachable.finite import NonFiniteError
+from coachable.training.worker_errors import WorkerError
 
 CONFIGS = Path(recipe_config.CONFIGS)
 FREE = {"critic_support", "network.critic.initial_value", "env.conditions"}  # any finite number
@@ -224,6 +225,16 @@ def test_a_training_that_is_stopped_by_a_number_ends_with_one_sentence(monkeypat
     with pytest.raises(SystemExit) as refused:
         recipe_config.run_recipe("rare_targets", lambda config: Stopped())
     assert refused.value.code == "error: gamma=1.5: expected a number in [0, 1]"
+
+
+def test_workers_that_cannot_be_had_end_a_training_with_one_sentence(monkeypatch, tmp_path):
+    def build(config):
+        raise WorkerError("collector.num_collectors=4 need 4 cores")
+
+    monkeypatch.setattr(sys, "argv", ["rare_targets.py", "preset=smoke", f"run_dir={tmp_path}"])
+    with pytest.raises(SystemExit) as stopped:
+        recipe_config.run_recipe("rare_targets", build)
+    assert stopped.value.code == "error: collector.num_collectors=4 need 4 cores"
 
 
 def test_an_argument_that_the_configuration_leaves_out_can_be_added():
