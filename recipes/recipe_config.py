@@ -173,6 +173,9 @@ def _hydra_arguments(config_name: str, arguments: list[str]) -> tuple[Namespace,
             f"error: {sweeps[0]} asks for several trainings: expected coachable train {config_name} seeds=0,1,2 for "
             "several seeds, one command for each other training, and KEY=[VALUE,VALUE] for a list"
         )
+    empty = [o.key_or_group for o in overrides if o.key_or_group in _PATHS and o.value() == ""]
+    if empty:  # for instance of a variable of the shell that is not set
+        raise SystemExit(f"error: {empty[0]}= is empty: expected {empty[0]}=PATH, or none at all")
     chosen = [o for o in overrides if o.key_or_group == "preset"]
     preset = chosen[-1].value() if chosen else "auto"
     if preset == "auto":
