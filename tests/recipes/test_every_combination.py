@@ -190,7 +190,9 @@ def test_the_stages_of_races_are_of_their_family(stage, margins, tmp_path):
 
 @pytest.mark.parametrize("stage", ["alone", "clean", "races"])
 def test_a_driver_of_races_learns_alone_on_the_observation_of_races(stage):
-    config = compose_config("racing_qr_sac", ["preset=aggressiveness", f"stage={stage}", "env.num_envs=3", "env.track=ring"])
+    config = compose_config(
+        "racing_qr_sac", ["preset=aggressiveness", f"stage={stage}", "env.num_envs=3", "env.track=ring"]
+    )
     among_others = stage == "races"
     assert config["impersonation"]["n"] == (2 if among_others else 0) and config["init_new_observations"] == 0
     settings = typed_settings(config)
