@@ -22,7 +22,13 @@ __all__ = ["TableWriter"]
 class TableWriter(Writer):
     """Writer of an `EventTableBuffer`, which contains the cursors of the tables and the state of open episodes.
 
-    The arguments follow from those of the buffer. The regions are those of the routed tables, then of the event tables.
+    Args:
+        regions: The tables: routed tables, then event tables.
+        route: Route of the steps; None if there is one routed table.
+        events: Event predicate; None without event tables.
+        horizon: H_max.
+        n_step: n-step assembly; None for one-step transitions.
+        num_envs: Number of environments in a batch; None if batches are `(num_envs, time)` or have trajectory numbers.
     """
 
     _storage: LazyTensorStorage  # set when the buffer registers it

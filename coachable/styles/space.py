@@ -82,12 +82,7 @@ class StyleSpace:
             p.name: self.slices[p.name] if isinstance(p, Choice) else self.slices[p.name].start for p in self.parameters
         }
         self._columns_of: dict[tuple[str, ...], slice | list[int] | None] = {}
-        if sampler is None:
-            each = (
-                UniformChoice(p.width) if isinstance(p, Choice) else Uniform(p.low, p.high) for p in self.parameters
-            )
-            sampler = Product(tuple(each))
-        self.sampler: Sampler = sampler
+        self.sampler: Sampler = _uniform_over(self.parameters) if sampler is None else sampler
         self._check_sampler()
 
     def __getitem__(self, name: str) -> Parameter:
@@ -345,6 +340,10 @@ class StyleSpace:
                 for corner in corners:
                     corner[self.slices[p.name]] = self._default[self.slices[p.name]]
         return corners
+
+
+def _uniform_over(parameters: Sequence[Parameter]) -> Sampler:
+    return Product([UniformChoice(p.width) if isinstance(p, Choice) else Uniform(p.low, p.high) for p in parameters])
 
 
 def _plain(fields: list[tuple[str, Any]]) -> dict[str, Any]:

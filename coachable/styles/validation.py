@@ -41,12 +41,17 @@ def violations(parameters: Sequence[Parameter], low: Tensor, high: Tensor, theta
     clauses, first = [], 0
     for p, block in blocks:
         if isinstance(p, Choice):
-            if not bool(((block == 0) | (block == 1)).all() & (block.sum(-1) == 1).all()):
+            if not bool(_is_one_hot(block).all()):
                 clauses.append(f"{p.name} is not a one-hot of its {p.width} options {list(p.options)}")
         elif outside[first]:
             clauses.append(f"{p.name} = {_span(block)}{_unit(p)} lies outside [{p.low:g}, {p.high:g}]{_unit(p)}")
         first += p.width
     return clauses
+
+
+def _is_one_hot(block: Tensor) -> Tensor:
+    """Return whether each row of `(N, n)` is a one-hot, `(N,)` bool."""
+    return ((block == 0) | (block == 1)).all(-1) & (block.sum(-1) == 1)
 
 
 def _span(values: Tensor) -> str:
