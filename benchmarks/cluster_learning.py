@@ -64,7 +64,7 @@ def main() -> None:
     ]
     if options.frames:
         common += [f"train.total_frames={options.frames}", f"train.eval_interval={max(1, options.frames // 4)}"]
-        common += [f"train.warmup_frames={options.frames // 10}"]
+        common += [f"train.warmup_frames={min(30_000, options.frames // 10)}"]
     curves: dict[str, list[Path]] = {}
     print("| " + " | ".join(HEADINGS) + " |\n|" + "-|" * len(HEADINGS))
     for name in options.only:
