@@ -336,6 +336,8 @@ def _style(text: str) -> dict[str, str]:
         name, equals, value = part.partition("=")
         if not equals:
             raise argparse.ArgumentTypeError(f"{part!r}: expected NAME=VALUE")
+        if name.strip() in style:
+            raise argparse.ArgumentTypeError(f"{text!r} gives {name.strip()} twice")
         style[name.strip()] = value.strip()
     return style
 

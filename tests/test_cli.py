@@ -69,6 +69,7 @@ def test_a_missing_agent_is_named_without_a_traceback(arguments, capsys, tmp_pat
     ("arguments", "message"),
     [
         ("render x --style pose", "'pose': expected NAME=VALUE"),
+        ("render x --style pose=up,pose=down", "'pose=up,pose=down' gives pose twice"),
         ("render x --size big", "'big': expected WIDTHxHEIGHT"),
         ("render x --seconds many", "invalid float value: 'many'"),
         ("evaluate x --episodes 0", "--episodes: '0': expected a whole number of at least 1"),
