@@ -1,11 +1,12 @@
-"""What an agent learns with workers on Ray, and with weights of a certain age, beside the training in one process.
+"""What an agent learns with workers on Ray, and with weights of another age, beside the training in one process.
 
     python benchmarks/cluster_learning.py                                  combat, preset small, seeds 0 to 2: hours
     python benchmarks/cluster_learning.py --env humanoid --only local workers            first stage of cpu
     python benchmarks/cluster_learning.py --frames 20_000 --seeds 0 --only local workers      to try it out
 
 All trainings have the same env-steps and the same updates per env-step. `workers` are 8 on Ray with 16 environments
-each; `every_10`, `every_100` and `every_1000` are the same with that many updates between two offers of weights. A
+each, with default settings. `fresh` are the same with short batches that do not wait in the queue, and `every_1000` the
+same with 1000 updates between two offers of weights, so that weights are younger or older than those of `workers`. A
 training that was interrupted is continued by the same command, one that has ended is not repeated. The table is
 printed, and learning curves with intervals over the seeds are drawn in `--out`.
 """
@@ -28,8 +29,9 @@ WORKERS = ["collector=ray", "collector.num_collectors=8", "collector.group_size=
 WORKERS += ["collector.cpus_per_worker=0.1"]
 VARIANTS = {
     "local": [],
+    "fresh": [*WORKERS, "collector.steps_per_batch=2", "collector.queue_size=1"],
     "workers": WORKERS,
-    **{f"every_{n}": [*WORKERS, f"collector.weights_every={n}"] for n in (10, 100, 1000)},
+    "every_1000": [*WORKERS, "collector.weights_every=1000"],
 }
 HEADINGS = (
     "weights",
