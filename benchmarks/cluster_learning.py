@@ -7,8 +7,9 @@
 All trainings have the same env-steps and the same updates per env-step. `workers` are 8 on Ray with 16 environments
 each, with default settings. `fresh` are the same with short batches that do not wait in the queue, and `every_1000` the
 same with 1000 updates between two offers of weights, so that weights are younger or older than those of `workers`. A
-training that was interrupted is continued by the same command, one that has ended is not repeated. The table is
-printed, and learning curves with intervals over the seeds are drawn in `--out`.
+training that was interrupted is continued by the same command, one that has ended is not repeated. At its end, an agent
+is evaluated again in more episodes. The table is printed, and learning curves with intervals over the seeds are drawn
+in `--out`.
 """
 
 import argparse
@@ -21,10 +22,11 @@ from coachable.evaluation.curves import draw_learning_curves, read_metric
 from coachable.evaluation.many_seeds import train_seeds
 
 RECIPES = Path(__file__).resolve().parent.parent / "recipes"
-ENVIRONMENTS = {  # recipe, its settings, and what is measured of the style
-    "combat": ("combat_cat_rac.py", ["preset=small"], "eval/style_score"),
-    "humanoid": ("humanoid_sac.py", ["preset=cpu", "stage=walk"], "eval/step_length_error"),
+ENVIRONMENTS = {  # recipe, its settings, what is measured of the style, and the episodes of the last evaluation
+    "combat": ("combat_cat_rac.py", ["preset=small"], "eval/style_score", 1000),
+    "humanoid": ("humanoid_sac.py", ["preset=cpu", "stage=walk"], "eval/step_length_error", 100),
 }
+QUIET = ["wandb.mode=off", "threads.learner=1", "threads.simulator=1"]
 WORKERS = ["collector=ray", "collector.num_collectors=8", "collector.group_size=8", "env.num_envs=16"]
 WORKERS += ["collector.cpus_per_worker=0.1"]
 VARIANTS = {
@@ -55,15 +57,9 @@ def main() -> None:
     parser.add_argument("--frames", type=int, help="env-steps of each training; those of the preset")
     parser.add_argument("--out", type=Path, default=Path("runs/cluster_learning"))
     options = parser.parse_args()
-    recipe, settings, style = ENVIRONMENTS[options.env]
+    recipe, settings, style, episodes = ENVIRONMENTS[options.env]
     options.out /= options.env
-    common = [
-        *settings,
-        "wandb.mode=off",
-        "threads.learner=1",
-        "threads.simulator=1",
-        "train.checkpoint_interval=300",
-    ]
+    common = [*settings, *QUIET, "train.checkpoint_interval=300"]
     if options.frames:
         common += [f"train.total_frames={options.frames}", f"train.eval_interval={max(1, options.frames // 4)}"]
         common += [f"train.warmup_frames={min(30_000, options.frames // 10)}"]
@@ -74,13 +70,27 @@ def main() -> None:
         if failed := train_seeds(RECIPES / recipe, [*common, *VARIANTS[name]], options.seeds, folder):
             sys.exit(f"{name}: {failed}")
         runs = [folder / f"seed_{seed}" for seed in options.seeds]
+        for run in runs:
+            evaluate([*settings, *QUIET], recipe, run, episodes)
         print("| " + " | ".join([name, f"{len(runs)}", *cells(runs, VARIANTS[name], style)]) + " |", flush=True)
         curves[name] = runs
         draw_learning_curves(curves, options.out / "learning.png", x="frames", y="eval/return", smooth=1)
 
 
+def evaluate(settings: list[str], recipe: str, run: Path, episodes: int) -> None:
+    """Evaluate a run's agent, by a training that begins with it and ends after one round without updates."""
+    arguments = [f"init_from={run}", "train.total_frames=1", "train.utd_ratio=0", f"eval.num_envs={episodes}"]
+    if failed := train_seeds(RECIPES / recipe, [*settings, *arguments], [0], evaluation_of(run).parent):
+        sys.exit(f"evaluation of {run}: {failed}")
+
+
+def evaluation_of(run: Path) -> Path:
+    return run.with_name(f"{run.name}_evaluated") / "seed_0"
+
+
 def cells(runs: list[Path], arguments: list[str], style: str) -> list[str]:
-    measures = {name: [read_metric(run, "frames", name)[1][-1] for run in runs] for name in ("eval/return", style)}
+    ends = [evaluation_of(run) for run in runs]
+    measures = {name: [read_metric(run, "frames", name)[1][-1] for run in ends] for name in ("eval/return", style)}
     stale = [read_metric(run, "frames", "workers/staleness")[1].mean() for run in runs] if arguments else [0.0]
     counted = ("frames", "updates", "minutes")  # from the start of each stage; the first column sums them
     totals = {name: [read_metric(run, name, name)[0][-1] for run in runs] for name in counted}
