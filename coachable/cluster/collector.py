@@ -28,9 +28,9 @@ _WAIT = 0.5  # [s] for a batch, after which the workers' error is looked for
 class ClusterCollector(AsyncCollector):
     """Collector whose workers are Ray actors, on this host or on a cluster (docs/guides/cluster.md).
 
-    A worker's batch has `num_envs` rows of `steps_per_batch` steps. All batches that wait are taken together, the rows
-    of one below those of another, because storing each on its own takes too much of the learner's time. Each step
-    carries, under `"collector"`, the numbers `worker`, `restart` (how often the worker had been started before),
+    A worker's batch has `num_envs` rows of `steps_per_batch` steps. Batches that wait are taken together, at most one
+    of each worker, the rows of one below those of another, because storing each on its own takes too much of the
+    learner's time. Each step carries, under `"collector"`, the numbers `worker`, `restart` (how often the worker had been started before),
     `serial` (of the worker's batches since that start) and `version` (updates that its weights had seen). Replay buffer
     and learner stay in this process.
 
@@ -208,8 +208,9 @@ class ClusterCollector(AsyncCollector):
         if self._next is None:
             assert self.workers.error is not None
             raise self.workers.error
-        taken = []
-        while self._next is not None:
+        taken: list[Arrival] = []
+        # Buffers read the steps of all rows in turn, so a worker's next batch has to wait until this one is stored.
+        while self._next is not None and all(self._next.worker != item.worker for item in taken):
             taken.append(self._next)
             self._follow(self._next)
             self._next = None

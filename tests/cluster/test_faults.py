@@ -74,6 +74,15 @@ def test_every_batch_comes_with_the_weights_of_its_version(cluster, tmp_path, gr
     watch.require_sums_within_trajectories()
 
 
+def test_batches_of_one_worker_that_wait_together_are_stored_in_order(cluster, tmp_path):
+    train = cluster_train(tmp_path)
+    watch = Watch(train, lambda watch: time.sleep(0.5))  # in which each worker fills its share of the queue
+    latest = train.run()
+    assert latest["workers/queue"] >= 2
+    watch.require_nothing_lost()
+    watch.require_sums_within_trajectories()
+
+
 @one_or_two
 def test_workers_killed_in_the_middle_of_a_batch_are_replaced(cluster, tmp_path, group_size):
     killed = []
