@@ -30,9 +30,9 @@ class ClusterCollector(AsyncCollector):
 
     A worker's batch has `num_envs` rows of `steps_per_batch` steps. Batches that wait are taken together, at most one
     of each worker, the rows of one below those of another, because storing each on its own takes too much of the
-    learner's time. Each step carries, under `"collector"`, the numbers `worker`, `restart` (how often the worker had been started before),
-    `serial` (of the worker's batches since that start) and `version` (updates that its weights had seen). Replay buffer
-    and learner stay in this process.
+    learner's time. Each step carries, under `"collector"`, the numbers `worker`, `restart` (how often the worker had
+    been started before), `serial` (of the worker's batches since that start) and `version` (updates that its weights
+    had seen). Replay buffer and learner stay in this process.
 
     Args:
         make_env: Builds a seeded, batched environment `[N]` from a seed.
