@@ -145,6 +145,8 @@ class Connection:
                 raise ClusterError(
                     f"collector.patience={patience:g}: node {name} ({address}) does not answer within this time"
                 ) from None
+            except self.ray.exceptions.TaskUnschedulableError:  # the node has left the cluster meanwhile
+                continue
             except self.ray.exceptions.RayError as error:
                 raise ClusterError(
                     f"collector=ray: node {name} ({address}) cannot run coachable: {_last_line(error)}"

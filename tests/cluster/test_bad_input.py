@@ -103,6 +103,12 @@ def test_a_node_that_does_not_answer(cluster):
     assert not ray.is_initialized()
 
 
+@pytest.mark.ray
+def test_a_node_that_has_just_left_is_not_asked(cluster):
+    cluster.remove()  # Ray still counts it for a moment
+    Connection(None, 1, 1.0, 60.0).close()
+
+
 def shared_memory():
     """Files in shared memory, without the semaphores of other programs."""
     return {name for name in os.listdir("/dev/shm") if not name.startswith("sem.")}

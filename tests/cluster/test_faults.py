@@ -1,5 +1,6 @@
 """Collection on a Ray cluster of several local nodes whose workers and nodes are killed."""
 
+import dataclasses
 import os
 import signal
 import subprocess
@@ -14,8 +15,6 @@ from coachable.cluster import ClusterError
 from coachable.cluster.flat_weights import flat_weights, load_flat_weights, portable_copy
 from coachable.training.checkpoint import find_checkpoint, read_state
 from tests.cluster.workers_of_tests import NUM_ENVS, STEPS, Watch, cluster_train
-
-LARGEST_TAKE = (4 + 2) * NUM_ENVS * STEPS  # [env-steps] the queue, and what two workers have just sent
 
 pytestmark = [pytest.mark.ray, pytest.mark.filterwarnings("ignore:a Ray worker was lost")]
 
@@ -37,7 +36,7 @@ def wait_for_end(pids, seconds=60.0):
 
 
 def end(watch):
-    watch.train.settings = type(watch.train.settings)(total_frames=1)
+    watch.train.settings = dataclasses.replace(watch.train.settings, total_frames=1)
 
 
 def end_after_restart(watch):
@@ -45,9 +44,14 @@ def end_after_restart(watch):
         end(watch)
 
 
+def end_after_forty_of_both(watch):
+    if len(watch.batches) >= 40 and len(set(watch.numbers("worker"))) == 2:
+        end(watch)
+
+
 @one_or_two
 def test_every_batch_comes_with_the_weights_of_its_version(cluster, tmp_path, group_size):
-    train = cluster_train(tmp_path, group_size=group_size)
+    train = cluster_train(tmp_path, group_size=group_size, total_frames=10**6)
     actor, weights = train.learner.loss_module.actor_network, {0: None}
     offer = train.collector.workers.offer
 
@@ -56,11 +60,10 @@ def test_every_batch_comes_with_the_weights_of_its_version(cluster, tmp_path, gr
         offer(version, offered)
 
     train.collector.workers.offer = keep
-    watch = Watch(train)
+    watch = Watch(train, end_after_forty_of_both)
     latest = train.run()
-    assert 400 <= train.frames <= 400 + LARGEST_TAKE
-    assert 38 <= train.learner.updates <= train.frames // 10  # 0.1 per env-step after the warm-up
-    assert set(watch.numbers("worker")) == {0, 1} and set(watch.numbers("restart")) == {0}
+    assert train.frames // 10 - 2 <= train.learner.updates <= train.frames // 10  # 0.1 per env-step after the warm-up
+    assert set(watch.numbers("restart")) == {0}
     versions = watch.numbers("version")
     assert len(set(versions)) > 5 and max(versions) > 20
     copy = portable_copy(actor)
@@ -172,7 +175,7 @@ def test_a_full_object_store_stops_nobody(cluster, tmp_path):
     held = [ray.put(np.ones(40 * 2**20, np.uint8)) for _ in range(4)]  # twice what the store of a node holds
     watch = Watch(train)
     train.run()
-    assert 400 <= train.frames <= 400 + LARGEST_TAKE and len(held) == 4
+    assert 400 <= train.frames <= 400 + 2 * NUM_ENVS * STEPS and len(held) == 4
     watch.require_nothing_lost()
 
 

@@ -41,4 +41,3 @@ def test_a_signal_before_the_first_batch_ends_the_training(cluster, tmp_path, nu
     assert not wait_for_end(workers), "workers do not outlive their learner"
     state = read_state(find_checkpoint(tmp_path / "run"))
     assert state["loop"]["frames"] == train.frames
-    assert state["collector"]["starts"] == [2, 2], "the next workers draw other random numbers than these"
