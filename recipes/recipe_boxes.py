@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from inspect import signature
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -106,9 +107,16 @@ def make_style_reward(run: Run, factory: Callable[..., StyleReward], space: Styl
 
 
 def fitted_network(run: Run, env: EnvBase) -> Network:
-    """Return the settings of actor and critics, with the widths of the environment's observations and actions."""
+    """Return the settings of actor and critics, with the widths of the environment's observations and actions.
+
+    Raises:
+        ValueError: If the configuration gives a width itself.
+    """
     network = run.settings.network
     widths = {"obs_dim": env.observation_spec["observation"].shape[-1], "action_dim": env.action_spec.shape[-1]}
+    for part, name in product(("actor", "critic"), widths):
+        if name in getattr(network, part):
+            raise ValueError(f"network.{part}.{name}: the environment sets it, expected no {name} here")
     actor, critic = Target(network.actor, **widths), Target(network.critic, **widths)
     if "heads" in actor:  # they define the width of a mixed action
         del actor["action_dim"]

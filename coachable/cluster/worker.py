@@ -17,7 +17,7 @@ from torchrl.envs.utils import ExplorationType
 
 from coachable.cluster.flat_weights import load_flat_weights
 from coachable.code_version import RECIPES, code_version
-from coachable.training.collection import SelfPlayEnv, simulation_env
+from coachable.training.collection import follow_policy
 from coachable.training.rng import seed_everything
 from coachable.training.throttle import Throttle
 
@@ -121,9 +121,7 @@ class RolloutWorker:
         }
         plain: dict[str, Any] = {"use_buffers": False, "trust_policy": True, "auto_register_policy_transforms": False}
         self.collector = Collector(env, self.policy, **options, **plain)
-        simulation = simulation_env(self.collector.env)
-        if isinstance(simulation, SelfPlayEnv):
-            simulation.follow(self.policy)
+        follow_policy(self.collector)
         self.serial = 0
         self.version = -1
         self._batches: Iterator[TensorDictBase] = iter(self.collector)

@@ -119,8 +119,9 @@ class TableWriter(Writer):
         """Return the records to append to event tables, read before the batch overwrites any."""
         table = copies.table + self.base_tables
         home = self.regions.table_of(np.maximum(copies.slot, 0))
-        # A step that its routed table no longer contains cannot be copied.
-        lost = (copies.row < 0) & (copies.serial + self.regions.capacities[home] < before[home])
+        # A step that its routed table no longer contains, or never did, cannot be copied.
+        overwritten = copies.serial + self.regions.capacities[home] < before[home]
+        lost = (copies.row < 0) & ((copies.slot < 0) | overwritten)
         self._lost += np.bincount(table[lost], minlength=len(self.regions))
         target = np.full(len(table), -1)
         target[~lost], _ = self.regions.allocate(table[~lost])

@@ -26,6 +26,7 @@ __all__ = [
     "SelfPlayEnv",
     "collector_state",
     "evaluate_policy",
+    "follow_policy",
     "load_collector_state",
     "make_collector",
     "require_same_bounds",
@@ -53,7 +54,6 @@ def make_collector(
     init_random_frames: int = 0,
     backend: str = "direct",
     num_collectors: int = 1,
-    sync: bool = True,
     seed: int = 0,
     policy_device: torch.device | str | None = None,
 ) -> BaseCollector:
@@ -67,7 +67,6 @@ def make_collector(
         init_random_frames: Number of env-steps with uniformly random actions at the start.
         backend: "direct" (this process) or "process" (one host); for several hosts see `coachable.cluster`.
         num_collectors: Number of workers with "process".
-        sync: Whether an iteration waits for all workers.
         seed: Seed of the first worker; worker i gets `seed + i`.
         policy_device: Device of the policy; None for the device of the environment.
 
@@ -90,18 +89,25 @@ def make_collector(
         collector = Collector(env, policy, use_buffers=False, trust_policy=True, **common, **plain)
         if next(collector.policy.parameters()) is not next(policy.parameters()):  # the loop relies on shared weights
             raise RuntimeError(f"the collector copied the policy: build the policy on {policy_device}, where it runs")
-        simulation = simulation_env(collector.env)
-        if isinstance(simulation, SelfPlayEnv):
-            simulation.follow(policy)
+        follow_policy(collector)
         return collector
     if backend == "process":
         factories = [_SeededFactory(make_env, seed + i) for i in range(num_collectors)]
         receiver, sender = multiprocessing.Pipe(duplex=False)
-        common |= plain | {"collector_class": ReportingCollector(sender)}
-        workers: Any = Collector(factories, policy, backend=backend, num_collectors=num_collectors, sync=sync, **common)
+        common |= plain | {"collector_class": ReportingCollector(sender, follow_policy)}
+        # It waits for all workers in each iteration. TorchRL's asynchronous one drops batches that are not taken within
+        # a second.
+        workers: Any = Collector(factories, policy, backend=backend, num_collectors=num_collectors, sync=True, **common)
         workers.worker_errors = receiver  # read by `check_workers`
         return workers
     raise ValueError(f"collector backend must be direct or process, got {backend!r}")
+
+
+def follow_policy(collector: Collector) -> None:
+    """Set the policy that the opponents of a `SelfPlayEnv` copy: that of its collector, which the learner updates."""
+    simulation = simulation_env(collector.env)
+    if isinstance(simulation, SelfPlayEnv):
+        simulation.follow(collector.policy)
 
 
 def require_same_bounds(env: EnvBase, policy: Any) -> None:

@@ -86,7 +86,7 @@ def pick_device(name: str = "auto") -> torch.device:
         name: "auto" (CUDA if available), "cpu", "cuda" or a device with an index such as "cuda:1".
 
     Raises:
-        ValueError: If a CUDA device is named and none is available.
+        ValueError: If the device is neither the CPU nor a CUDA device, or a CUDA device is named and none is available.
 
     Example:
         >>> pick_device("cpu")
@@ -95,8 +95,10 @@ def pick_device(name: str = "auto") -> torch.device:
     try:
         device = torch.device("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else torch.device(name)
     except RuntimeError:
-        raise ValueError(f"device={name}: expected auto, cpu, cuda or cuda:0") from None
-    if device.type != "cuda":
+        device = None
+    if device is None or device.type not in ("cpu", "cuda"):
+        raise ValueError(f"device={name}: expected auto, cpu, cuda or cuda:0")
+    if device.type == "cpu":
         return device
     if not torch.cuda.is_available():
         raise ValueError(

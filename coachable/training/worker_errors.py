@@ -1,7 +1,7 @@
 """Errors of worker processes; TorchRL reports only their exit status to the training process."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -27,13 +27,16 @@ class ReportingCollector:
 
     Args:
         sender: End of the pipe to which all workers send.
+        prepare: Called with the collector before its first rollout.
     """
 
     sender: Connection
+    prepare: Callable[[Collector], None]
 
     def __call__(self, *args: Any, **options: Any) -> Collector:
         """Make a collector whose errors are sent; arguments are those of `Collector`."""
         collector = Collector(*args, **options)
+        self.prepare(collector)
         rollout = collector.rollout
 
         def reporting() -> Any:

@@ -293,6 +293,7 @@ def test_runs_with_tables_resume_bit_for_bit(loss, replay, tmp_path):
         ("cheetah_speed", ["~network.critic._target_"], r"^network.critic has no _target_"),
         ("rare_targets", ["+collector.frames_per_batch=99"], r"^frames_per_batch=99 of .*: the recipe sets it"),
         ("rare_targets", ["+env.seed=5"], r"^seed=5 of rare_targets.RareTargets: the recipe sets it"),
+        ("rare_targets", ["+network.actor.obs_dim=3"], r"^network.actor.obs_dim: the environment sets it"),
     ],
 )
 def test_what_makes_no_sense_fails_at_the_start_with_one_sentence(recipe, arguments, message, tmp_path):

@@ -96,13 +96,11 @@ def test_a_signal_to_all_processes_ends_workers_and_training(number, tmp_path, q
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sync", [True, False])
-def test_workers_start_as_by_default(sync, tmp_path):
-    train = build("humanoid_sac", tmp_path, "collector.num_collectors=2", f"collector.sync={sync}")
+def test_workers_start_as_by_default(tmp_path):
+    train = build("humanoid_sac", tmp_path, "collector.num_collectors=2")
     distances = watch_actions(train)
     train.run()
-    if sync:
-        require_trained(train, distances)
+    require_trained(train, distances)
     assert not multiprocessing.active_children()
 
 
@@ -143,21 +141,19 @@ def breaking_env(killed, seed):
 
 
 @pytest.mark.parametrize(
-    ("sync", "killed", "end"),
+    ("killed", "end"),
     [
-        (True, False, "raised ZeroDivisionError: the pole has no length"),
-        (False, False, "raised ZeroDivisionError: the pole has no length"),
-        (False, True, "ended with exit status -9"),  # as by the system when memory is short
+        (False, "raised ZeroDivisionError: the pole has no length"),
+        (True, "ended with exit status -9"),  # as by the system when memory is short
     ],
 )
 def test_the_end_of_a_worker_in_a_later_step_is_one_sentence(
-    sync, killed, end, monkeypatch, quick_starts, make_train, tmp_path
+    killed, end, monkeypatch, quick_starts, make_train, tmp_path
 ):
     def build(config):
         train = make_train(tmp_path, checkpoint_interval=0)
-        actor, workers = train.learner.loss_module.actor_network, {"num_collectors": 2, "sync": sync}
-        make_env = partial(breaking_env, killed)
-        train.collector = make_collector(make_env, actor, frames_per_batch=8, backend="process", **workers)
+        actor, make_env = train.learner.loss_module.actor_network, partial(breaking_env, killed)
+        train.collector = make_collector(make_env, actor, frames_per_batch=8, backend="process", num_collectors=2)
         return train
 
     monkeypatch.setattr(sys, "argv", ["rare_targets.py", "preset=smoke", f"run_dir={tmp_path}"])
@@ -167,3 +163,42 @@ def test_the_end_of_a_worker_in_a_later_step_is_one_sentence(
     assert re.fullmatch(rf"error: a worker process {end}\. {stopped}", str(ended.value.code))
     assert not multiprocessing.active_children()
     assert read_state(find_checkpoint(tmp_path))["loop"]["frames"] > 0  # of an earlier iteration
+
+
+class MirroredEnv(StyleEchoEnv):
+    """Shows in its first observation what the policy that it follows does there."""
+
+    def follow(self, policy):
+        self.policy = policy
+
+    def _step(self, tensordict):
+        with torch.no_grad():
+            loc = self.policy[0](tensordict.select(*self.policy[0].in_keys))["loc"]
+        out = super()._step(tensordict)
+        out["observation"][..., :1] = loc
+        return out
+
+
+def mirrored_env(seed):
+    term = Term(lambda features, style: features[..., 0], parameters=("target",))
+    reward = StyleReward(echo_space(), {"target": term})
+    return coachable_env(MirroredEnv(seed=seed), echo_space(), reward, EpisodeSums(), seed=seed)
+
+
+def test_an_environment_with_copies_of_the_policy_gets_the_newest_in_its_worker(quick_starts, make_train, tmp_path):
+    train = make_train(tmp_path, total_frames=80, warmup_frames=20, utd_ratio=0.5)
+    train.collector.shutdown()
+    actor = train.learner.loss_module.actor_network
+    train.collector = make_collector(mirrored_env, actor, frames_per_batch=4, backend="process")
+    distances, store = [], train._store
+
+    def watch(data):
+        arrived = data.contiguous().reshape(-1)
+        with torch.no_grad():
+            expected = actor[0](arrived.select(*actor[0].in_keys))["loc"]
+        distances.append((expected - arrived["next", "observation"][..., :1]).abs().max().item())
+        store(data)
+
+    train._store = watch
+    train.run()
+    assert train.learner.updates > 20 and max(distances) < 1e-4

@@ -71,6 +71,18 @@ def test_what_was_evicted_meanwhile_is_counted_as_lost():
     assert buffer.statistics()["hit"]["lost"] == 1
 
 
+def test_a_step_that_its_table_never_contained_is_counted_as_lost():
+    buffer = EventTableBuffer({"default": 4, "hit": 9}, events=KeyEvents(["hit"]), event_horizon=4)
+
+    def of(trajectories, ids, fired):
+        return steps(ids, fired, collector=TensorDict({"traj_ids": torch.tensor(trajectories)}, [len(ids)]))
+
+    buffer.extend(of([0, 1, 1, 1, 1], [0, 10, 11, 12, 13], [False] * 5))  # one more than the table holds
+    buffer.extend(of([0], [1], [True]))
+    assert buffer.table("hit")["id"].tolist() == [1]
+    assert buffer.statistics()["hit"]["lost"] == 1
+
+
 def test_open_episodes_that_nobody_continues_are_forgotten():
     buffer = EventTableBuffer({"default": 50, "hit": 9}, events=KeyEvents(["hit"]), event_horizon=3)
     for trajectory in range(400):

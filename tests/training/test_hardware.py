@@ -84,6 +84,7 @@ def test_an_update_takes_sixteen_products_which_are_half_of_its_time(monkeypatch
     assert estimate_update_seconds(2 * 512 * 512, 64, bf16=True) == pytest.approx(16 / 20 + 0.003)
 
 
-def test_a_device_that_torch_does_not_know_is_named():
-    with pytest.raises(ValueError, match="device=cude: expected auto, cpu, cuda or cuda:0"):
-        pick_device("cude")
+@pytest.mark.parametrize("name", ["cude", "meta"])
+def test_a_device_on_which_nothing_can_be_trained_is_named(name):
+    with pytest.raises(ValueError, match=f"device={name}: expected auto, cpu, cuda or cuda:0"):
+        pick_device(name)
