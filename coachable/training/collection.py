@@ -105,9 +105,10 @@ def make_collector(
 
 def follow_policy(collector: Collector) -> None:
     """Set the policy that the opponents of a `SelfPlayEnv` copy: that of its collector, which the learner updates."""
-    simulation = simulation_env(collector.env)
+    simulation: Any = simulation_env(collector.env)
     if isinstance(simulation, SelfPlayEnv):
-        simulation.follow(collector.policy)
+        policy: Any = collector.policy
+        simulation.follow(policy)
 
 
 def require_same_bounds(env: EnvBase, policy: Any) -> None:

@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import cast
 
 from coachable.coach.phrases.segments import Segment
-from coachable.coach.phrases.vocabulary import ANGLE, ANY, PERCENT, PLAINLY, SLIGHTLY, STRONGLY, TURNS, UNITS, stem
+from coachable.coach.phrases.vocabulary import (
+    ANGLE,
+    ANY,
+    LEVELS,
+    PERCENT,
+    PLAINLY,
+    SLIGHTLY,
+    STRONGLY,
+    TURNS,
+    UNITS,
+    stem,
+)
 from coachable.evaluation.wording import readable
 from coachable.ranges import around
 from coachable.styles import Choice, Setpoint, Weight
 
 Last = tuple[tuple[str, ...], float]  # parameters and direction of a change
 
+_PARTICLES = frozenset(("up", "down"))  # of verbs such as "speed up" or "calm down"
 _QUALITY = 0.85  # share of the range that an adjective such as "careful" asks for
 
 
@@ -30,20 +43,29 @@ def amount(p: Weight | Setpoint, segment: Segment, now: float, last: Last | None
     """
     if segment.direction is not None and segment.direction[0] == ANGLE != dimension_of(p):
         return f"{readable(p.name)} has no left and right"
-    compared = segment.direction is not None or segment.level is not None
+    said = segment.direction[0] if segment.direction is not None else segment.dimension
+    if ANY not in (said, own := dimension_of(p)) and said != own and segment.number is None:
+        return _not_a(said, p)
+    compared = segment.too or (segment.negated and "so" in segment.words)
+    compared |= any(part is not None for part in (segment.direction, segment.level, segment.factor))
     sense = segment.sense or (-1 if spent and compared else 0)
     sign = _sign(segment, p, last, sense)
     if segment.number is not None:
         return _given(p, segment, now, sign, sense)
     if segment.keep and sign is None and not segment.explicit:
         return now
-    if segment.negated and segment.direction is not None:
-        return now  # "not longer" asks for no change
+    verb = sense and not _PARTICLES.isdisjoint(segment.words)
+    if segment.negated and (segment.direction is not None or verb):
+        return now  # "not longer" and "do not slow down" ask for no change
     if segment.factor is not None:
-        return now / segment.factor if sense < 0 else now * segment.factor
+        grows = segment.factor < 1.0 and sign is not None and sign > 0.0 and "by" in segment.words
+        factor = 1.0 + segment.factor if grows else segment.factor  # "increase by half"
+        return now / factor if sense < 0 else now * factor
     if sign is not None:
         return _moved(p, segment, now, sign)
     if segment.level is not None:
+        if spent and not segment.sense and not segment.preferred:
+            return f"save {readable(p.name)}, or use it?"
         return _level(p, 1.0 - segment.level if sense < 0 else segment.level, segment.degree)
     if segment.default:
         return cast(float, p.default)  # declared, or derived when the parameter was made: never None
@@ -71,11 +93,15 @@ def _is_circle(p: Weight | Setpoint | Choice) -> bool:
 def _sign(segment: Segment, p: Weight | Setpoint, last: Last | None, sense: int) -> float | None:
     """Return +1 or -1 for a change relative to the value in force, or None for an absolute request."""
     same = last is not None and p.name in last[0]
-    turn = -1.0 if sense < 0 and segment.dimension == ANY else 1.0  # "closer" means closer, also after "careful"
+    of_the_unit = segment.dimension != ANY != dimension_of(p)  # "closer" means closer, also after "careful"
+    turn = -1.0 if sense < 0 and not of_the_unit else 1.0
     if segment.direction is not None:
         dimension, sign = segment.direction
         if last is not None and same and segment.repeated and dimension == ANY and not segment.mentions:
             return sign * last[1]  # "a bit more" of what was asked before
+        for more, adjective in pairwise(segment.words):
+            if more in ("more", "less") and adjective in LEVELS and LEVELS[adjective][1] < 0.5:
+                turn = -turn  # "less short"
         return sign * turn
     if segment.level is not None:
         relative = (segment.too or segment.negated) and segment.level != 0.5
@@ -107,6 +133,8 @@ def _weight(p: Weight, segment: Segment, spent: bool) -> float:
     """Return the value of a weight that is only named: "fire", "a bit of fire", "avoid fire", "save fuel"."""
     if segment.negated and not segment.sense and not spent:
         return p.low
+    if segment.negated and segment.preferred and spent and not segment.sense:
+        return p.high  # "without using fuel"
     if segment.negated != (segment.sense < 0):
         return 0.0
     return p.high / 4 if segment.degree == SLIGHTLY else p.high
@@ -118,6 +146,10 @@ def _given(p: Weight | Setpoint, segment: Segment, now: float, sign: float | Non
     number, unit = segment.number
     if segment.negated:
         return "say what instead"
+    if sign is None and sense and "by" in segment.words:
+        sign = float(sense)
+    if sense < 0 and sign is None and not unit:
+        return f"on which scale? {readable(p.name)} goes from {p.low:g} to {p.high:g} {p.unit}".rstrip()
     if unit in PERCENT:
         if sign is not None and not segment.absolute:
             return now * (1 + sign * number / 100)
@@ -125,12 +157,15 @@ def _given(p: Weight | Setpoint, segment: Segment, now: float, sign: float | Non
         return p.low + (p.high - p.low) * (1.0 - share if sense < 0 else share)
     if unit:
         if dimension_of(p) != UNITS[unit][0]:
-            article = "an" if UNITS[unit][0] == ANGLE else "a"
-            in_unit = f", it is in {p.unit}" if p.unit else ""
-            return f"{readable(p.name)} is not {article} {UNITS[unit][0]}{in_unit}"
+            return _not_a(UNITS[unit][0], p)
         number = number * UNITS[unit][1] / UNITS[stem(p.unit)][1]
     if segment.signed or (number < 0 and p.low >= 0):
         return now + number
     if sign is not None and not segment.absolute and segment.level is None:
         return now + sign * number
     return float(f"{number:.9g}")
+
+
+def _not_a(dimension: str, p: Weight | Setpoint) -> str:
+    article = "an" if dimension == ANGLE else "a"
+    return f"{readable(p.name)} is not {article} {dimension}{f', it is in {p.unit}' if p.unit else ''}"

@@ -208,6 +208,10 @@ class StyleGrammar:
             self._take_values(segment, reading)
             return
         names, problem = self._target(segment, reading)
+        plain = not segment.has_head and all(isinstance(self.parameters[name], Weight) for name in names)
+        if segment.unknown and plain:  # the word may say the opposite: "melee off"
+            reading.failed.append(f"'{segment.text}' ({unknown})")
+            return
         if not names:
             reading.failed.append(f"'{segment.text}'{problem}")
             return
@@ -237,6 +241,10 @@ class StyleGrammar:
         """Change the parameters of named options and values, or exclude these values if the segment is negated."""
         for mention in segment.mentions:
             if mention.value is None:
+                continue
+            fixed = not self.parameters[mention.names[0]].options
+            if fixed and (segment.factor is not None or (segment.direction is not None and segment.direction[1] < 0)):
+                reading.failed.append(f"'{segment.text}' (say how much instead)")  # "less grip"
                 continue
             if not segment.negated:
                 self._note_unknown(segment, reading)

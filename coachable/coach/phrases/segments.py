@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 from coachable.coach.phrases.vocabulary import (
     ABSOLUTE,
@@ -14,13 +15,16 @@ from coachable.coach.phrases.vocabulary import (
     EVERY,
     FACTORS,
     FILLERS,
+    JOINTS,
     KEEPS,
     LEVELS,
     NEGATIONS,
+    PARTICLES,
     PERCENT,
     PREFERENCES,
     REPEATS,
     SEPARATORS,
+    STRONGLY,
     UNITS,
     stem,
 )
@@ -34,6 +38,8 @@ _FLAGS = {
     "absolute": ABSOLUTE,
 }
 """Words by the attribute of `Segment` that they set."""
+
+_PARTICLES = [[word] for word in PARTICLES]
 
 
 @dataclass(frozen=True)
@@ -66,6 +72,7 @@ class Segment:
         degree: Strength of the change, 0 if there is none.
         factor: Factor of words such as "twice".
         unknown: Words without a meaning.
+        joint: The separator before the request, "" if there is none.
     """
 
     words: list[str] = field(default_factory=list)
@@ -85,6 +92,7 @@ class Segment:
     every: bool = False
     absolute: bool = False
     signed: bool = False
+    joint: str = ""
 
     @property
     def text(self) -> str:
@@ -118,6 +126,12 @@ class Segment:
         return self.explicit or self.default or self.repeated or self.keep or self.degree > 0
 
     @property
+    def bare(self) -> bool:
+        """Whether the request consists of names only."""
+        asks = self.has_head or self.negated or self.preferred or self.unknown
+        return bool(self.mentions) and not asks and all(mention.value is None for mention in self.mentions)
+
+    @property
     def complete(self) -> bool:
         """Whether another request may begin here."""
         return any(m.value is not None for m in self.mentions) or bool(self.mentions and self.explicit)
@@ -141,11 +155,15 @@ def split(
     while i < len(tokens):
         size = sizes[i]
         mention = lexicon[tuple(stems[i : i + size])] if size else None
+        if mention is not None and stems[i : i + size] in _PARTICLES and mention.names[0] not in segment.names:
+            mention = None
         separated = mention is None and tokens[i] in SEPARATORS
         outdone = mention is None and _outdoes(segment, tokens[i], ahead[i])
         if separated or outdone or _begins_another(segment, tokens[i : i + 2], mention, ahead[i] is not None):
             found.append(segment)
-            segment = Segment(negated=outdone and tokens[i] not in NEGATIONS)
+            segment = Segment(joint=tokens[i]) if separated else Segment()
+            if outdone and tokens[i] not in NEGATIONS:  # "more A than B" leaves B as it is
+                segment = Segment(negated=True, direction=None if found[-1].preferred else found[-1].direction)
         if mention is not None:
             segment.words += tokens[i : i + size]
             if mention not in segment.mentions:
@@ -154,7 +172,7 @@ def split(
             size = _take(segment, tokens, i, ignored)
         i += max(size, 1)
     found.append(segment)
-    return _tidy(found)
+    return _shared(_tidy(found))
 
 
 def _look_up(
@@ -181,8 +199,10 @@ def _look_up(
 
 
 def _outdoes(segment: Segment, word: str, ahead: Mention | None) -> bool:
-    """Return whether the next parameter is ruled out for the segment's: "traps not melee", "rather A than B"."""
+    """Return whether the next parameter is set against the segment's: "traps not melee", "more A than B"."""
     contrasted = word in NEGATIONS or (segment.preferred and word in ("over", "than"))
+    contrasted |= word == "than" and segment.direction is not None
+    contrasted |= word == "to" and "prefer" in segment.words
     return contrasted and bool(segment.mentions) and ahead is not None and not set(segment.names) & set(ahead.names)
 
 
@@ -191,14 +211,16 @@ def _begins_another(segment: Segment, rest: Sequence[str], mention: Mention | No
         other = bool(segment.mentions) and not set(segment.names) & set(mention.names)
         # "arms up": the option belongs to the noun before it
         return other or (mention.value is not None and segment.complete)
+    word = rest[0]
+    dimension = (LEVELS.get(word) or DIRECTIONS.get(word) or ("",))[0]
+    if dimension and segment.dimension not in ("", dimension) and segment.number is None:
+        return True  # "short fast steps"
     if not segment.complete:
         return False
-    word = rest[0]
     if word in NEGATIONS:
         return True
     if word in LEVELS or word in DIRECTIONS:
         # "arms up high" is one request, "arms up high speed" are two
-        dimension = (LEVELS.get(word) or DIRECTIONS[word])[0]
         return segment.number is None and (named_ahead or bool(dimension))
     # A degree belongs to the next word if that is a comparative or an adjective: "shorter steps much more melee".
     return word in DEGREES and len(rest) > 1 and (rest[1] in DIRECTIONS or rest[1] in LEVELS)
@@ -214,6 +236,7 @@ def _take(segment: Segment, tokens: Sequence[str], i: int, ignored: Collection[s
         unit = stem(tokens[i + 1]) if i + 1 < len(tokens) else ""
         known = unit in PERCENT or unit in UNITS
         segment.signed, segment.number = word.startswith("+"), (float(word), unit if known else "")
+        segment.absolute |= i > 0 and tokens[i - 1] == "to"
         if known:
             segment.words.append(tokens[i + 1])
             segment.dimension = segment.dimension or UNITS.get(unit, ("", 1.0))[0]
@@ -230,6 +253,8 @@ def _take(segment: Segment, tokens: Sequence[str], i: int, ignored: Collection[s
         segment.factor = FACTORS[word]
     elif word == "possible" and segment.level is not None:
         segment.level = float(round(segment.level))
+    elif word == "possible" and "as" in segment.words:
+        segment.degree = STRONGLY
     else:
         _take_modifier(segment, word, ignored)
     return 1
@@ -261,3 +286,17 @@ def _tidy(found: list[Segment]) -> list[Segment]:
         else:
             kept.append(segment)
     return kept
+
+
+def _shared(found: list[Segment]) -> list[Segment]:
+    """Let each name of a list have what its first one has: "no fire, acid or frost", "less fuel and tyres"."""
+    in_list = False  # whether the list ends with "and" or "or", which a mere comma does not tell
+    listed = []
+    for segment in reversed(found):
+        in_list = segment.bare and segment.joint in JOINTS and (in_list or segment.joint != ",")
+        listed.append(in_list)
+    for is_listed, (before, segment) in zip(listed[-2::-1], pairwise(found), strict=True):
+        if is_listed and before.mentions and not before.dimension and before.number is None:
+            segment.negated, segment.direction, segment.level = before.negated, before.direction, before.level
+            segment.factor, segment.degree = before.factor, before.degree
+    return found

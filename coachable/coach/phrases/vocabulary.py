@@ -82,8 +82,10 @@ DEFAULTS = _words("reset normal default usual neutral standard ordinary regular"
 KEEPS = _words("keep same leave stay unchanged hold")
 REPEATS = _words("again more further less")
 EVERY = _words("both each all every")
-ABSOLUTE = _words("to at of than exactly about around roughly")
-SEPARATORS = _words(", ; . ! ? : and but plus while with then also")
+ABSOLUTE = _words("at of than exactly about around roughly")
+SEPARATORS = _words(", ; . ! ? : and or but plus while with then also")
+JOINTS = _words(", and or")  # separators within a list of names
+PARTICLES = _words("up forward ahead")  # options of a parameter only beside its name: "arms up", but "speed up"
 
 # Words that carry no request of their own.
 FILLERS = _words(
@@ -129,6 +131,10 @@ def tokenise(phrase: str) -> list[str]:
     text = phrase.lower().replace("\u2019", "'").replace("\u2212", "-")  # typographic apostrophe and minus
     text = re.sub(r"\bcan't\b|\bcannot\b", "can not", text).replace("won't", "will not")
     text = re.sub(r"\b(?:instead of|rather than)\b", "not", text)
+    text = re.sub(r"\b(?:all|anything|everything) (?:but|except)\b", "not", text)
+    text = re.sub(r"\bno more (?!than\b)", "no ", text)
+    text = re.sub(r"\ba little\b", "a bit", text)
+    text = re.sub(r"\bzero\b", "0", text)
     text = re.sub(r"n't\b", " not", text).replace("'s", "").replace("'", "")
     text = re.sub(r"(?<=[a-z])[-_](?=[a-z])", " ", text)
     text = _THOUSANDS.sub(lambda m: m[0].replace(",", ""), text)

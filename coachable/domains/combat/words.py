@@ -4,18 +4,21 @@ from coachable.domain import Words
 
 WORDS = Words(
     vocabulary={
-        "": ("fight", "fighting"),
+        "": ("fight", "fighting", "weapon", "weapons"),
         "melee": ("spear", "close combat", "hand to hand"),
         "traps": ("tripwire", "ambush"),
-        "part_weapon": ("break weapon", "destroy weapon", "tear off weapon", "disarm"),
-        "part_canister": ("break canister", "destroy canister", "tear off canister"),
-        "part_shield": ("break shield", "destroy shield", "tear off shield", "armour", "armor"),
+        "part_weapon": (
+            *("weapon part", "break weapon", "destroy weapon", "tear off weapon", "shoot off weapon", "cut off weapon"),
+            "disarm",
+        ),
+        "part_canister": ("break canister", "destroy canister", "tear off canister", "shoot canister"),
+        "part_shield": (*("break shield", "destroy shield", "tear off shield", "take down shield", "armour", "armor"),),
         "acid": ("corrode", "corrosion"),
         "purgewater": ("drench", "water"),
         "frost": ("freeze", "ice"),
         "shock": ("stun", "electrify"),
-        "fire": ("burn", "ignite", "set on fire"),
-        "adhesive": ("glue", "slow it", "slow down"),
+        "fire": ("burn", "burn it down", "ignite", "set on fire"),
+        "adhesive": ("glue", "slow it", "slow it down", "slow them", "slow them down", "slow down"),
         "carjas_bane sunscourge": ("bow",),
     },
     presets={

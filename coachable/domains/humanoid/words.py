@@ -34,7 +34,17 @@ _VOCABULARY = {
     "": ("walk", "walks", "walking"),
     "pose": ("arm", "hand", "posture", "elbow"),
     "pose=arms_up": (
-        *("up", "arms raised", "raise arms", "raise both arms", "lift arms", "hands up", "hands high"),
+        *(
+            "up",
+            "arms raised",
+            "up arm",
+            "up hand",
+            "raise arms",
+            "raise both arms",
+            "lift arms",
+            "hands up",
+            "hands high",
+        ),
         *("overhead", "above head", "over head", "reach up", "arms high", "arms in the air", "hands in the air"),
     ),
     "pose=arms_in_front": ("forward", "front", "in front", "ahead", "zombie", "sleepwalker"),
@@ -63,7 +73,7 @@ GAIT_WORDS = Words(
         "speed": ("pace", "tempo", "velocity"),
         "+speed": ("speed up", "brisk", "briskly", "quickly", "hurry up", "get a move on"),
         "-speed": ("slow down", "slowly", "leisurely", "dawdle", "take your time"),
-        "speed=low": ("creep", "crawl"),
+        "speed=low": ("creep", "crawl", "slow to a stop"),
         "speed=high": ("rush", "race"),
     },
     presets={

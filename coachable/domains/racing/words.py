@@ -61,11 +61,17 @@ WORDS = {
             "-tire": ("use tyre", "tyre use", "wear", "tyre wear"),
             "tire=0": ("burn tyre", "waste tyre", "ignore tyre", "never mind tyre"),
             "fuel=0": ("burn fuel", "waste fuel", "ignore fuel", "never mind fuel"),
-            "tire fuel=0": ("flat out", "push"),
+            "tire fuel=0": (
+                *("flat out", "push", "waste fuel and tyre", "waste tyre and fuel"),
+                *("ignore fuel and tyre", "ignore tyre and fuel"),
+            ),
             "": (*_DRIVING, "burn", "burning", "consume", "consuming", "spend", "spending", "wear out"),
             "overtake": ("attack", "pass"),
             "defend": ("block",),
-            "defend=low": ("let them pass", "let other pass", "let car pass", "let them by"),
+            "defend=low": (
+                *("let them pass", "let other pass", "let car pass", "let car behind pass"),
+                *("let them by", "let him pass", "let him by"),
+            ),
         },
         presets={
             "flat out": {"tire": 0.0, "fuel": 0.0},
@@ -96,7 +102,18 @@ WORDS = {
             ),
             "+longitudinal +lateral": (
                 *("careful", "carefully", "cautious", "cautiously", "caution", "defensive", "defensively", "polite"),
-                *("timid", "safe", "safely", "calm", "patient", "gentle", "keep distance", "give room", "leave room"),
+                *(
+                    "timid",
+                    "safe",
+                    "safely",
+                    "calm",
+                    "calm down",
+                    "patient",
+                    "gentle",
+                    "keep distance",
+                    "give room",
+                    "leave room",
+                ),
             ),
         },
         presets={

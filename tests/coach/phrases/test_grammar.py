@@ -1,15 +1,17 @@
 """Phrases: a table of what each means, and the share of thirty-six requests that is understood."""
 
 import re
+from functools import cache
 
 import pytest
 
 from coachable.coach.phrases import segments
-from coachable.coach.phrases.grammar import MAX_PHRASE, StyleGrammar
+from coachable.coach.phrases.grammar import MAX_PHRASE, StyleGrammar, fitting
 from coachable.coach.phrases.vocabulary import tokenise
 from coachable.domain import load_domain
 from coachable.domains.humanoid import humanoid_style_space
 from coachable.styles import Choice, Setpoint, Weight
+from coachable.training.weights import domain_of, load_policy
 from tests.coach.phrases.requests import REQUESTS
 
 NOW = {"pose": "arms_in_front", "step_length": 0.475, "course": 0.0}
@@ -274,3 +276,80 @@ def test_most_of_36_requests_are_understood_and_none_wrongly(grammar):
         assert walked or "step_length" not in changes, phrase
         assert "course" not in changes, phrase
     assert right == {"pose": 23, "gait": 21, "both": 13}  # of 28, 24 and 16
+
+
+FIGHT = {"acid": 0.3, "fire": 0.3}
+SAVING = {"fuel": 20.0, "tire": 3000.0}
+OF_AGENTS = [
+    # agent, style in force beside the default, phrase, changes
+    ("combat_full", FIGHT, "no traps, fire or acid", {"traps": -0.0075, "fire": -0.045, "acid": -0.03}),
+    ("combat_full", FIGHT, "stop using traps and melee", {"traps": -0.0075, "melee": -0.055}),
+    ("combat_full", FIGHT, "no traps, fire", {"traps": -0.0075, "fire": 0.9}),
+    ("combat_full", FIGHT, "no traps but melee", {"traps": -0.0075, "melee": 1.1}),
+    ("combat_full", FIGHT, "no traps, use melee", {"traps": -0.0075, "melee": 1.1}),
+    ("combat_full", FIGHT, "use fire and acid", {"fire": 0.9, "acid": 0.6}),
+    ("combat_full", FIGHT, "a bit of fire and acid", {"fire": 0.225, "acid": 0.15}),
+    ("combat_full", FIGHT, "prefer acid to fire", {"acid": 0.6, "fire": -0.045}),
+    ("combat_full", FIGHT, "more fire than acid", {"fire": 0.489}),
+    ("combat_full", FIGHT, "everything but fire", {"fire": -0.045}),
+    ("combat_full", FIGHT, "no more melee", {"melee": -0.055}),
+    ("combat_full", FIGHT, "slow it down", {"adhesive": 0.9}),
+    ("combat_full", FIGHT, "cut off the weapon", {"part_weapon": 1.0}),
+    ("racing_resources", SAVING, "don't save fuel and tyres", {"fuel": 0.0, "tire": 0.0}),
+    ("racing_resources", SAVING, "waste fuel and tyres", {"fuel": 0.0, "tire": 0.0}),
+    ("racing_resources", SAVING, "use less fuel and tyres", {"fuel": 41.6, "tire": 5412.0}),
+    ("racing_resources", SAVING, "you use too much fuel", {"fuel": 63.2}),
+    ("racing_resources", SAVING, "use half the fuel", {"fuel": 40.0}),
+    ("racing_resources", SAVING, "overtake without using fuel", {"overtake": 2.0, "fuel": 105.0}),
+    ("racing_resources", SAVING, "tyres wear too fast", {"tire": 5412.0}),
+    ("racing_resources", {"defend": 1.0}, "let him pass", {"defend": 0.0}),
+    ("racing_drift", {}, "no drift or wheelspin", {"slip_angle_rear": -0.4, "slip_ratio_rear": -0.4}),
+    ("racing_aggressiveness", {}, "calm down", {"longitudinal": 1.7, "lateral": 0.85}),
+    ("racing_aggressiveness", {}, "as aggressive as possible", {"longitudinal": 0.0, "lateral": 0.0}),
+    ("racing_aggressiveness", {}, "a little aggressive", {"longitudinal": 0.65, "lateral": 0.325}),
+    ("humanoid", {"course": 60.0}, "turn 20 degrees to the right", {"course": 40.0}),
+    ("humanoid", {}, "less short steps", {"step_length": 0.545}),
+    ("humanoid", {}, "increase the step length by half", {"step_length": 0.7125}),
+    ("humanoid", {}, "up the step length", {"step_length": 0.545}),
+    ("humanoid", {}, "steps a little shorter", {"step_length": 0.44}),
+    ("humanoid_gait", {"speed": 0.9}, "slow down a little", {"speed": 0.725}),
+    ("humanoid_gait", {"speed": 0.9}, "slow down by 10%", {"speed": 0.81}),
+    ("humanoid_gait", {"speed": 0.9}, "slow down by 0.2 m/s", {"speed": 0.7}),
+    ("humanoid_gait", {"speed": 0.9}, "slow down to 0.6 m/s", {"speed": 0.6}),
+    ("humanoid_gait", {"speed": 0.9}, "don't slow down", {}),
+]
+REFUSED = [
+    ("combat_full", "melee off", "unknown: off"),
+    ("combat_full", "use your weapon", "weapon"),
+    ("racing_resources", "fuel max", "save fuel, or use it?"),
+    ("racing_drift", "less grip", "say how much instead"),
+    ("racing_aggressiveness", "aggressiveness 0", "on which scale? longitudinal goes from 0 to 2 m"),
+    ("humanoid", "faster steps", "step length is not a speed, it is in m"),
+    ("humanoid", "turn slower", "course is not a speed, it is in deg"),
+    ("humanoid", "short fast steps", "step length is not a speed, it is in m"),
+    ("humanoid", "walk forward", "unknown: forward"),
+    ("humanoid", "fewer baby steps", "say how much instead"),
+]
+
+
+@cache
+def grammar_of(name):
+    agent = load_policy(name)
+    domain = domain_of(agent)
+    parameters = [*agent.space.parameters, *(control.parameter for control in domain.controls)]
+    words = fitting(domain.words, parameters)
+    return StyleGrammar(parameters, words.vocabulary), {p.name: p.default for p in parameters}
+
+
+@pytest.mark.parametrize(("name", "now", "phrase", "changes"), OF_AGENTS, ids=[row[2] for row in OF_AGENTS])
+def test_phrases_about_the_shipped_agents(name, now, phrase, changes):
+    grammar, defaults = grammar_of(name)
+    understood = grammar.read(phrase, {**defaults, **now})
+    assert understood.changes == pytest.approx(changes) and not understood.failed
+
+
+@pytest.mark.parametrize(("name", "phrase", "reason"), REFUSED, ids=[row[1] for row in REFUSED])
+def test_phrases_about_the_shipped_agents_that_are_not_guessed_at(name, phrase, reason):
+    grammar, defaults = grammar_of(name)
+    assert reason in str(grammar.read(phrase, defaults))
+    assert grammar.read(phrase, defaults).failed
