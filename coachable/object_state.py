@@ -31,8 +31,8 @@ def save_object(thing: Any, known: dict[int, tuple[int, Any]] | None = None) -> 
     """Save the attributes of an environment of another library, including nested wrappers, tasks and generators.
 
     Args:
-        thing: Object of `gymnasium` or `dm_control`. Spaces, models and functions are left out, because they are equal
-            in all environments that are made in the same way.
+        thing: Object of `gymnasium` or `dm_control`. Spaces and functions are left out, because they are equal in all
+            environments that are made in the same way.
         known: Numbers of the arrays, lists and dicts that were saved before, by identity; None if this is the first
             object. What several attributes share is saved once, and shared again when it is restored.
 
@@ -155,27 +155,34 @@ def _mujoco(value: Any) -> tuple[Any, Any] | None:
 
 
 def _save_mujoco(model: Any, data: Any) -> dict[str, Any]:
-    """Return the state that a step depends on, and derived arrays, which rewards may read before the next step."""
+    """Return the state and the model, on which a step depends, and derived arrays, which rewards may read before."""
     import mujoco
 
     what = mujoco.mjtState.mjSTATE_INTEGRATION
     state = np.empty(mujoco.mj_stateSize(model, what))
     mujoco.mj_getState(model, data, state, what)
-    derived = {name: torch.from_numpy(array.copy()) for name, array in _float_arrays(data).items()}
-    return {"state": torch.from_numpy(state), "derived": derived}
+    derived, constants = (
+        {name: torch.from_numpy(array.copy()) for name, array in _float_arrays(part).items()} for part in (data, model)
+    )
+    return {"state": torch.from_numpy(state), "derived": derived, "model": constants}
 
 
 def _load_mujoco(model: Any, data: Any, saved: dict[str, Any]) -> None:
     import mujoco
 
+    _fill(_float_arrays(model), saved.get("model", {}))  # tasks write into them: positions of targets, sizes, ...
     mujoco.mj_setState(model, data, saved["state"].numpy(), mujoco.mjtState.mjSTATE_INTEGRATION)
     mujoco.mj_forward(model, data)  # contacts and constraints
-    for name, array in _float_arrays(data).items():
-        # mj_step derives arrays before it advances the state, so that they belong to the previous state.
-        if name in saved["derived"] and tuple(saved["derived"][name].shape) == array.shape:
-            array[:] = saved["derived"][name].numpy()
+    # mj_step derives arrays before it advances the state, so that they belong to the previous state.
+    _fill(_float_arrays(data), saved["derived"])
 
 
-def _float_arrays(data: Any) -> dict[str, np.ndarray]:
-    arrays = ((name, getattr(data, name)) for name in dir(data) if not name.startswith("_"))
+def _fill(arrays: dict[str, np.ndarray], saved: dict[str, torch.Tensor]) -> None:
+    for name, array in arrays.items():
+        if name in saved and tuple(saved[name].shape) == array.shape:
+            array[:] = saved[name].numpy()
+
+
+def _float_arrays(part: Any) -> dict[str, np.ndarray]:
+    arrays = ((name, getattr(part, name)) for name in dir(part) if not name.startswith("_"))
     return {name: a for name, a in arrays if isinstance(a, np.ndarray) and a.dtype == np.float64}

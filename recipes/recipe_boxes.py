@@ -156,6 +156,12 @@ def make_loss(run: Run, actor: nn.Module, critics: list[nn.Module], env: EnvBase
             raise ValueError(
                 f"network.critic makes critics with {outputs} outputs: {type(loss).__name__} expects {expected}"
             )
+    for name in {"v_min", "v_max"} & set(settings.network.critic) & set(settings.loss):
+        if settings.network.critic[name] != settings.loss[name]:
+            raise ValueError(
+                f"network.critic.{name}={settings.network.critic[name]}: the loss has {settings.loss[name]}; expected "
+                "critic_support to set both"
+            )
     loss.make_value_estimator(gamma=settings.gamma)
     return loss.to(run.device)
 

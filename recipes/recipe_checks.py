@@ -1,6 +1,6 @@
 """Checks of a configuration; the error messages name the key, the given value and the valid ones."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import Field, fields, is_dataclass
 from functools import reduce
 from typing import Any
@@ -58,6 +58,23 @@ def typed_settings(config: dict[str, Any]) -> Settings:
 def declared(*path: str) -> Any:
     """Return what the schema declares at a path: a field, a range, a list of the range of each entry, or None."""
     return reduce(_inside, path, FamilySettings)
+
+
+def check_added(config: DictConfig, said: Iterable[str]) -> None:
+    """Refuse an added key, which nothing reads, if it has the name of a setting elsewhere; other ones are notes.
+
+    Args:
+        config: The composed configuration.
+        said: Keys that the command line sets.
+
+    Raises:
+        ValueError: If there is such a key.
+    """
+    groups: dict[str, Any] = OmegaConf.to_container(config, resolve=False)  # pyright: ignore[reportAssignmentType]
+    for key in said:
+        places = [f"{group}.{key}" for group, inner in groups.items() if isinstance(inner, dict) and key in inner]
+        if places and declared(key) is None:
+            raise ValueError(f"+{key} has no effect: expected {' or '.join(places)}")
 
 
 def range_of(entry: Any) -> Range | None:

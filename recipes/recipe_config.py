@@ -20,7 +20,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from recipe_checks import checked_values, mistake_in, typed_settings
+from recipe_checks import check_added, checked_values, mistake_in, typed_settings
 from recipe_saved import CONFIGS, check_saved_config
 from recipe_stages import composed_stages
 from recipe_target import choices
@@ -245,7 +245,10 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
         CheckpointError: If the configuration in a checkpoint names other functions, or is not plain.
         ValueError: If a number lies outside its range.
     """
+    check_added(cfg, _said(overrides))
     if cfg.resume:
+        if removed := _removed(overrides):
+            raise ValueError(f"~{removed[0]} cannot be removed from a resumed run: start a new one with init_from=PATH")
         checkpoint = find_checkpoint(cfg.resume)
         saved = read_state(checkpoint).get("config")
         said = {key: OmegaConf.select(cfg, key) for key in _said(overrides)}
@@ -267,11 +270,13 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
                 OmegaConf.update(before, key, value, merge=False)
             for stage in before.get("stages") or []:
                 for key, value in said.items():
-                    OmegaConf.update(stage, key, value, merge=False)
+                    if key.split(".")[0] not in _FIXED:  # each stage keeps its own
+                        OmegaConf.update(stage, key, value, merge=False)
             cfg = OmegaConf.create(OmegaConf.to_container(before, resolve=True, throw_on_missing=True))
     elif cfg.get("stages") or cfg.stage is not None:
-        stages = composed_stages(cfg, {key: OmegaConf.select(cfg, key) for key in _said(overrides)})
-        cfg = _chosen_stage(cfg, stages)
+        said = _said(overrides)
+        stages = composed_stages(cfg, said, _removed(overrides))
+        cfg = _chosen_stage(cfg, stages, said)
     try:
         config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)  # pyright: ignore
     except OmegaConfBaseException as error:
@@ -284,13 +289,14 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
         raise CheckpointError(f"{config['resume']} holds a configuration of another kind: {error}") from error
 
 
-def _chosen_stage(cfg: DictConfig, stages: list[dict[str, Any]]) -> DictConfig:
+def _chosen_stage(cfg: DictConfig, stages: list[dict[str, Any]], said: list[str]) -> DictConfig:
     """Return the stage of `stage=NAME` as a training of its own, or else the first one with the list of all."""
     names = [stage["stage"] for stage in stages]
     if cfg.stage is not None and cfg.stage not in names:
         raise ValueError(f"stage={cfg.stage} does not exist.{choices(cfg.stage, names)}")
     chosen = stages[0 if cfg.stage is None else names.index(cfg.stage)]
-    return OmegaConf.create({**chosen, "stages": stages if cfg.stage is None else []})
+    own = {"init_new_observations": cfg.init_new_observations} if "init_new_observations" in said else {}
+    return OmegaConf.create({**chosen, **own, "stages": stages if cfg.stage is None else []})
 
 
 def announce(config: dict[str, Any], trainer: Trainer) -> None:
@@ -350,8 +356,20 @@ def _quoted_paths(arguments: list[str]) -> list[str]:
 
 
 def _said(overrides: list[str]) -> list[str]:
-    keys = [o.key_or_group for o in OverridesParser.create().parse_overrides(overrides) if not o.is_delete()]
+    """Return the keys that a command line sets: of `train={batch_size: 8}` the key `train.batch_size`."""
+    parsed = [o for o in OverridesParser.create().parse_overrides(overrides) if not o.is_delete()]
+    keys = [key for o in parsed for key in _entries(o.key_or_group, o.value())]
     return [key for key in keys if key != "preset" and not key.startswith("hydra")]
+
+
+def _entries(key: str, value: Any) -> list[str]:
+    if not isinstance(value, dict) or not value:
+        return [key]
+    return [entry for name, inner in value.items() for entry in _entries(f"{key}.{name}", inner)]
+
+
+def _removed(overrides: list[str]) -> list[str]:
+    return [o.key_or_group for o in OverridesParser.create().parse_overrides(overrides) if o.is_delete()]
 
 
 def _run_of(checkpoint: Path, *, staged: bool) -> str | None:

@@ -1,6 +1,8 @@
 """Configurations of the stages of a training: the recipe's own, with the changes of each stage."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable
+from functools import reduce
+from operator import getitem
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -10,19 +12,22 @@ from recipe_checks import checked_values, mistake_in, typed_settings
 _OF_THE_RUN = ("run_dir", "resume", "init_from", "init_new_observations", "stage", "stages", "hydra")
 
 
-def composed_stages(cfg: DictConfig, said: Mapping[str, Any]) -> list[dict[str, Any]]:
+def composed_stages(cfg: DictConfig, said: Iterable[str], removed: Iterable[str] = ()) -> list[dict[str, Any]]:
     """Return the complete configuration of every stage; each stage keeps the changes of the stages before it.
 
     Args:
         cfg: The recipe's configuration. `cfg.stages` lists the changes of each stage, its `name` and its
             `total_frames`, which stands for `train.total_frames`.
-        said: Overrides of the command line by key, which apply to all stages.
+        said: Keys that the command line sets, which applies to all stages.
+        removed: Keys that the command line removes.
 
     Raises:
         ValueError: If a stage has no name, changes an unknown setting, or a number lies outside its range.
     """
     stages = []
     changes: list[dict[str, Any]] = OmegaConf.to_container(cfg.stages, resolve=False)  # pyright: ignore
+    given = OmegaConf.to_container(cfg, resolve=False)
+    values = {key: reduce(getitem, key.split("."), given) for key in said if key.split(".")[0] not in _OF_THE_RUN}
     current = cfg.copy()
     current.stages = []
     OmegaConf.set_struct(current, None)  # a stage may add arguments of a target, but no entries of the schema
@@ -38,9 +43,13 @@ def composed_stages(cfg: DictConfig, said: Mapping[str, Any]) -> list[dict[str, 
             )
         try:
             current = OmegaConf.merge(current, change, length)
-            for key, value in said.items():
-                if key.split(".")[0] not in _OF_THE_RUN:
-                    OmegaConf.update(current, key, value, merge=False, force_add=True)
+            for key, value in values.items():
+                OmegaConf.update(current, key, value, merge=False, force_add=True)
+            for key in removed:
+                group, _, name_in_group = key.rpartition(".")
+                inner = OmegaConf.select(current, group)
+                if group and OmegaConf.get_type(inner) is dict:  # arguments of a target; the schema's are all needed
+                    inner.pop(name_in_group, None)
             stage: dict[str, Any] = OmegaConf.to_container(current, resolve=True, throw_on_missing=True)  # pyright: ignore
         except OmegaConfBaseException as error:
             raise ValueError(f"stage {name}: {mistake_in(error)}") from None

@@ -71,7 +71,8 @@ def make_collector(
         policy_device: Device of the policy; None for the device of the environment.
 
     Raises:
-        ValueError: If the backend is unknown, or the actions of policy and environment have other bounds.
+        ValueError: If the backend is unknown, "direct" is asked for several workers, or the actions of policy and
+            environment have other bounds.
     """
     common: dict[str, Any] = {
         "frames_per_batch": frames_per_batch,
@@ -84,6 +85,11 @@ def make_collector(
         common |= {"policy_device": policy_device, "env_device": "cpu", "storing_device": "cpu"}
     plain: dict[str, Any] = {"auto_register_policy_transforms": False}  # the policies here need none
     if backend == "direct":
+        if num_collectors != 1:
+            raise ValueError(
+                f"collector.num_collectors={num_collectors}: collector=direct collects in this process; expected 1, or "
+                "collector=process"
+            )
         env = make_env(seed)
         require_same_bounds(env, policy)
         collector = Collector(env, policy, use_buffers=False, trust_policy=True, **common, **plain)

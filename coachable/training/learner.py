@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import warnings
 from collections.abc import Callable
 from typing import Any, Literal, cast, get_args
 
@@ -135,6 +136,10 @@ class Learner:
             self.optimizers[name].load_state_dict(state)
         self._losses = loss_functions(self.loss_module)
         self._to_compile = self._options["compile"] and self.backend.compiles
+        if self._options["compile"] and not self.backend.compiles:
+            warnings.warn(
+                "compile=True has no effect on hand-written passes: expected fast=off beside it", stacklevel=2
+            )
         self._watch.look()
 
     def update(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -224,6 +229,7 @@ class Learner:
         """Return a learner of a copy of the loss, with a copy of the state."""
         twin = type(self)(copy.deepcopy(self.loss_module, memo), **self._options)
         twin.use_backend(self._make_backend)
+        twin._log_alpha = self._log_alpha  # the loss may hold a scaled one
         twin.load_state_dict(copy.deepcopy(self.state_dict(), memo))
         return twin
 

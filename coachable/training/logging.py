@@ -1,6 +1,7 @@
 """Logging of metrics to a CSV file and, on request, to Weights & Biases, and a progress display."""
 
 import csv
+import io
 import json
 import math
 import os
@@ -65,16 +66,24 @@ class MetricsLog:
 
         Args:
             row: Numbers by name, with the number of env-steps so far as "frames"; new names become new columns.
+
+        Raises:
+            OSError: If the row cannot be written; the file is as before.
         """
         new = [name for name in row if name not in self.columns]
         if new:
             rows = self._read()
-            self.columns += new
-            self._rewrite(rows)
-        with self.path.open("a", newline="", encoding="utf-8") as file:
-            csv.DictWriter(file, self.columns, restval="", lineterminator="\n").writerow(
-                {k: _short(v) for k, v in row.items()}
-            )
+            self._rewrite(rows, [*self.columns, *new])
+        text = io.StringIO()
+        writer = csv.DictWriter(text, self.columns, restval="", lineterminator="\n")
+        writer.writerow({k: _short(v) for k, v in row.items()})
+        size = self.path.stat().st_size
+        try:
+            with self.path.open("a", newline="", encoding="utf-8") as file:
+                file.write(text.getvalue())
+        except OSError:  # a full disk
+            os.truncate(self.path, size)
+            raise
         if self.logger is not None:
             finite = {k: float(v) for k, v in row.items() if math.isfinite(v)}
             self.logger.log_metrics(finite, step=int(row["frames"]))
@@ -95,13 +104,15 @@ class MetricsLog:
         except (UnicodeDecodeError, csv.Error) as error:
             raise ValueError(f"{self.path} is not a table of metrics: {error}. {_MOVE}") from error
 
-    def _rewrite(self, rows: list[dict[str, Any]]) -> None:
+    def _rewrite(self, rows: list[dict[str, Any]], columns: list[str] | None = None) -> None:
+        columns = self.columns if columns is None else columns
         partial = self.path.with_name(self.path.name + ".partial")
         with partial.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, self.columns, restval="", lineterminator="\n", extrasaction="ignore")
+            writer = csv.DictWriter(file, columns, restval="", lineterminator="\n", extrasaction="ignore")
             writer.writeheader()
             writer.writerows(rows)
         os.replace(partial, self.path)
+        self.columns = columns
 
 
 def wandb_logger(name: str, run_dir: Path, *, project: str = "coachable", mode: str = "auto") -> Any | None:

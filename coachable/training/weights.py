@@ -233,10 +233,12 @@ def initialise_from(
             they are 0, the outputs of the networks are those of the other training.
 
     Raises:
-        CheckpointError: If style parameters or network shapes differ, or the networks cannot take new observations.
+        CheckpointError: If style parameters, network shapes or the support of categorical critics differ, or the
+            networks cannot take new observations.
     """
     file = _locate(path_or_domain)
     state = _read_agent(file)
+    _check_support(state["config"], loss_module, file)
     with refusing(file, "a style space"):
         _check_space({**state["space"], "sampler": None}, StyleSpace(space.parameters, name=space.name), file)
     present = loss_module.state_dict()
@@ -249,6 +251,18 @@ def initialise_from(
     for name, value in state["critics"].items():
         for prefix in (_CRITICS, "target_" + _CRITICS):
             present[prefix + name].copy_(value)
+
+
+def _check_support(config: Mapping[str, Any], loss_module: LossModule, source: Path) -> None:
+    bins: Any = getattr(loss_module, "bins", None)
+    with refusing(source, "a configuration"):
+        trained = config.get("loss", {})
+        support = [float(trained[name]) for name in ("v_min", "v_max") if name in trained]
+    if bins is not None and support and support != [bins.v_min, bins.v_max]:
+        raise CheckpointError(
+            f"the critics of {source} represent values in {support}, those of this training in "
+            f"[{bins.v_min}, {bins.v_max}]: expected the same critic_support"
+        )
 
 
 def _widened(saved: Mapping[str, Tensor], seen: int, new: int) -> dict[str, Tensor]:

@@ -293,6 +293,12 @@ def test_runs_with_tables_resume_bit_for_bit(loss, replay, tmp_path):
         ("cheetah_speed", ["~network.critic._target_"], r"^network.critic has no _target_"),
         ("rare_targets", ["+collector.frames_per_batch=99"], r"^frames_per_batch=99 of .*: the recipe sets it"),
         ("rare_targets", ["+env.seed=5"], r"^seed=5 of rare_targets.RareTargets: the recipe sets it"),
+        ("rare_targets", ["collector.num_collectors=4"], r"^collector.num_collectors=4: collector=direct collects in"),
+        (
+            "rare_targets",
+            ["loss=cat_rac", "network.critic.v_min=-7"],
+            r"^network.critic.v_min=-7: the loss has -5.0; expected critic_support",
+        ),
         ("rare_targets", ["+network.actor.obs_dim=3"], r"^network.actor.obs_dim: the environment sets it"),
     ],
 )

@@ -178,6 +178,49 @@ def test_what_the_command_line_says_holds_in_all_stages():
     assert [stage["train"]["total_frames"] for stage in config["stages"]] == [8, 8]
 
 
+def test_a_mapping_sets_its_entries_and_leaves_the_rest_to_the_stages():
+    for arguments in (["train={batch_size: 9}"], ["train.batch_size=9"]):
+        config = compose_config("rare_targets", [*TINY, STAGES, *arguments])
+        assert [stage["train"]["batch_size"] for stage in config["stages"]] == [9, 9]
+        assert [stage["train"]["total_frames"] for stage in config["stages"]] == [24, 40]
+
+
+def test_what_the_command_line_refers_to_is_looked_up_in_each_stage():
+    config = compose_config("rare_targets", [*TINY, STAGES, "critic_support.v_max=${alpha}"])
+    assert [stage["critic_support"]["v_max"] for stage in config["stages"]] == [0.01, 0.2]
+
+
+def test_what_the_command_line_removes_stays_away_in_all_stages():
+    stages = "stages=[{name: first}, {name: second, env: {seconds: 9}}]"
+    config = compose_config("cheetah_speed", ["preset=smoke", stages, "~env.seconds"])
+    assert ["seconds" in stage["env"] for stage in config["stages"]] == [False, False]
+
+
+def test_new_observations_of_a_stage_that_is_trained_on_its_own():
+    clean = compose_config("racing_qr_sac", ["preset=resources", "stage=clean", "init_new_observations=33"])
+    assert clean["init_new_observations"] == 33
+    traffic = ["preset=resources", "stage=traffic"]
+    assert compose_config("racing_qr_sac", traffic)["init_new_observations"] == 33
+    assert compose_config("racing_qr_sac", [*traffic, "init_new_observations=0"])["init_new_observations"] == 0
+
+
+def test_an_added_key_that_nothing_reads_is_refused_if_it_looks_like_a_setting():
+    with pytest.raises(ValueError, match=r"^\+batch_size has no effect: expected train.batch_size$"):
+        compose_config("rare_targets", [*TINY, "+batch_size=8"])
+
+
+def test_a_later_stage_keeps_its_own_settings_beside_resume(whole, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(whole, run)
+    shutil.rmtree(run / "stages" / "2_second")
+    config = compose_config("rare_targets", [f"resume={run}", "alpha=0.01", "train={log_interval: 5}"])
+    assert [stage["alpha"] for stage in config["stages"]] == [0.01, 0.2]
+    assert [stage["train"]["log_interval"] for stage in config["stages"]] == [5, 5]
+    assert [stage["train"]["batch_size"] for stage in config["stages"]] == [12, 12]
+    with pytest.raises(ValueError, match=r"^~env.num_envs cannot be removed from a resumed run"):
+        compose_config("rare_targets", [f"resume={run}", "~env.num_envs"])
+
+
 def test_a_group_that_is_removed_is_named():
     with pytest.raises(ValueError, match=r"^replay: Missing mandatory value"):
         compose_config("rare_targets", [*TINY, "~replay"])

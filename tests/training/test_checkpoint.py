@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
+from coachable.distributions.hl_gauss import HLGauss
 from coachable.files import save_state
 from coachable.replay import EventTableBuffer, KeyEvents
 from coachable.replay.replay_files import read_replay, write_replay
@@ -326,6 +327,19 @@ def test_initialise_from_copies_actor_critics_and_targets(make_train, echo_space
     wider = StyleSpace([Setpoint("target", -9.0, 9.0)], Uniform([6.0], [9.0]), name="echo")
     with pytest.raises(CheckpointError, match=r"was trained on another style space: .*target"):
         initialise_from(weights, second.collector.policy, loss, wider)
+
+
+def test_initialise_from_refuses_critics_of_another_support(make_train, echo_space, tmp_path):
+    train = make_train(total_frames=40)
+    describe = train.describe
+    train.describe = lambda: describe() | {"config": {"loss": {"v_min": -50.0, "v_max": 650.0}}}
+    train.run()
+    loss = train.learner.loss_module
+    loss.bins = HLGauss(-50.0, 650.0, 51)
+    initialise_from(tmp_path / "run", train.collector.policy, loss, echo_space)
+    loss.bins = HLGauss(-500.0, 1000.0, 51)
+    with pytest.raises(CheckpointError, match=r"in \[-50.0, 650.0\], those of this training in \[-500.0, 1000.0\]"):
+        initialise_from(tmp_path / "run", train.collector.policy, loss, echo_space)
 
 
 def test_weights_name_no_place_on_the_machine_that_trained(make_train, tmp_path):

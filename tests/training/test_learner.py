@@ -215,6 +215,15 @@ def test_a_checkpoint_does_not_replace_settings_of_the_optimisers(make_learner):
     assert [after.optimizers["actor"].param_groups[0][key] for key in ("lr", "eps")] == [1e-2, 0.25]
 
 
+def test_a_copy_scales_the_same_entropy_weight(make_learner):
+    learner = make_learner(make_loss(), precision="fp32")
+    alpha = learner.loss_module.log_alpha.exp().item()
+    learner.scale_entropy_weight(0.5)
+    twin = copy.deepcopy(learner)
+    twin.scale_entropy_weight(0.5)
+    assert twin.loss_module.log_alpha.exp().item() == pytest.approx(alpha / 2)
+
+
 @pytest.mark.parametrize("order", ["simultaneous", "policy_first"])
 def test_resumed_equals_uninterrupted(make_learner, order):
     def run(learner, seeds):

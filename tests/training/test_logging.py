@@ -2,6 +2,7 @@
 
 import io
 import json
+import resource
 import time
 
 import pytest
@@ -19,6 +20,21 @@ def test_csv_gains_columns_and_forgets_an_abandoned_future(tmp_path):
     again.rewind(2)
     again.write({"frames": 3, "b": 5.0})
     assert (tmp_path / "metrics.csv").read_text().splitlines() == ["frames,a,b", "1,1.0,", "2,,2.0", "3,,5.0"]
+
+
+def test_a_full_disk_leaves_the_rows_before_as_they_are(tmp_path):
+    log = MetricsLog(tmp_path)
+    log.write({"frames": 1, "a": 1.0})
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for row in ({"frames": 2, "a": 0.123456}, {"frames": 3, "another": 1.0}):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (log.path.stat().st_size + 3, before[1]))
+        try:
+            with pytest.raises(OSError):
+                log.write(row)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    log.write({"frames": 4, "a": 4.0})
+    assert log.path.read_text().splitlines() == ["frames,a", "1,1.0", "4,4.0"]
 
 
 @pytest.mark.parametrize("torn", ["4,1", "40,1.0,", "40,1.0,2.0", '4"'])

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.envs import Compose, DMControlEnv, DoubleToFloat, EnvBase, GymWrapper, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import StepCounter
 
@@ -34,6 +35,18 @@ def test_dm_control_goes_on_bit_for_bit_over_the_ends_of_episodes():
     found, _ = _rollout(other, td.clone(), actions[7:])
     assert expected["done"].any()
     assert (expected == found).all()
+
+
+def test_what_a_dm_control_task_writes_into_its_model_is_restored():
+    pytest.importorskip("dm_control")
+    one, other = DMControlEnv("reacher", "easy"), DMControlEnv("reacher", "easy")
+    for seed, env in enumerate((one, other)):
+        env.set_seed(seed)
+        env.reset()
+    load_simulator(other, save_simulator(one))
+    action = TensorDict({"action": torch.zeros(2, dtype=torch.float64)}, [])
+    expected, found = one.step(action.clone())["next"], other.step(action.clone())["next"]
+    assert torch.equal(expected["to_target"], found["to_target"])
 
 
 def test_transforms_of_a_part_are_restored_with_it(make_echo_env):
