@@ -237,7 +237,10 @@ def _render(options: argparse.Namespace) -> int:
 def _curves(options: argparse.Namespace) -> int:
     from coachable.evaluation.curves import draw_learning_curves
 
-    last = draw_learning_curves(dict(options.groups), options.out, x=options.x, y=options.y, smooth=options.smooth)
+    groups: dict[str, list[Path]] = {}
+    for label, runs in options.groups:
+        groups.setdefault(label, []).extend(runs)
+    last = draw_learning_curves(groups, options.out, x=options.x, y=options.y, smooth=options.smooth)
     for label, value in last.items():
         print(f"{label}: {options.y} {value:.4g} at the end")
     print(f"wrote {options.out}")

@@ -81,6 +81,8 @@ def summarise_runs(runs: Sequence[Path], x: str, y: str, smooth: int = 5) -> tup
     curves = []
     for run in runs:
         at, values = read_metric(run, x, y)
+        if (np.diff(at) < 0.0).any():
+            raise ValueError(f"{run} has values of {x!r} that fall: choose another x")
         window = min(smooth, len(values))
         curves.append((at[window - 1 :], np.convolve(values, np.ones(window) / window, mode="valid")))
     grid = np.linspace(max(at[0] for at, _ in curves), min(at[-1] for at, _ in curves), _POINTS)

@@ -47,6 +47,12 @@ def test_runs_without_a_common_part_are_refused(tmp_path):
         draw_learning_curves({"both": runs}, tmp_path / "curves.png", smooth=1)
 
 
+def test_a_column_that_falls_is_no_horizontal_axis(tmp_path):
+    (tmp_path / "metrics.csv").write_text("alpha,loss\n0.3,1\n0.2,2\n0.1,3\n")
+    with pytest.raises(ValueError, match="has values of 'alpha' that fall: choose another x"):
+        draw_learning_curves({"one": [tmp_path]}, tmp_path / "curves.png", x="alpha", y="loss")
+
+
 def test_stages_follow_one_another(tmp_path):
     for number, slope in ((10, 3.0), (9, 2.0)):
         make_run(tmp_path / "run" / "stages" / f"{number}_name", slope, rows=3)
@@ -70,6 +76,10 @@ def test_the_command(tmp_path, capsys):
     make_run(tmp_path / "staged" / "stages" / "1_walk", 2.0)
     assert main(["curves", f"staged={tmp_path}/staged", "--out", str(tmp_path / "c.png"), "--smooth", "1"]) == 0
     assert "staged: episode/return 38 at the end" in capsys.readouterr().out
+    make_run(tmp_path / "bf16_late" / "1", 2.0)
+    both = [f"bf16={tmp_path}/bf16_0", f"bf16={tmp_path}/bf16_late/1"]
+    assert main(["curves", *both, "--out", str(tmp_path / "c.png"), "--smooth", "1"]) == 0
+    assert "bf16: episode/return 28.5 at the end" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         main(["curves", f"fp32={tmp_path}/fp32_*"])
     assert "no run with a metrics.csv matches" in capsys.readouterr().err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from operator import itemgetter
 
 from coachable.coach.phrases.grammar import Value
 from coachable.coach.session.session import CoachSession
@@ -29,11 +30,13 @@ def read_plan(text: str, session: CoachSession) -> dict[float, dict[str, Value]]
         raise ValueError(f"the schedule has {len(text):,} characters: expected at most {MAX_PLAN:,}")
     example = f"'3: {next(iter(session.grammar.examples), 'default')}'"
     style, plan, previous = dict(session.style), {}, None
+    entries = []
     for entry in filter(str.strip, re.split(r"[;\n]", text)):
         match = _ENTRY.fullmatch(entry)
         if match is None:
             raise ValueError(f"'{entry.strip()}' is not of the form SECONDS: PHRASE, such as {example}")
-        seconds, phrase = float(match[1]), match[2].strip()
+        entries.append((float(match[1]), match[2].strip()))
+    for seconds, phrase in sorted(entries, key=itemgetter(0)):  # "shorter" refers to what is in force then
         preset = next((values for name, values in session.presets.items() if name.lower() == phrase.lower()), None)
         if preset is None:
             previous = session.grammar.read(phrase, style | session.controls, previous)

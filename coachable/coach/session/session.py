@@ -230,10 +230,10 @@ class CoachSession:
         check_seed(seed)
         self._controls.values |= self._controls.wanted
         start = Recording(self.domain.name, self.source, seed, self.style, self.controls)
+        self._episodes.seed(seed)
         self._timeline = Timeline(start)
         self._steps_at_request, self._complied_at, self.seed = 0, None, seed
         self._generator = torch.Generator().manual_seed(seed)
-        self._episodes.seed(seed)
         self._controls.steer(self.base_env)
         self._begin_episode()
 

@@ -199,7 +199,7 @@ class RacingEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         start = int(torch.randint(2**31, ()).item()) if seed is None else seed
-        self.seeds = start * 1_000_003 + self._start_of_race
+        self.seeds = start % 2**43 * 1_000_003 + self._start_of_race  # fits into 64 bits
         self.episode = torch.zeros_like(self.episode)
         self.course.assign(self.circuit.repeat(self.cars))
         self.garage.reset()

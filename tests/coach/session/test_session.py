@@ -8,6 +8,7 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 
+from coachable.coach.session.plan import read_plan
 from coachable.coach.session.session import CoachSession
 from coachable.keys import STYLE
 from coachable.styles import StyleRangeWarning, StyleReward, StyleSpace, Term, Weight
@@ -242,3 +243,8 @@ def test_seeding_starts_over(session):
 def test_a_missing_agent():
     with pytest.raises(CheckpointError, match="no checkpoint at nowhere"):
         CoachSession.open("nowhere")
+
+
+def test_the_entries_of_a_plan_are_read_in_the_order_of_their_times(session):
+    plan = read_plan("3: target 0.1 m more; 0: target 0.5 m", session)
+    assert plan == {0.0: {"target": 0.5}, 3.0: {"target": pytest.approx(0.6)}}
