@@ -15,11 +15,11 @@ _STATEFUL = {"gymnasium": ("Env",), "dm_env": ("Environment",), "dm_control.rl.c
 
 # Types whose objects are equal in all environments that are made in the same way, by module.
 _CONSTANT = {
-    "gymnasium": ("Space",),
     "gymnasium.envs.registration": ("EnvSpec",),
     "gymnasium.envs.mujoco.mujoco_rendering": ("MujocoRenderer",),
     "mujoco": ("MjModel",),
 }
+_SPACE = {"gymnasium": ("Space",)}  # equal, too, but for its generator of samples
 _CODE = (type, partial, FunctionType, MethodType, BuiltinFunctionType, ModuleType)
 
 
@@ -31,8 +31,8 @@ def save_object(thing: Any, known: dict[int, tuple[int, Any]] | None = None) -> 
     """Save the attributes of an environment of another library, including nested wrappers, tasks and generators.
 
     Args:
-        thing: Object of `gymnasium` or `dm_control`. Spaces and functions are left out, because they are equal in all
-            environments that are made in the same way.
+        thing: Object of `gymnasium` or `dm_control`. Functions are left out, and of spaces all but their generators,
+            because they are equal in all environments that are made in the same way.
         known: Numbers of the arrays, lists and dicts that were saved before, by identity; None if this is the first
             object. What several attributes share is saved once, and shared again when it is restored.
 
@@ -89,6 +89,8 @@ def _pack(value: Any, where: str, known: dict[int, tuple[int, Any]]) -> Any:
         return {"generator": _pack(value.bit_generator.state, where, known)}
     if isinstance(value, np.random.RandomState):
         return {"generator": _pack(value.get_state(legacy=False), where, known)}
+    if _is_one_of(value, _SPACE):
+        return {"space": [_pack(generator, where, known) for generator in _generators(value)]}
     if (physics := _mujoco(value)) is not None:
         return {"mujoco": _save_mujoco(*physics)}
     if _is_one_of(value, _STATEFUL):
@@ -130,6 +132,9 @@ def _unpack(saved: Any, present: Any, where: str, known: list[Any]) -> Any:
         present.bit_generator.state = _unpack(saved["generator"], present.bit_generator.state, where, known)
     elif "generator" in saved and isinstance(present, np.random.RandomState):
         present.set_state(_unpack(saved["generator"], present.get_state(legacy=False), where, known))
+    elif "space" in saved and _is_one_of(present, _SPACE):
+        for generator, state in zip(_generators(present), saved["space"], strict=True):
+            _unpack(state, generator, where, known)
     elif "mujoco" in saved and (physics := _mujoco(present)) is not None:
         _load_mujoco(*physics, saved["mujoco"])
     elif "object" in saved and _is_one_of(present, _STATEFUL):
@@ -137,6 +142,13 @@ def _unpack(saved: Any, present: Any, where: str, known: list[Any]) -> Any:
     else:
         raise UnsavableError(f"{where} is of type {type(present).__name__} here, and was of another kind when saved")
     return present
+
+
+def _generators(space: Any) -> list[np.random.Generator]:
+    """Return the generators of samples of a space of Gymnasium and of the spaces within it."""
+    inner = getattr(space, "spaces", ())
+    parts = inner.values() if isinstance(inner, dict) else inner
+    return [space.np_random, *(generator for part in parts for generator in _generators(part))]
 
 
 def _is_one_of(value: Any, kinds: dict[str, tuple[str, ...]]) -> bool:

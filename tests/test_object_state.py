@@ -57,6 +57,14 @@ def test_a_restored_environment_goes_on_bit_for_bit(name):
     assert course(one, actions[25:]) == course(other, actions[25:])
 
 
+@pytest.mark.parametrize("inner", [lambda space: space, lambda space: spaces.Dict(a=space)], ids=["plain", "dict"])
+def test_spaces_go_on_drawing_samples(inner):
+    one, other = (Dice(space=inner(spaces.Box(-1.0, 1.0, (3,)))) for _ in range(2))
+    one.space.seed(1), other.space.seed(2)
+    load_object(other, through_a_file(save_object(one)))
+    np.testing.assert_equal(other.space.sample(), one.space.sample())
+
+
 @pytest.mark.parametrize(
     "value",
     [
@@ -104,7 +112,7 @@ def test_methods_are_not_taken_from_a_checkpoint():
 
 
 def test_what_all_copies_share_is_left_out():
-    shared = {"space": spaces.Discrete(3), "rule": abs, "kind": int, "library": np}
+    shared = {"rule": abs, "kind": int, "library": np}
     assert set(save_object(Dice(steps=1, **shared))) == {"steps"}
 
 
