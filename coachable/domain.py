@@ -233,6 +233,10 @@ class Domain:
         coached: Options of `make_env` for coaching and films, if they differ from those of evaluations.
         evaluation: Function that replaces the grid and the switching test of `coachable evaluate`: `(domain, policy,
             folder, settings) -> report`, with the loaded policy and `coachable.evaluation.evaluation_settings`.
+
+    Raises:
+        TypeError: If `make_env`, `make_space` or `make_reward` is no function.
+        ValueError: If `control_step` or `episode_steps` is not positive.
     """
 
     name: str
@@ -262,6 +266,17 @@ class Domain:
     make_stage: Callable[[], Stage] | None = None
     make_web: Callable[..., Any] | None = None
     recorded: Recorded = field(default_factory=Recorded)
+
+    def __post_init__(self) -> None:
+        given = vars(self)
+        for name in ("make_env", "make_space", "make_reward"):
+            if not callable(given[name]):
+                raise TypeError(f"{name} of the domain {self.name!r} is {given[name]!r}: expected a function")
+        step, steps = given["control_step"], given["episode_steps"]
+        if not isinstance(step, WorkedOut) and not 0.0 < step < math.inf:
+            raise ValueError(f"control_step of the domain {self.name!r} is {step}: expected seconds, above 0")
+        if not isinstance(steps, WorkedOut) and not (steps >= 1 and steps == int(steps)):
+            raise ValueError(f"episode_steps of the domain {self.name!r} is {steps}: expected a whole number from 1")
 
     def styled_env(
         self,

@@ -358,6 +358,12 @@ def test_copies_that_are_not_separate_environments_are_refused():
         GymnasiumEnv(lambda: gymnasium.vector.SyncVectorEnv([Walk, Walk]), moved)
 
 
+def test_an_action_of_another_width_is_refused():
+    env = GymnasiumEnv(Walk, moved, num_envs=1)
+    with pytest.raises(ValueError, match="an action has 3 numbers: expected 1"):
+        env.step(env.reset().set("action", torch.zeros(1, 3)))
+
+
 def test_a_diverged_policy_is_named():
     env = GymnasiumEnv(Walk, moved, num_envs=1)
     with pytest.raises(ValueError, match="NaN"):

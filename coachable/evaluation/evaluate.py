@@ -23,7 +23,7 @@ from coachable.evaluation.style_grid import (
     published,
     write_results,
 )
-from coachable.evaluation.switching import SWITCH_PERIOD, SwitchReport, evaluate_switching
+from coachable.evaluation.switching import SwitchReport, evaluate_switching
 from coachable.evaluation.wording import counted, units_of, with_unit
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
 
@@ -180,10 +180,10 @@ def _report(
     if switching is None:
         return text
     median = f"{switching.median_seconds:.2f} s" if len(switching.comply_seconds) else "never"
-    text += f"\n## Style switched at random every {SWITCH_PERIOD} steps ({counted(switch_episodes, 'episode')})\n\n"
+    text += f"\n## Style switched at random every {switching.period} steps ({counted(switch_episodes, 'episode')})\n\n"
     formats = {name: ".0%" if domain.columns.get(name, "").endswith("%") else ".3f" for name in switching.metrics}
     text += markdown_table([switching.metrics], formats, units_of(domain, agent.space, formats))
     if not switching.switches:
-        return text + "\nThere was no switch after which compliance could be judged.\n"
+        return text + "\nNo episode reached a switch after which compliance could be judged.\n"
     text += f"\nComplied before the next switch: {switching.complied:.0%} of {switching.switches} switches; "
     return text + f"median time to comply {median}.\n"

@@ -19,7 +19,6 @@ from coachable.evaluation.report_figures import draw_metrics, draw_requests, dra
 from coachable.evaluation.report_page import Page, paragraph, picture, shown, table
 from coachable.evaluation.runs import Run, StyleTable, estimate, evaluate_run, flat_row, response_rows, sweep_estimate
 from coachable.evaluation.style_grid import acting, training_counts, write_csv
-from coachable.evaluation.switching import SWITCH_PERIOD
 from coachable.evaluation.wording import counted, heading_of, readable
 from coachable.outputs import complete_folder
 from coachable.styles import Setpoint, StyleSpace
@@ -204,7 +203,7 @@ class _Sections:
         switches = sum(test.switches for test in tests)
         if not switches:  # the episodes are too short for one, or compliance cannot be judged
             return
-        period = SWITCH_PERIOD * self.domain.control_step
+        period = tests[0].period * self.domain.control_step
         draw_switches(self.runs, period, self.out / "switches.png")
         row: dict[str, Any] = {
             "complied": estimate([test.complied for test in tests]),

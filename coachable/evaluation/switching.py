@@ -15,20 +15,23 @@ from coachable.evaluation.episode_records import RolloutOptions, record_styles
 from coachable.styles import StyleSpace
 
 SWITCH_PERIOD = 100
-"""Number of env steps between switches of the style."""
+"""Number of env steps between switches of the style, in episodes of at least four times as many."""
 
 
 @dataclass(frozen=True)
 class SwitchReport:
-    """Results of episodes whose style switched at random every `SWITCH_PERIOD` steps.
+    """Results of episodes whose style switched at random.
 
     Attributes:
+        period: Number of env steps between switches.
         metrics: Mean over episodes of survival and of the domain's measures.
         comply_seconds: Time from a switch until the agent complied (S,) [s], for the switches after which it did.
         complied: Share of the switches after which the agent complied before the next one.
-        switches: Number of switches in episodes that had not ended; 0 if no step shows whether the agent complied.
+        switches: Number of switches in episodes that had not ended; 0 if all ended before, or no step shows whether the
+            agent complied.
     """
 
+    period: int
     metrics: dict[str, float]
     comply_seconds: Tensor
     complied: float
@@ -43,28 +46,29 @@ class SwitchReport:
 def evaluate_switching(
     domain: Domain, policy: TensorDictModuleBase, space: StyleSpace, *, episodes: int, **options: Unpack[RolloutOptions]
 ) -> SwitchReport:
-    """Evaluate a policy with a new style from the training distribution every `SWITCH_PERIOD` steps.
+    """Evaluate a policy with a new style from the training distribution every 100 steps, or four times an episode.
 
     No switch counts if compliance cannot be judged in any step, such as savings of fuel without a comparison. The
     arguments are those of `evaluate_grid`, but `episodes` is the number of all episodes.
     """
     generator = torch.Generator().manual_seed(options.get("seed", 0))
     steps = options.get("steps") or domain.episode_steps
-    styles = space.sample((-(-steps // SWITCH_PERIOD), episodes), generator)
-    label = f"{episodes} episodes, style switched every {SWITCH_PERIOD} steps"
-    record = record_styles(domain, policy, space, lambda step: styles[step // SWITCH_PERIOD], label, **options)
+    period = min(SWITCH_PERIOD, max(1, steps // 4))
+    styles = space.sample((-(-steps // period), episodes), generator)
+    label = f"{episodes} episodes, style switched every {period} steps"
+    record = record_styles(domain, policy, space, lambda step: styles[step // period], label, **options)
     summary = {"survived": record.survived.float(), **domain.measures.summarise(record.measures, record.alive)}
     metrics = {name: value.nanmean().item() for name, value in summary.items()}
     complies = domain.measures.complies(record.measures) & record.alive
     is_known = bool((judged_steps(domain.measures, record.measures) & record.alive).any())
     waits, switches = [], 0
-    for start in range(SWITCH_PERIOD, len(complies) if is_known else 0, SWITCH_PERIOD):
+    for start in range(period, len(complies) if is_known else 0, period):
         running = record.alive[start]
-        done, first = complies[start : start + SWITCH_PERIOD].max(0)
+        done, first = complies[start : start + period].max(0)
         switches += int(running.sum())
         waits.append((first[running & done] + 1) * domain.control_step)
     times = torch.cat(waits) if waits else torch.empty(0)
-    return SwitchReport(metrics, times, len(times) / switches if switches else float("nan"), switches)
+    return SwitchReport(period, metrics, times, len(times) / switches if switches else float("nan"), switches)
 
 
 def judged_steps(measures: StyleMeasures, record: Mapping[str, Tensor]) -> Tensor:

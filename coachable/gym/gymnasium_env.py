@@ -97,6 +97,8 @@ class GymnasiumEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actions = tensordict.get("action").detach()
         require_finite_action(actions)
+        if actions.shape[-1] != self.heads.action_dim:
+            raise ValueError(f"an action has {actions.shape[-1]} numbers: expected {self.heads.action_dim}")
         choices = self.heads.choices(actions).tolist() if self.heads.categorical else [[]] * len(self.envs)
         axes = self.heads.split(actions)[1].clamp(-1.0, 1.0).tolist()
         rewards = np.zeros(len(self.envs))

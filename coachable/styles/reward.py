@@ -1,5 +1,6 @@
 """`StyleReward`, which computes the style part of the reward from features and a style."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -120,6 +121,11 @@ def _check_terms(space: StyleSpace, terms: Mapping[str, Any], scales: Mapping[st
     stray = [name for name in scales if name not in terms]
     if stray:
         problems.append(f"scales are given for {stray}, expected some of the terms {list(terms)}")
+    problems += [
+        f"the scale of {name!r} is {scale}: expected a finite number"
+        for name, scale in scales.items()
+        if not isinstance(scale, int | float) or not math.isfinite(scale)
+    ]
     if problems:
         label = f" {space.name!r}" if space.name else ""
         raise ValueError(f"StyleReward does not fit the space{label} {list(space.names)}: " + "; ".join(problems) + ".")

@@ -181,6 +181,9 @@ class SetpointTolerance(_OfNumbers):
         sigmoid: Shape of the decline, see `tolerance`.
         value_at_margin: See `tolerance`.
         gate: Column of a feature that multiplies the term, such as a "step completed" flag, or None.
+
+    Raises:
+        ValueError: If `margin`, `sigmoid` or `value_at_margin` is not valid for `tolerance`.
     """
 
     parameter: str
@@ -189,6 +192,9 @@ class SetpointTolerance(_OfNumbers):
     sigmoid: str = "long_tail"
     value_at_margin: float = 0.1
     gate: int | None = None
+
+    def __post_init__(self) -> None:
+        _check_shape(self.margin, self.sigmoid, self.value_at_margin)
 
     @property
     def parameters(self) -> tuple[str, ...]:
@@ -216,8 +222,8 @@ class ChoiceTolerance:
         value_at_margin: See `tolerance`.
 
     Raises:
-        ValueError: If the bounds are not two matrices of one shape, a lower bound exceeds its upper bound, or the key
-            is an index.
+        ValueError: If the bounds are not two matrices of one shape, a lower bound exceeds its upper bound, the key is
+            an index, or a setting is not valid for `tolerance`.
     """
 
     def __init__(
@@ -241,6 +247,7 @@ class ChoiceTolerance:
                 f"ChoiceTolerance for {parameter!r} has the key {key}, an index: expected a slice, such as slice(0, 1) "
                 "for the first feature."
             )
+        _check_shape(margin, sigmoid, value_at_margin)
         self.parameters, self.num_options = (parameter,), len(lower)
         self.key, self.margin, self.sigmoid, self.value_at_margin = key, margin, sigmoid, value_at_margin
         # Both bounds are in one table (n_options, 2k), so that a step needs one look-up instead of two.
@@ -265,6 +272,10 @@ class ChoiceTolerance:
             )
         value = tolerance(measured, lower, upper, self.margin, self.sigmoid, self.value_at_margin)
         return weighted_sum(mean, value)
+
+
+def _check_shape(margin: float, sigmoid: str, value_at_margin: float) -> None:
+    tolerance(torch.zeros(1), 0.0, 0.0, margin, sigmoid, value_at_margin)
 
 
 def _on(copies: dict[torch.device, Tensor], device: torch.device) -> Tensor:

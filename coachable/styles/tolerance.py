@@ -41,8 +41,8 @@ def tolerance(
     """
     if not isinstance(lower, Tensor) and not isinstance(upper, Tensor) and lower > upper:
         raise ValueError(f"tolerance has lower = {lower} > upper = {upper}: expected lower <= upper.")
-    if margin < 0:
-        raise ValueError(f"tolerance has margin = {margin}: expected a number >= 0.")
+    if not 0 <= margin < math.inf:
+        raise ValueError(f"tolerance has margin = {margin}: expected a finite number >= 0.")
     if margin == 0:
         return ((x >= lower) & (x <= upper)).to(x.dtype)
     if sigmoid not in _SIGMOIDS:

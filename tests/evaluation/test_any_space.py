@@ -66,3 +66,17 @@ def test_report_of_a_gymnasium_environment_from_an_exported_model(tmp_path, monk
     page = (tmp_path / "report" / "report.html").read_text()
     assert f"Deterministic policy of {file}, trained for 12 frames" in page
     assert "What a style costs" in page
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"make_env": None}, "make_env of the domain 'any' is None: expected a function"),
+        ({"control_step": -1.0}, "control_step of the domain 'any' is -1.0: expected seconds, above 0"),
+        ({"episode_steps": 0}, "episode_steps of the domain 'any' is 0: expected a whole number from 1"),
+    ],
+)
+def test_a_declaration_that_cannot_work_is_refused(fields, message):
+    declared = {"make_env": StyleEchoEnv, "make_space": StyleSpace, "make_reward": StyleReward}
+    with pytest.raises((TypeError, ValueError), match=message):
+        Domain("any", **(declared | fields))

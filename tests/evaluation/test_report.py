@@ -61,15 +61,6 @@ AGENT = LoadedPolicy(
 SMALL = {"seeds": 3, "episodes": 2, "switch_episodes": 4, "progress": False}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick_switches():
-    """Switches within episodes of 10 steps."""
-    with pytest.MonkeyPatch.context() as patch:
-        for module in ("switching", "report"):
-            patch.setattr(f"coachable.evaluation.{module}.SWITCH_PERIOD", 4)
-        yield
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     out = tmp_path_factory.mktemp("report")
@@ -192,7 +183,7 @@ def test_several_agents_are_a_run_each(tmp_path):
 def test_another_kind_of_grid(tmp_path):
     """No numeric axis, metrics that the domain does not name, an agent that never lives to see a switch."""
     domain = Domain(**{**vars(DOMAIN), "grid": {"hat": ("red", "blue")}, "columns": {}})
-    text = write_report(domain, {"toy.pt": AGENT}, tmp_path, **SMALL, steps=3)
+    text = write_report(domain, {"toy.pt": AGENT}, tmp_path, **SMALL, steps=1)
     page = (tmp_path / "report.html").read_text()
     assert "task return" in page and "Requested and measured" not in page
     assert "Styles that change" not in page and "switches" not in text and not (tmp_path / "switches.csv").exists()
@@ -202,7 +193,7 @@ def test_of_many_parameters_only_what_is_asked_for_is_named():
     space = StyleSpace([Weight(name, 0.0, 5.0) for name in ("melee", "fire", "frost", "lure")])
     cells = [dict.fromkeys(space.names, 0.0), {**dict.fromkeys(space.names, 0.0), "fire": 5.0}]
     grid = StyleGrid(cells, {"survived": np.ones((2, 3))}, 0, 10)
-    table = StyleTable([Run("seed 0", grid, SwitchReport({}, torch.empty(0), 0.0, 0), [])], space)
+    table = StyleTable([Run("seed 0", grid, SwitchReport(100, {}, torch.empty(0), 0.0, 0), [])], space)
     assert table.rows(["survived"])[1] == {"style": "fire 5", "survived": (1.0, 1.0, 1.0)}
     assert table.labels[0] == "default"
 

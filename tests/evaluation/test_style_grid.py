@@ -9,7 +9,6 @@ import torch
 from tensordict.nn import TensorDictModule
 
 from coachable.domain import Domain, load_domain
-from coachable.evaluation import switching
 from coachable.evaluation.episode_records import record_episodes
 from coachable.evaluation.evaluate import evaluate_styles
 from coachable.evaluation.evaluation_settings import EvaluationSettings
@@ -86,9 +85,7 @@ def test_recorded_styles_follow_the_schedule():
     assert record.style.shape == (6, 2, 3)
 
 
-def test_switches_do_not_count_where_compliance_cannot_be_judged(monkeypatch):
-    monkeypatch.setattr(switching, "SWITCH_PERIOD", 2)
-
+def test_switches_do_not_count_where_compliance_cannot_be_judged():
     class Unjudged(ToyMeasures):
         def judged(self, record):
             return torch.zeros_like(record["error"], dtype=torch.bool)
@@ -99,19 +96,18 @@ def test_switches_do_not_count_where_compliance_cannot_be_judged(monkeypatch):
     assert report.metrics["survived"] == 1.0
 
 
-def test_switching_counts_compliance_per_switch(monkeypatch):
-    monkeypatch.setattr(switching, "SWITCH_PERIOD", 2)
+def test_switching_counts_compliance_per_switch():
     report = evaluate_switching(DOMAIN, POLICY, SPACE, episodes=200, steps=4, progress=False)
-    # One switch; the half of the styles with a red hat is obeyed at once, i.e. after one step of 0.1 s.
-    assert report.switches == 200
-    assert report.complied == pytest.approx(0.5, abs=5 * (0.25 / 200) ** 0.5)
+    # The style has four spans; the half of the styles with a red hat is obeyed at once, i.e. after one step of 0.1 s.
+    assert (report.period, report.switches) == (1, 600)
+    assert report.complied == pytest.approx(0.5, abs=5 * (0.25 / 600) ** 0.5)
     torch.testing.assert_close(report.comply_seconds, torch.full_like(report.comply_seconds, 0.1))
 
 
 def test_the_median_of_an_even_number_of_waits_is_between_the_middle_two():
-    report = SwitchReport({}, torch.tensor([0.4, 0.1, 0.2, 0.8]), complied=1.0, switches=4)
+    report = SwitchReport(100, {}, torch.tensor([0.4, 0.1, 0.2, 0.8]), complied=1.0, switches=4)
     assert report.median_seconds == pytest.approx(0.3)
-    assert np.isnan(SwitchReport({}, torch.empty(0), complied=0.0, switches=4).median_seconds)
+    assert np.isnan(SwitchReport(100, {}, torch.empty(0), complied=0.0, switches=4).median_seconds)
 
 
 def test_trials_and_medians_are_reported(tmp_path):

@@ -339,3 +339,20 @@ def test_a_term_of_the_wrong_shape_is_named():
     wide = StyleReward(space, {"wide": WeightedFeature("w", 0)})
     with pytest.raises(ValueError, match=r"'wide' returned shape \(4, 3\)"):
         wide(torch.zeros(4, 3, 2), space.sample((4, 1)))
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [({"sigmoid": "gauss"}, "unknown sigmoid 'gauss'"), ({"margin": math.nan}, "margin = nan: expected a finite")],
+)
+def test_settings_of_a_tolerance_are_checked_when_a_term_is_made(setting, message):
+    with pytest.raises(ValueError, match=message):
+        SetpointTolerance("speed", 0, **{"margin": 1.0, **setting})
+    with pytest.raises(ValueError, match=message):
+        ChoiceTolerance("hat", slice(0, 1), [[0.0]], [[1.0]], **{"margin": 1.0, **setting})
+
+
+def test_scales_are_finite():
+    space = StyleSpace([Weight("fuel", -3, 105)])
+    with pytest.raises(ValueError, match=r"the scale of 'fuel' is nan: expected a finite number"):
+        StyleReward(space, {"fuel": WeightedFeature("fuel", 0)}, {"fuel": math.nan})

@@ -279,7 +279,8 @@ class StyleGrammar:
         dimension = segment.dimension
         numeric = [n for n, p in self.parameters.items() if not isinstance(p, Choice)]
         if dimension:
-            fitting = [n for n in numeric if dimension_of(self.parameters[n]) == dimension]
+            named = {n for n in numeric if dimension in tokenise(n) and not dimension_of(self.parameters[n])}
+            fitting = [n for n in numeric if dimension_of(self.parameters[n]) == dimension or n in named]
             if not fitting:
                 return (), f" (nothing here has a {dimension})"
         else:

@@ -113,7 +113,7 @@ _FRACTIONS = {"half": 0.5, "quarter": 0.25}
 _MIXED = re.compile(rf"\b(\d+|{'|'.join(_NUMBERS)}) and a (half|quarter)\b")
 _RATIO = re.compile(r"(?<![\d./])(\d{1,4})/([1-9]\d{0,3})(?![\d./])")
 _THOUSANDS = re.compile(r"(?<![\d.,])[1-9]\d{0,2}(?:,\d{3})+(?!\d)")  # "1,000", but not "0,400"
-_TOKEN = re.compile(r"[+-]?\d+(?:\.\d+)?|m/s|km/h|[a-z°]+|%|[,;.!?:]")
+_TOKEN = re.compile(r"[+-]?\d+(?:\.\d+)?|m/s(?![a-z])|km/h|[a-z°]+|%|[,;.!?:]")
 
 
 def stem(word: str) -> str:

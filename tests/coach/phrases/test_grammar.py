@@ -149,6 +149,12 @@ def test_both_and_all_change_every_parameter_that_fits():
     assert grammar.read("all higher", now, first).changes == {"ahead": 1.4, "beside": 0.45, "fuel": 0.7}
 
 
+def test_a_parameter_that_is_called_a_speed_is_one_whatever_its_unit():
+    grammar = StyleGrammar([Setpoint("speed", 0.0, 0.05, unit="m/step", default=0.02)])
+    assert grammar.read("faster", {"speed": 0.02}).changes == {"speed": pytest.approx(0.03)}
+    assert grammar.read("0.02 m/step", {"speed": 0.03}).failed
+
+
 def test_back_to_normal_means_everything(grammar):
     understood = grammar.read("back to normal", {"pose": "t_pose", "step_length": 0.6, "course": 90.0})
     assert understood.changes == {"pose": "arms_in_front", "step_length": 0.475, "course": 0.0}
