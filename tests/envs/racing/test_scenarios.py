@@ -25,3 +25,12 @@ def test_worn_tyres_say_nothing_about_where_the_cars_start():
     spread = (wear - wear.mean(0)).abs()[:, inside]
     for tyre in spread:
         assert torch.corrcoef(torch.stack([tyre, gap[inside]]))[0, 1].abs() < 0.06
+
+
+def test_every_seed_of_63_bits_starts_a_race():
+    env = RacingEnv(2, track="oval")
+    starts = []
+    for seed in (5, 2**45, 2**63 - 1):
+        env.set_seed(seed)
+        starts.append(env.reset()["observation"])
+    assert not torch.equal(starts[0], starts[1]) and not torch.equal(starts[1], starts[2])
