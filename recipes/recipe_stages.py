@@ -26,8 +26,7 @@ def composed_stages(cfg: DictConfig, said: Iterable[str], removed: Iterable[str]
     """
     stages = []
     changes: list[dict[str, Any]] = OmegaConf.to_container(cfg.stages, resolve=False)  # pyright: ignore
-    given = OmegaConf.to_container(cfg, resolve=False)
-    values = {key: reduce(getitem, key.split("."), given) for key in said if key.split(".")[0] not in _OF_THE_RUN}
+    values = {key: _unresolved(cfg, key) for key in said if key.split(".")[0] not in _OF_THE_RUN}
     current = cfg.copy()
     current.stages = []
     OmegaConf.set_struct(current, None)  # a stage may add arguments of a target, but no entries of the schema
@@ -59,3 +58,10 @@ def composed_stages(cfg: DictConfig, said: Iterable[str], removed: Iterable[str]
         stages.append(stage)
         OmegaConf.update(current, "init_new_observations", 0)  # the next stage starts with these observations
     return stages
+
+
+def _unresolved(cfg: DictConfig, key: str) -> Any:
+    """Return a group as it is, or what stands at a key, such as `${gamma}`."""
+    value = OmegaConf.select(cfg, key)
+    given = OmegaConf.to_container(cfg, resolve=False)
+    return value if isinstance(value, DictConfig) else reduce(getitem, key.split("."), given)  # pyright: ignore
