@@ -124,8 +124,15 @@ def _check_terms(space: StyleSpace, terms: Mapping[str, Any], scales: Mapping[st
     problems += [
         f"the scale of {name!r} is {scale}: expected a finite number"
         for name, scale in scales.items()
-        if not isinstance(scale, int | float) or not math.isfinite(scale)
+        if not _is_finite(scale)
     ]
     if problems:
         label = f" {space.name!r}" if space.name else ""
         raise ValueError(f"StyleReward does not fit the space{label} {list(space.names)}: " + "; ".join(problems) + ".")
+
+
+def _is_finite(value: Any) -> bool:
+    try:
+        return math.isfinite(value)
+    except (TypeError, ValueError):
+        return False

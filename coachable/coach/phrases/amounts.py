@@ -24,7 +24,7 @@ from coachable.styles import Choice, Setpoint, Weight
 
 Last = tuple[tuple[str, ...], float]  # parameters and direction of a change
 
-_PARTICLES = frozenset(("up", "down"))  # of verbs such as "speed up" or "calm down"
+_OF_VERBS = frozenset(("up", "down"))  # such as "speed up" or "calm down"
 _QUALITY = 0.85  # share of the range that an adjective such as "careful" asks for
 
 
@@ -54,7 +54,7 @@ def amount(p: Weight | Setpoint, segment: Segment, now: float, last: Last | None
         return _given(p, segment, now, sign, sense)
     if segment.keep and sign is None and not segment.explicit:
         return now
-    verb = sense and not _PARTICLES.isdisjoint(segment.words)
+    verb = sense and not _OF_VERBS.isdisjoint(segment.words)
     if segment.negated and (segment.direction is not None or verb):
         return now  # "not longer" and "do not slow down" ask for no change
     if segment.factor is not None:
