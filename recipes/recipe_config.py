@@ -245,13 +245,14 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
         CheckpointError: If the configuration in a checkpoint names other functions, or is not plain.
         ValueError: If a number lies outside its range.
     """
-    check_added(cfg, _said(overrides))
+    keys = _said(overrides)
+    check_added(cfg, keys)
     if cfg.resume:
         if removed := _removed(overrides):
             raise ValueError(f"~{removed[0]} cannot be removed from a resumed run: start a new one with init_from=PATH")
         checkpoint = find_checkpoint(cfg.resume)
         saved = read_state(checkpoint).get("config")
-        said = {key: OmegaConf.select(cfg, key) for key in _said(overrides)}
+        said = {key: OmegaConf.select(cfg, key) for key in keys}
         check_saved_config(saved, checkpoint, config_name, said, OmegaConf.to_container(cfg, resolve=True))
         with refusing(checkpoint, "a configuration"):
             before = OmegaConf.create(saved)
@@ -274,9 +275,8 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
                         OmegaConf.update(stage, key, value, merge=False)
             cfg = OmegaConf.create(OmegaConf.to_container(before, resolve=True, throw_on_missing=True))
     elif cfg.get("stages") or cfg.stage is not None:
-        said = _said(overrides)
-        stages = composed_stages(cfg, said, _removed(overrides))
-        cfg = _chosen_stage(cfg, stages, said)
+        stages = composed_stages(cfg, keys, _removed(overrides))
+        cfg = _chosen_stage(cfg, stages, keys)
     try:
         config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)  # pyright: ignore
     except OmegaConfBaseException as error:

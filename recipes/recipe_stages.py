@@ -26,7 +26,14 @@ def composed_stages(cfg: DictConfig, said: Iterable[str], removed: Iterable[str]
     """
     stages = []
     changes: list[dict[str, Any]] = OmegaConf.to_container(cfg.stages, resolve=False)  # pyright: ignore
-    values = {key: _unresolved(cfg, key) for key in said if key.split(".")[0] not in _OF_THE_RUN}
+    given: dict[str, Any] = OmegaConf.to_container(cfg, resolve=False)  # pyright: ignore
+    values: dict[str, Any] = {}
+    for key in said:
+        if key.split(".")[0] not in _OF_THE_RUN:
+            group = OmegaConf.select(
+                cfg, key
+            )  # has a type; what refers to others, such as ${gamma}, stays as it stands
+            values[key] = group if isinstance(group, DictConfig) else reduce(getitem, key.split("."), given)
     current = cfg.copy()
     current.stages = []
     OmegaConf.set_struct(current, None)  # a stage may add arguments of a target, but no entries of the schema
@@ -58,10 +65,3 @@ def composed_stages(cfg: DictConfig, said: Iterable[str], removed: Iterable[str]
         stages.append(stage)
         OmegaConf.update(current, "init_new_observations", 0)  # the next stage starts with these observations
     return stages
-
-
-def _unresolved(cfg: DictConfig, key: str) -> Any:
-    """Return a group as it is, or what stands at a key, such as `${gamma}`."""
-    value = OmegaConf.select(cfg, key)
-    given = OmegaConf.to_container(cfg, resolve=False)
-    return value if isinstance(value, DictConfig) else reduce(getitem, key.split("."), given)  # pyright: ignore

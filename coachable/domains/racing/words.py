@@ -102,18 +102,8 @@ WORDS = {
             ),
             "+longitudinal +lateral": (
                 *("careful", "carefully", "cautious", "cautiously", "caution", "defensive", "defensively", "polite"),
-                *(
-                    "timid",
-                    "safe",
-                    "safely",
-                    "calm",
-                    "calm down",
-                    "patient",
-                    "gentle",
-                    "keep distance",
-                    "give room",
-                    "leave room",
-                ),
+                *("timid", "safe", "safely", "calm", "calm down", "patient", "gentle"),
+                *("keep distance", "give room", "leave room"),
             ),
         },
         presets={
