@@ -219,6 +219,7 @@ def test_an_error_inside_the_update_restores_the_loss(monkeypatch):
 
 def test_hand_written_passes_are_not_compiled():
     """They are the faster of the two."""
-    learner = make_learner(make_loss(), True, compile=True)
+    with pytest.warns(UserWarning, match="compile=True has no effect"):
+        learner = make_learner(make_loss(), True, compile=True)
     learner.update(make_batch(16))
     assert learner._losses.both == learner.loss_module.forward
