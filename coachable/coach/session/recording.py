@@ -121,10 +121,10 @@ def check_seed(seed: int) -> None:
     """Check that every random generator takes a seed.
 
     Raises:
-        ValueError: If it is negative or has more than 63 bits.
+        ValueError: If it is no whole number, is negative or has more than 63 bits.
     """
-    if not 0 <= seed < 2**63:
-        raise ValueError(f"seed = {seed}: expected a whole number from 0 to 2**63 - 1")
+    if not isinstance(seed, int) or not 0 <= seed < 2**63:
+        raise ValueError(f"seed = {seed!r}: expected a whole number from 0 to 2**63 - 1")
 
 
 def is_trained(parameter: Parameter, value: float | str) -> bool:

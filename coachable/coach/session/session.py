@@ -196,9 +196,10 @@ class CoachSession:
             ValueError: For a negative time or a style that `set` would refuse; nothing is scheduled then.
         """
         agenda: dict[int, dict[str, Any]] = {}
+        for seconds in plan:
+            if not isinstance(seconds, int | float) or not 0.0 <= seconds < math.inf:
+                raise ValueError(f"the plan has the time {seconds!r}: expected seconds from now on, 0 or more")
         for seconds, style in sorted(plan.items()):
-            if not 0.0 <= seconds < math.inf:
-                raise ValueError(f"the plan has the time {seconds}: expected seconds from now on, 0 or more")
             values = self._preset(style) if isinstance(style, str) else dict(style)
             theta = self.space.make(strict=self.strict, **(self.style | values))
             request = {name: value for name, value in self.space.describe(theta).items() if name in values}
@@ -221,7 +222,7 @@ class CoachSession:
             seed: Seed with which the session and its recording start over; None continues both.
 
         Raises:
-            ValueError: If the seed is negative or has more than 63 bits.
+            ValueError: If the seed is no whole number, is negative or has more than 63 bits.
         """
         if seed is None:
             self.cancel()
@@ -276,7 +277,12 @@ class CoachSession:
         Args:
             seconds: Simulated time [s].
             on_step: Called with this session after each step.
+
+        Raises:
+            ValueError: If the time is negative or not finite.
         """
+        if not 0.0 <= seconds < math.inf:
+            raise ValueError(f"seconds = {seconds}: expected 0 or more")
         for _ in range(round(seconds / self.domain.control_step)):
             self.step()
             on_step(self)

@@ -159,10 +159,16 @@ def test_a_style_of_zero_weights_asks_for_nothing():
 
 
 def test_seeds_have_a_range(session):
-    for seed in (-1, 2**63):
+    for seed in (-1, 2**63, "1"):
         with pytest.raises(ValueError, match="expected a whole number from 0"):
             session.reset(seed)
     session.step()
+
+
+@pytest.mark.parametrize("seconds", [-1.0, float("nan"), float("inf")])
+def test_run_takes_a_finite_time(session, seconds):
+    with pytest.raises(ValueError, match=r"seconds = .*: expected 0 or more"):
+        session.run(seconds)
 
 
 def run_until_ended(session: CoachSession) -> None:
@@ -213,7 +219,12 @@ def test_schedules(session):
     session.schedule({1.0: {"target": 0.0}})
     session.cancel()
     assert session.scheduled == 0
-    for plan, message in [({-1.0: {}}, "time -1"), ({0.0: "walk"}, "no preset named 'walk'"), ({0.0: {"x": 1}}, "'x'")]:
+    for plan, message in [
+        ({-1.0: {}}, "time -1"),
+        ({"1": {}}, "time '1'"),
+        ({0.0: "walk"}, "no preset named 'walk'"),
+        ({0.0: {"x": 1}}, "'x'"),
+    ]:
         with pytest.raises(ValueError, match=message):
             session.schedule(plan)
 
