@@ -87,7 +87,7 @@ def collect(out: Path) -> dict[str, dict[str, dict[int, Rows]]]:
     """Return the evaluations in `out` by task, contestant and seed."""
     found: dict[str, dict[str, dict[int, Rows]]] = {}
     for path in sorted(out.glob("*.jsonl")):
-        task, name, seed = path.stem.split("_")
+        task, name, seed = path.stem.rsplit("_", 2)
         if rows := read_rows(path):
             found.setdefault(task, {}).setdefault(name, {})[int(seed)] = rows
     return found
@@ -195,7 +195,11 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--tasks", nargs="+", default=list(MINUTES), metavar="DOMAIN-TASK")
     parser.add_argument("--contestants", nargs="+", choices=list(CONTESTANTS), default=list(CONTESTANTS))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
-    parser.add_argument("--minutes", type=float, help="of each training; default: 30, and 90 for humanoids and dogs")
+    parser.add_argument(
+        "--minutes",
+        type=float,
+        help="of each training; default: 30 for walker-walk, walker-run and quadruped-walk, 90 for others",
+    )
     parser.add_argument("--threads", type=int, default=2, help="cores of each contestant")
     parser.add_argument("--clock", choices=["wall", "cpu"], default="wall", help="cpu: processor time of all threads")
     parser.add_argument("--device", default="cpu", help="of our learner; the peers stay on the CPU")

@@ -3,6 +3,7 @@
 import argparse
 import glob
 import runpy
+import shlex
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -198,7 +199,7 @@ def _train_seeds(file: Path, arguments: list[str], seeds: str) -> int:
     folder = Path(folders[-1] if folders else f"runs/{file.stem}/seeds_{time.strftime('%Y-%m-%d_%H-%M-%S')}")
     arguments = [argument for argument in arguments if not argument.startswith("run_dir=")]
     chosen = parse_seeds(seeds.partition("=")[2])
-    print(f"Writing to {folder}; run_dir={folder} continues what Ctrl-C interrupts", flush=True)
+    print(f"Writing to {folder}; {shlex.quote(f'run_dir={folder}')} continues what Ctrl-C interrupts", flush=True)
     failed = train_seeds(file, arguments, chosen, folder)
     print(seed_table(folder, chosen, failed), end="")
     return 1 if failed else 0

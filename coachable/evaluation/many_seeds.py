@@ -59,7 +59,7 @@ def train_seeds(script: Path, arguments: Sequence[str], seeds: Sequence[int], fo
     """
     record = folder / "arguments.json"
     said = json.loads(record.read_text(encoding="utf-8")) if record.exists() else [*arguments]
-    if said != [*arguments]:
+    if sorted(said) != sorted(arguments):
         raise ValueError(
             f"{folder} holds trainings with {' '.join(map(str, said)) or 'no settings'}: "
             "expected the same settings, or another folder with run_dir=PATH"
@@ -80,8 +80,8 @@ def train_seeds(script: Path, arguments: Sequence[str], seeds: Sequence[int], fo
                 seed = waiting.pop(0)
                 running[seed] = _start(script, [*arguments, *threads], seed, folder)
             for seed in [seed for seed, process in running.items() if process.poll() is not None]:
-                if running.pop(seed).returncode:
-                    failed[seed] = _last_line(folder / f"seed_{seed}.log")
+                if code := running.pop(seed).returncode:
+                    failed[seed] = _why_ended(code, folder / f"seed_{seed}.log")
             time.sleep(0.2)
     except KeyboardInterrupt:  # reaches the trainings, too, which save a checkpoint
         for process in running.values():
@@ -139,6 +139,8 @@ def _last(run: Path, name: str) -> float:
         return math.nan
 
 
-def _last_line(log: Path) -> str:
+def _why_ended(code: int, log: Path) -> str:
+    if code < 0:
+        return f"ended by {signal.Signals(-code).name}, see {log}: the same command continues"
     lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     return lines[-1] if lines else "it ended without printing anything"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -116,7 +117,7 @@ def write_report(
         if domain.evaluation is not None:
             settings = EvaluationSettings(episodes, switch_episodes, sweeps=runs[0].sweeps, **options)
             sections.add_own(settings)
-        command = f"coachable report {' '.join(agents)} --seed {seed} --episodes {episodes}"
+        command = f"coachable report {shlex.join(agents)} --seed {seed} --episodes {episodes}"
         command += f" --switch-episodes {switch_episodes} --sweep-points {sweep_points}"
         command += f" --seeds {seeds}" if len(agents) == 1 else ""
         command += f" --steps {steps}" if steps else ""
@@ -150,8 +151,8 @@ def _lead(agents: Mapping[str, LoadedPolicy], runs: Sequence[Run], episodes: int
         f"{counted(episodes, 'episode')} in each of {counted(len(grid.cells), 'style')}, up to {grid.steps} steps "
         "each. Values are interquartile means over the runs, each run counting with the mean of its episodes; in "
         "brackets 95 % intervals, by stratified bootstrap over runs. An interquartile mean leaves out the lowest and "
-        "the highest quarter. For shares it describes a typical style rather than the average, so the summary also "
-        "gives the plain mean."
+        "the highest quarter of the values; of fewer than four it is the plain mean. For shares it describes a "
+        "typical style rather than the average, so the summary also gives the plain mean."
     )
 
 
@@ -248,16 +249,17 @@ class _Sections:
         )
 
     def add_own(self, settings: EvaluationSettings) -> None:
-        """Add the tables and figures that the domain's own evaluation writes for the first agent."""
+        """Add the tables and figures that the domain's own evaluation writes for the first run."""
         assert self.domain.evaluation is not None
         folder = self.out / self.domain.name
         folder.mkdir(exist_ok=True)
         self.domain.evaluation(self.domain, self.agent, folder, settings)
+        source = [paragraph(f"Measured in {self.runs[0].label} only.")] if len(self.runs) > 1 else []
         for file in sorted(folder.glob("*.csv")):
             with file.open(newline="", encoding="utf-8") as lines:
                 rows = [{name: _number(value) for name, value in row.items()} for row in csv.DictReader(lines)]
             figure = file.with_suffix(".png")
-            parts = [picture(figure, f"{readable(file.stem)}, a figure")] if figure.is_file() else []
+            parts = [*source, *([picture(figure, f"{readable(file.stem)}, a figure")] if figure.is_file() else [])]
             columns = {name: [value for row in rows if isinstance(value := row[name], float)] for name in rows[0]}
             large = [name for name, values in columns.items() if values and max(values) >= 1000]
             parts.append(

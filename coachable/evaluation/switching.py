@@ -62,7 +62,7 @@ def evaluate_switching(
     complies = domain.measures.complies(record.measures) & record.alive
     is_known = bool((judged_steps(domain.measures, record.measures) & record.alive).any())
     waits, switches = [], 0
-    for start in range(period, len(complies) if is_known else 0, period):
+    for start in range(period, len(complies) - period + 1 if is_known else 0, period):  # after each, a whole period
         running = record.alive[start]
         done, first = complies[start : start + period].max(0)
         switches += int(running.sum())

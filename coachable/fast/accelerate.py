@@ -35,7 +35,8 @@ When = Literal["auto", "on", "off"]
 def accelerate(learner: Learner, when: When | bool = "auto") -> bool:
     """Switch a learner to hand-written passes, a flat optimiser and, with a C compiler, the kernels of `kernels.c`.
 
-    The results are the same up to rounding, and so is the format of `learner.state_dict()`.
+    The results are the same up to rounding, and so is the format of `learner.state_dict()`. With `precision="bf16"`,
+    changes of parameters through `.data` are not noticed before the next update; other changes in place are.
 
     Args:
         learner: The learner. Its optimisers keep their state.
@@ -86,8 +87,13 @@ def obstacle(loss_module: LossModule) -> str | None:
             return f"the {name} has dropout"
         if not residual_networks(network):
             return f"the {name} has parameters outside of residual networks"
-    if not any(name.startswith("target_qvalue_network_params") for name, _ in loss_module.named_buffers()):
+    targets = {
+        name.split(".")[0] for name, _ in loss_module.named_buffers() if name.startswith("target_") and "." in name
+    }
+    if "target_qvalue_network_params" not in targets:
         return "the critics have no target network"
+    if others := targets - {"target_qvalue_network_params"}:
+        return f"the loss has {', '.join(sorted(others))} besides the critics' target network"
     return None
 
 
@@ -120,8 +126,12 @@ class Acceleration(Backend):
         self._prepare()
 
     def working(self) -> AbstractContextManager[Any]:
-        """Keep torch at one thread, because its own wait for work in a loop that takes a core from the crew."""
-        return crew(KERNEL_THREADS if load_kernels() else 1)
+        """Keep torch at one thread, because its own wait for work in a loop that takes a core from the crew.
+
+        With many threads, torch's own operations are used, but not for losses whose gradients `sac.c` computes.
+        """
+        few = self._direct is not None or torch.get_num_threads() <= KERNEL_THREADS
+        return crew(KERNEL_THREADS if load_kernels() and few else 1)
 
     @contextmanager
     def updating(self) -> Iterator[None]:

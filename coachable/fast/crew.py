@@ -41,20 +41,20 @@ def cut_rows(rows: int, shares: int) -> list[slice]:
 
 @contextmanager
 def crew(largest: int) -> Iterator[None]:
-    """Let as many threads as torch has share the work inside the block, while torch itself uses one.
+    """Let threads share the work inside the block, as many as torch has, while torch itself uses one.
 
     The kernels release Python's lock, so that threads of Python suffice. Torch's own threads would wait for the next
     operation in a loop that takes a core from the others.
 
     Args:
-        largest: With more threads than this nothing changes.
+        largest: Most threads that share the work; with one nothing changes.
     """
     threads = torch.get_num_threads()
-    if not 1 < threads <= largest or _size.value > 1:
+    if min(threads, largest) < 2 or _size.value > 1:
         yield
         return
     torch.set_num_threads(1)
-    _size.value = threads
+    _size.value = min(threads, largest)
     try:
         yield
     finally:

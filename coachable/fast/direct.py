@@ -100,10 +100,9 @@ def has_direct_gradients(loss_module: LossModule, *plans: Plan) -> bool:
     quantiles = type(loss) is QRSACLoss
     return (
         all(_readable(plan) for plan in plans)
-        and loss.reduction == "mean"
-        and (loss.kappa > 0 if quantiles else loss.loss_function == "l2" and critic.trunk.out_features == 1)
+        and _has_plain_settings(loss)
+        and (quantiles or critic.trunk.out_features == 1)
         and loss._version == 2
-        and not loss.skip_done_states
         and loss.min_log_alpha is None
         and loss.max_log_alpha is None
         and type(estimator) is TD0Estimator
@@ -134,8 +133,8 @@ class DirectGradients:
         self._value: StyleCritic = loss.qvalue_network.module
 
     def serves(self, batch: TensorDictBase) -> bool:
-        """Return whether the batch has no weights of a prioritised replay buffer."""
-        return self._loss._maybe_get_priority_weight(batch) is None
+        """Return whether the batch has no weights of a prioritised replay buffer, and the loss its plain settings."""
+        return _has_plain_settings(self._loss) and self._loss._maybe_get_priority_weight(batch) is None
 
     @torch.no_grad()
     def both(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -181,44 +180,54 @@ class DirectGradients:
             batch: The batch.
             critic: Whether to set the critics' gradients.
             actor: Whether to set the policy's gradients.
+
+        Raises:
+            ValueError: If an entry of the batch does not have the width of the networks, which `sac.c` cannot notice.
         """
         loss, count = self._loss, batch.numel()
-        axes = int(self._shares[0].networks[0][0].outputs) // 2
+        policy, own, _ = self._shares[0].networks
+        axes = int(policy[0].outputs) // 2
         held: list[Tensor] = []
 
-        def address(tensor: Tensor) -> int:
+        def address(tensor: Tensor, name: str, width: int = 1) -> int:
+            if tensor.numel() != count * width:
+                raise ValueError(f"{name} has the shape {tuple(tensor.shape)}: expected {count} rows of {width}")
             held.append(tensor.float().contiguous())
             return held[-1].data_ptr()
 
         def inputs(network: GaussianPolicy | StyleCritic, state: TensorDictBase, keys: Sequence[Any]) -> _Inputs:
-            tensors = [state.get(keys[0])]
+            tensors, expected = [state.get(keys[0])], policy[0].layer[0].inner
+            if network is self._value:
+                expected = own[0].layer[0].inner - axes  # the action is its last input
             if network.space is not None:
                 tensors.append(network.space.encode(state.get(keys[-1])))
-            widths = (_I * _MOST)(*(tensor.shape[-1] for tensor in tensors))
-            return _Inputs(len(tensors), widths, (_P * _MOST)(*map(address, tensors)))
+            widths = [tensor.shape[-1] for tensor in tensors]
+            if sum(widths) != expected:
+                raise ValueError(f"observation and style have {sum(widths)} columns: the network has {expected} inputs")
+            addresses = map(address, tensors, ("observation", "style"), widths)
+            return _Inputs(len(widths), (_I * _MOST)(*widths), (_P * _MOST)(*addresses))
 
         found = {name: torch.empty(count) for name in ("loss", "td_error", "log_prob", "value")}
         low, high = self._policy.log_scale_range
-        own = self._shares[0].networks[1]
         job = _Job(
             *(count, axes, len(own), own[0].outputs, float(loss._alpha), low, high, getattr(loss, "kappa", 0.0)),
             critic=inputs(self._value, batch, loss.qvalue_network.in_keys),
-            **{name: address(tensor) for name, tensor in found.items()},
+            **{name: address(tensor, name) for name, tensor in found.items()},
         )
         if critic:
             successor, estimator = batch.get("next"), loss.value_estimator
             keys = estimator.tensor_keys
             job.next_policy = inputs(self._policy, successor, loss.actor_network.in_keys)
             job.next_critic = inputs(self._value, successor, loss.qvalue_network.in_keys)
-            job.taken = address(batch.get(loss.tensor_keys.action))
-            job.reward = address(successor.get(keys.reward))
+            job.taken = address(batch.get(loss.tensor_keys.action), "action", axes)
+            job.reward = address(successor.get(keys.reward), "reward")
             steps = batch.get(keys.steps_to_next_obs, None)
             discount = estimator.gamma if steps is None else estimator.gamma**steps
-            job.discount = address(discount * ~successor.get(keys.terminated))
-            job.next_noise = address(torch.randn(count, axes))
+            job.discount = address(discount * ~successor.get(keys.terminated), "terminated")
+            job.next_noise = address(torch.randn(count, axes), "noise", axes)
         if actor:
             job.policy = inputs(self._policy, batch, loss.actor_network.in_keys)
-            job.noise = address(torch.randn(count, axes))
+            job.noise = address(torch.randn(count, axes), "noise", axes)
         self._call(job, count, critic, actor)
         return found
 
@@ -239,6 +248,12 @@ class DirectGradients:
                 first.gradients[name].add_(other.gradients[name])
             if wanted:
                 first.mark_written(name)
+
+
+def _has_plain_settings(loss: Any) -> bool:
+    """Return whether the settings of a loss that may change at any time are those of `sac.c`."""
+    is_plain = loss.kappa > 0 if type(loss) is QRSACLoss else loss.loss_function == "l2"
+    return is_plain and loss.reduction == "mean" and not loss.skip_done_states
 
 
 def _readable(plan: Plan) -> bool:

@@ -22,7 +22,7 @@ class FlatAdam(torch.optim.Adam):
     """Adam for a network of the hand-written passes.
 
     It gives the same numbers as `torch.optim.Adam` and keeps the same state, so that a state dict of either loads into
-    the other.
+    the other. Weight decay, AMSGrad and maximisation are not offered.
 
     Args:
         params: The trained parameters.
@@ -58,8 +58,14 @@ class FlatAdam(torch.optim.Adam):
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Step on the gradients in the buffers, renew the rounded copies, and move the target."""
+        """Step on the gradients in the buffers, renew the rounded copies, and move the target.
+
+        Raises:
+            ValueError: If a parameter group asks for weight decay, AMSGrad or maximisation.
+        """
         (group,) = self.param_groups
+        if asked := [name for name in ("weight_decay", "amsgrad", "maximize") if group[name]]:
+            raise ValueError(f"{asked[0]}={group[asked[0]]}: the accelerated optimiser has none; expected fast=off")
         (beta1, beta2), rate, eps = group["betas"], group["lr"], group["eps"]
         flat, target, tensors = self._flat, self._target, self._flat.tensors
         states = [self.state[parameter] for parameter in flat.originals]

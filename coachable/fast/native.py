@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 
-KERNEL_THREADS = 4  # the kernels run on one thread; beside many, the parallel operations of torch are faster
+KERNEL_THREADS = 4  # most that share the kernels' work; with more, the parallel operations of torch are faster
 
 _LOG = logging.getLogger(__name__)
 _NAMES = {torch.bfloat16: "bf16", torch.float32: "fp32"}  # as the functions' names end
@@ -87,7 +87,7 @@ def load_kernels() -> dict[torch.dtype, Kernels]:
         return {}
     try:
         return _bind(_library(compiler))
-    except (OSError, subprocess.SubprocessError) as error:
+    except (OSError, subprocess.SubprocessError, AttributeError) as error:  # the last one: a function is missing
         detail = getattr(error, "stderr", "") or error
         _LOG.warning("building %s with %s failed; updates run without: %s", _SOURCE.name, compiler, detail)
         return {}
@@ -115,7 +115,7 @@ def _library(compiler: str) -> ctypes.CDLL:
 
 def _build(compiler: str, library: Path) -> Path:
     command = [compiler, *_FLAGS, "-o", str(library), str(_SOURCE), "-lm"]
-    subprocess.run(command, check=True, capture_output=True, text=True, timeout=120)
+    subprocess.run(command, check=True, capture_output=True, text=True, errors="replace", timeout=120)
     library.chmod(0o700)
     return library
 

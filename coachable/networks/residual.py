@@ -135,8 +135,17 @@ class ResidualMLP(nn.Module):
 
         The head runs in float32, also under autocast, because values and log-probabilities need more precision than
         bfloat16.
+
+        Raises:
+            ValueError: If the inputs have another width.
         """
         x = inputs[0] if len(inputs) == 1 else torch.cat(inputs, -1)
+        if x.shape[-1] != self.in_features:
+            widths = " + ".join(str(part.shape[-1]) for part in inputs)
+            raise ValueError(
+                f"the network has {self.in_features} inputs, but got {widths} = {x.shape[-1]} (observation, style and, "
+                "for a critic, action): expected the widths with which it was made"
+            )
         hidden = self.blocks(x)
         with torch.autocast(x.device.type, enabled=False):
             return self.head(hidden.to(self.head.weight.dtype))

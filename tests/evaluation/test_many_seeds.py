@@ -91,6 +91,14 @@ def test_trainings_side_by_side_share_the_cores(said, cores, expected, tmp_path,
     assert commands == [[*said, *expected]] * 2
 
 
+def test_the_signal_that_ended_a_training_is_named(tmp_path):
+    script = tmp_path / "recipe.py"
+    script.write_text("import os, signal\nprint('half done', flush=True)\nos.kill(os.getpid(), signal.SIGKILL)\n")
+    assert "ended by SIGKILL" in train_seeds(script, ["a=1", "b=2"], [0], tmp_path / "runs")[0]
+    script.write_text("raise SystemExit('error: no such loss')")
+    assert train_seeds(script, ["b=2", "a=1"], [0], tmp_path / "runs") == {0: "error: no such loss"}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL], ids=["ctrl_c", "killed"])
 def test_the_same_command_continues_what_was_interrupted(tmp_path, number):

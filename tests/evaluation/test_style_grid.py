@@ -104,6 +104,11 @@ def test_switching_counts_compliance_per_switch():
     torch.testing.assert_close(report.comply_seconds, torch.full_like(report.comply_seconds, 0.1))
 
 
+def test_a_switch_counts_if_a_whole_period_follows():
+    report = evaluate_switching(DOMAIN, POLICY, SPACE, episodes=20, steps=9, progress=False)
+    assert report.period == 2 and 50 < report.switches <= 3 * 20  # before steps 2, 4 and 6, not 8; some have ended
+
+
 def test_the_median_of_an_even_number_of_waits_is_between_the_middle_two():
     report = SwitchReport(100, {}, torch.tensor([0.4, 0.1, 0.2, 0.8]), complied=1.0, switches=4)
     assert report.median_seconds == pytest.approx(0.3)

@@ -158,6 +158,12 @@ def test_networks_that_are_trained_in_part_are_left_to_torch():
     assert obstacle(loss) == "some parameters of actor_network_params are frozen"
 
 
+def test_further_target_networks_are_left_to_torch():
+    """The optimiser of the critics moves no others."""
+    loss = make_loss(delay_actor=True)
+    assert obstacle(loss) == "the loss has target_actor_network_params besides the critics' target network"
+
+
 def test_networks_with_dropout_are_left_to_torch():
     actor = make_gaussian_actor(OBS, ACT, ScaledStyle(), WIDTHS, dropout=0.1)
     critics = [make_critic(OBS, ACT, ScaledStyle(), WIDTHS) for _ in range(2)]

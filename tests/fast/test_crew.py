@@ -7,6 +7,7 @@ import torch
 
 from coachable.fast import fused, native
 from coachable.fast.crew import crew, crew_size, share_out
+from coachable.fast.native import KERNEL_THREADS
 from tests.fast.test_fused import SHAPES, build, inputs_of
 from tests.sac_problem import cat_rac, make_batch, make_learner, make_loss, qr_sac
 
@@ -109,3 +110,19 @@ def test_torch_uses_one_thread_meanwhile(two_threads):
     assert seen == [1, 1] and torch.get_num_threads() == 2
     with crew(1):
         assert crew_size() == 1 and torch.get_num_threads() == 2
+
+
+@pytest.mark.parametrize("build, size", [(make_loss, KERNEL_THREADS), (cat_rac, 1)])
+def test_beside_many_threads_only_direct_gradients_share_the_kernels(build, size):
+    """The other losses use torch's operations then."""
+    learner = make_learner(build(), True)
+    if learner.backend._direct is None and size > 1:
+        pytest.skip("no C compiler, or no vector instructions")
+    before = torch.get_num_threads()
+    torch.set_num_threads(2 * KERNEL_THREADS)
+    try:
+        with learner.backend.working():
+            assert crew_size() == size
+        learner.update(make_batch(256))
+    finally:
+        torch.set_num_threads(before)

@@ -12,7 +12,7 @@ from coachable.losses import QRSACLoss
 from coachable.networks import make_critic, make_gaussian_actor
 from coachable.training import Learner
 from coachable.training.learner import NonFiniteLossError
-from tests.sac_problem import ACT, OBS, WIDTHS, ScaledStyle, cat_rac, make_batch, make_loss, qr_sac
+from tests.sac_problem import ACT, OBS, WIDTHS, ScaledStyle, cat_rac, make_batch, make_learner, make_loss, qr_sac
 
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16}
 
@@ -58,6 +58,36 @@ def threads(request):
     torch.set_num_threads(request.param)
     yield request.param
     torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize(
+    "key, shape, message",
+    [
+        ("observation", (64, 9), "11 columns: the network has 9 inputs"),
+        (("next", "observation"), (64, 2), "4 columns: the network has 9 inputs"),
+        ("action", (64, 1), r"action has the shape \(64, 1\): expected 64 rows of 3"),
+        (("next", "reward"), (64, 2), r"reward has the shape \(64, 2\)"),
+        (("next", "terminated"), (64, 3), r"terminated has the shape \(64, 3\)"),
+    ],
+)
+def test_entries_of_another_width_are_refused(key, shape, message, accelerated):
+    """sac.c would read beyond their ends."""
+    batch = make_batch(64)
+    batch.set(key, batch[key].new_zeros(shape))
+    with pytest.raises(ValueError, match=message):
+        accelerated(make_loss).update(batch)
+
+
+def test_settings_that_the_loss_gets_later_are_followed():
+    if load_sac(torch.float32) is None:
+        pytest.skip("no C compiler, or no vector instructions")
+    results = []
+    for fast in (True, False):
+        learner = make_learner(make_loss(), fast, precision="fp32")
+        learner.loss_module.loss_function = "smooth_l1"
+        torch.manual_seed(0)
+        results.append(learner.update(make_batch(64))["loss_qvalue"])
+    torch.testing.assert_close(*results)
 
 
 @pytest.mark.parametrize("shape", [(96,), (35,), (16, 3), (1,)])

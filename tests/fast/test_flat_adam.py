@@ -100,3 +100,11 @@ def test_state_is_that_of_adam():
     restored.step()
     for ours, other in zip(params, again, strict=True):
         assert torch.equal(ours, other)
+
+
+@pytest.mark.parametrize("option", [{"weight_decay": 0.1}, {"maximize": True}, {"amsgrad": True}])
+def test_other_options_of_adam_are_refused(option):
+    optimizer, _ = flat_adam(parameters(0))
+    optimizer.param_groups[0].update(option)
+    with pytest.raises(ValueError, match=r"expected fast=off"):
+        optimizer.step()

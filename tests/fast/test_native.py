@@ -1,4 +1,5 @@
 import logging
+import shutil
 import subprocess
 
 import pytest
@@ -225,6 +226,21 @@ def test_a_failing_build_is_reported_and_survived(fresh, monkeypatch, tmp_path, 
     with caplog.at_level(logging.WARNING):
         assert native.load_kernels() == {}
     assert "building broken.c" in caplog.text
+
+
+@pytest.mark.parametrize("script", ["printf '\\374' >&2; exit 1", "{cc} -shared -o $out -x c /dev/null"])
+@needs_compiler
+def test_a_compiler_that_is_none_is_reported_and_survived(script, fresh, monkeypatch, tmp_path, caplog):
+    """One that prints what is no text, and one whose library has none of the functions."""
+    compiler = tmp_path / "cc"
+    take_out = 'while [ "$1" != -o ]; do shift; done; out=$2\n'
+    compiler.write_text(f"#!/bin/sh\n{take_out}{script.format(cc=shutil.which('cc') or shutil.which('gcc'))}\n")
+    compiler.chmod(0o700)
+    monkeypatch.setenv("CC", str(compiler))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    with caplog.at_level(logging.WARNING):
+        assert native.load_kernels() == {}
+    assert "updates run without" in caplog.text
 
 
 def cached(folder):

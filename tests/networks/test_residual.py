@@ -84,6 +84,11 @@ def test_bad_options_raise(options):
         ResidualMLP(3, 1, **{"widths": (4, 4), **options})
 
 
+def test_inputs_of_another_width_are_refused():
+    with pytest.raises(ValueError, match=r"has 5 inputs, but got 4 \+ 2 = 6"):
+        ResidualMLP(5, 1, (8,))(torch.zeros(3, 4), torch.zeros(3, 2))
+
+
 def test_dropout_is_on_only_where_a_gradient_is_asked_for():
     torch.manual_seed(0)
     net = ResidualMLP(6, 1, (2000,), dropout=0.25).blocks

@@ -1,14 +1,10 @@
-"""A training of seconds by `dmc.py`: `pytest benchmarks/test_dmc.py`."""
+"""The benchmark `dmc.py`: a training of seconds, its tasks, and its tables."""
 
 import csv
-import sys
-from pathlib import Path
 
+import dmc
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-import dmc
 from dmc_workers import EPISODE, REPEAT, Task
 
 
@@ -55,6 +51,17 @@ def test_a_task_equals_the_suite_with_each_action_twice(name):
         assert np.array_equal(observation, flat(steps[-1]))
         assert reward == pytest.approx(sum(step.reward for step in steps)) and not terminated
         assert truncated == steps[-1].last()
+
+
+def test_results_are_found_by_task_contestant_and_seed(tmp_path):
+    row = '{"minutes": 1.0, "env_steps": 1000, "return": 10.0}'
+    for name in ("ball_in_cup-catch_coachable_0", "ball_in_cup-catch_sbx-sac_1"):
+        (tmp_path / f"{name}.jsonl").write_text(f"{row}\n")
+    found = dmc.collect(tmp_path)
+    assert {name: list(seeds) for name, seeds in found["ball_in_cup-catch"].items()} == {
+        "coachable": [0],
+        "sbx-sac": [1],
+    }
 
 
 def test_marks_that_a_training_did_not_reach_are_empty():
