@@ -16,6 +16,7 @@ from coachable.coach.phrases.vocabulary import (
     STRONGLY,
     TURNS,
     UNITS,
+    own_unit,
     stem,
 )
 from coachable.evaluation.wording import readable
@@ -155,7 +156,9 @@ def _given(p: Weight | Setpoint, segment: Segment, now: float, sign: float | Non
             return now * (1 + sign * number / 100)
         share = number / 100
         return p.low + (p.high - p.low) * (1.0 - share if sense < 0 else share)
-    if unit:
+    if unit not in UNITS and unit not in ("", own_unit(p.unit)):
+        return f"{readable(p.name)} {f'is in {p.unit}' if p.unit else 'has no unit'}"
+    if unit in UNITS:
         if dimension_of(p) != UNITS[unit][0]:
             return _not_a(UNITS[unit][0], p)
         number = number * UNITS[unit][1] / UNITS[stem(p.unit)][1]

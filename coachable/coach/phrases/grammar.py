@@ -14,7 +14,7 @@ from typing import Any, cast
 from coachable.coach.phrases import segments
 from coachable.coach.phrases.amounts import Last, amount, dimension_of, wrapped
 from coachable.coach.phrases.segments import Mention, Segment
-from coachable.coach.phrases.vocabulary import FILLERS, RESERVED, stem, tokenise
+from coachable.coach.phrases.vocabulary import FILLERS, RESERVED, mark_own_units, own_unit, stem, tokenise
 from coachable.domain import Words
 from coachable.evaluation.wording import readable, readable_number
 from coachable.styles import Choice, Parameter, StyleSpace, Weight
@@ -129,7 +129,8 @@ class StyleGrammar:
         if len(phrase) > MAX_PHRASE:
             problem = f"the phrase has {len(phrase):,} characters, at most {MAX_PHRASE:,} are read"
             return Understanding(phrase[:MAX_PHRASE], {}, (), (problem,), reading.last)
-        split = segments.split(tokenise(phrase), self.lexicon, self._ignored)
+        marked = mark_own_units(phrase, {p.unit for p in self.parameters.values()})
+        split = segments.split(tokenise(marked), self.lexicon, self._ignored)
         if not split:
             reading.failed.append(f"'{phrase.strip()}'" if phrase.strip() else "an empty phrase")
         for segment in split:
@@ -285,6 +286,8 @@ class StyleGrammar:
                 return (), f" (nothing here has a {dimension})"
         else:
             fitting = [n for n in numeric if dimension_of(self.parameters[n]) != "angle"]
+        if segment.number is not None and segment.number[1].startswith("°"):
+            fitting = [n for n in numeric if own_unit(self.parameters[n].unit) == segment.number[1]] or fitting
         if segment.every:
             return tuple(fitting), ""  # "both 0.5 m"
         if reading.last is not None and (reading.last[0][0] in fitting or not dimension):

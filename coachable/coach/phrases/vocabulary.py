@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 # How far a comparative moves a parameter, as a share of its range.
 SLIGHTLY, PLAINLY, STRONGLY = 0.1, 0.2, 0.4
@@ -119,6 +119,25 @@ _TOKEN = re.compile(r"[+-]?\d+(?:\.\d+)?|m/s(?![a-z])|km/h|[a-z°]+|%|[,;.!?:]")
 def stem(word: str) -> str:
     """Return a word without the s of the plural."""
     return word[:-1] if len(word) > 3 and word.endswith("s") and not word.endswith("ss") else word
+
+
+def own_unit(unit: str) -> str:
+    """Return the token for a parameter's unit that is not in `UNITS`, such as "rad/s"; "" for other units and none."""
+    letters = re.sub(r"[^a-z]", "", unit.lower())
+    return "" if not letters or stem(unit) in UNITS else f"°{stem(letters)}"
+
+
+def mark_own_units(phrase: str, units: Iterable[str]) -> str:
+    """Replace units behind numbers by their tokens, see `own_unit`.
+
+    Example:
+        >>> tokenise(mark_own_units("spin 2 rad/s", ["rad/s"]))
+        ['spin', '2', '°rad']
+    """
+    for unit in sorted(filter(own_unit, units), key=len, reverse=True):
+        written = r"\s*".join(map(re.escape, unit.split()))
+        phrase = re.sub(rf"(?<=\d)\s*{written}(?![\w/])", f" {own_unit(unit)}", phrase, flags=re.IGNORECASE)
+    return phrase
 
 
 def tokenise(phrase: str) -> list[str]:

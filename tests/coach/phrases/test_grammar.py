@@ -152,7 +152,28 @@ def test_both_and_all_change_every_parameter_that_fits():
 def test_a_parameter_that_is_called_a_speed_is_one_whatever_its_unit():
     grammar = StyleGrammar([Setpoint("speed", 0.0, 0.05, unit="m/step", default=0.02)])
     assert grammar.read("faster", {"speed": 0.02}).changes == {"speed": pytest.approx(0.03)}
-    assert grammar.read("0.02 m/step", {"speed": 0.03}).failed
+    assert grammar.read("0.02 m/step", {"speed": 0.03}).changes == {"speed": 0.02}
+
+
+@pytest.mark.parametrize(
+    "unit", ["rad/s", "deg/s", "°/s", "N m", "N·m", "W/kg", "Hz", "rpm", "1/s", "m/s²", "A", "bar"]
+)
+def test_a_number_may_have_the_unit_of_its_parameter_whatever_that_is(unit):
+    grammar = StyleGrammar([Setpoint("spin", -3.0, 3.0, unit=unit), Weight("thrift", 0.0, 2.0)])
+    now = {"spin": 0.0, "thrift": 0.0}
+    for phrase in (f"spin 2 {unit}", f"2{unit.lower()}", f"2 {unit} more spin"):
+        read = grammar.read(phrase, now)
+        assert read.changes == {"spin": 2.0} and not read.failed, phrase
+    assert grammar.read(f"spin 2 {unit}, thrift max", now).changes == {"spin": 2.0, "thrift": 2.0}
+    assert grammar.read(f"thrift 1 {unit}", now).failed == ("'thrift 1' (thrift has no unit)",)
+
+
+def test_the_unit_tells_which_parameter_is_meant():
+    grammar = StyleGrammar([Setpoint("spin", -3.0, 3.0, unit="rad/s"), Setpoint("lift", -3.0, 3.0, unit="N m")])
+    now = {"spin": 0.0, "lift": 0.0}
+    assert grammar.read("1 N m", now).changes == {"lift": 1.0}
+    assert grammar.read("lift 2 rad/s", now).failed == ("'lift 2' (lift is in N m)",)
+    assert grammar.read("spin 1 rad", now).failed == ("'spin 1 rad' (spin is not an angle, it is in rad/s)",)
 
 
 def test_back_to_normal_means_everything(grammar):
