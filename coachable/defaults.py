@@ -169,7 +169,8 @@ class EnvPictures:
         try:
             picture = simulation.render()
         except Exception as error:  # environments of other libraries may raise anything
-            raise RenderingError(f"{name} draws no pictures: {error}") from error
+            reason = f"its render raised {type(error).__name__} {error}".rstrip()
+            raise RenderingError(f"{name} draws no pictures: {reason}") from error
         return self._fitted(picture)
 
     def _draw_mujoco(self, model: Any, data: Any) -> np.ndarray:

@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException, ValidationError
 from recipe_target import Target, choices
 
+from coachable.domain import domain_names
 from coachable.ranges import FINITE, Range
 
 _NUMBERS = {entry.name: entry for entry in fields(Settings) if "range" in entry.metadata}
@@ -75,6 +76,16 @@ def check_added(config: DictConfig, said: Iterable[str]) -> None:
         places = [f"{group}.{key}" for group, inner in groups.items() if isinstance(inner, dict) and key in inner]
         if places and declared(key) is None:
             raise ValueError(f"+{key} has no effect: expected {' or '.join(places)}")
+
+
+def check_domain(config: DictConfig, said: Iterable[str]) -> None:
+    """Refuse a domain of the command line that no package registers; a recipe's own need not be registered.
+
+    Raises:
+        ValueError: If it is not registered.
+    """
+    if "domain" in said and isinstance(config.domain, str) and config.domain not in (names := domain_names()):
+        raise ValueError(f"domain={config.domain}: expected a registered one.{choices(config.domain, names)}")
 
 
 def range_of(entry: Any) -> Range | None:

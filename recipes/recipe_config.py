@@ -20,7 +20,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from recipe_checks import check_added, checked_values, mistake_in, typed_settings
+from recipe_checks import check_added, check_domain, checked_values, mistake_in, typed_settings
 from recipe_saved import CONFIGS, check_saved_config
 from recipe_stages import composed_stages
 from recipe_target import choices
@@ -247,6 +247,7 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
     """
     keys = _said(overrides)
     check_added(cfg, keys)
+    check_domain(cfg, keys)
     if cfg.resume:
         if removed := _removed(overrides):
             raise ValueError(f"~{removed[0]} cannot be removed from a resumed run: start a new one with init_from=PATH")

@@ -63,6 +63,9 @@ class GymnasiumEnv(EnvBase):
         super().__init__(device="cpu", batch_size=torch.Size((num_envs,)))
         self.features = features
         self.envs = [gymnasium.make(make) if isinstance(make, str) else make() for _ in range(num_envs)]
+        for env in self.envs:
+            if not hasattr(env, "action_space"):
+                raise ValueError(f"make returned {env}: expected an environment of Gymnasium")
         _require_separate(self.envs)
         first = self.envs[0]
         sizes, axes = action_components(first.action_space)
@@ -72,7 +75,7 @@ class GymnasiumEnv(EnvBase):
         first.reset(seed=seed)  # wrappers may remember this episode, for instance in running means
         first.action_space.seed(seed)
         trial = first.action_space.sample()
-        observation, _, _, _, info = first.step(trial)
+        observation, *_, info = _stepped(first, trial)
         self._num_features = len(checked_features(features(observation, trial, info)))
         width = self._observation.shape[1]
         action = self.heads.spec(self.batch_size)
@@ -108,8 +111,7 @@ class GymnasiumEnv(EnvBase):
             if self._finished[row]:  # evaluations step finished episodes on without a reset
                 self._start(row)
             action = native_action(env.action_space, iter(choices[row]), iter(axes[row]))
-            observation, reward, terminated[row], truncated[row], info = env.step(action)
-            rewards[row] = float(reward)
+            observation, rewards[row], terminated[row], truncated[row], info = _stepped(env, action)
             found = checked_features(self.features(observation, action, info))
             if len(found) != self._num_features:  # NumPy would repeat a single number
                 raise ValueError(f"features returned {len(found)} numbers: expected {self._num_features}, as at first")
@@ -178,6 +180,25 @@ class GymnasiumEnv(EnvBase):
             for env in self.envs:
                 env.close()
         super().close(raise_if_closed=raise_if_closed)
+
+
+def _stepped(env: Any, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    """Make a step, and check that its reward and flags are single numbers."""
+    result = env.step(action)
+    if len(result) != 5:
+        raise ValueError(
+            f"step returned {len(result)} values: expected observation, reward, terminated, truncated and info"
+        )
+    observation, reward, terminated, truncated, info = result
+    flags = [bool(_number(name, value)) for name, value in (("terminated", terminated), ("truncated", truncated))]
+    return observation, _number("reward", reward), flags[0], flags[1], info
+
+
+def _number(name: str, value: Any) -> float:
+    number = np.asarray(value)
+    if number.size != 1 or number.dtype.kind not in "biuf":
+        raise ValueError(f"step returned {name}={value!r}: expected one number, or True or False")
+    return float(number.item())
 
 
 def _require_separate(envs: Sequence[gymnasium.Env]) -> None:

@@ -64,6 +64,8 @@ class ActorCriticLoss(SACLoss):
                 f"{name} got {len(critics)} critic(s) for num_qvalue_nets={num_qvalue_nets}: pass a list of that many, "
                 "each built separately"
             )
+        if len(set(map(id, critics))) < len(critics):
+            raise ValueError(f"{name} got the same critic more than once: expected critics built separately")
         POSITIVE.check("alpha", alpha)
         policy = PolicyReader(actor_network, name, continuous_only=self._continuous_only, action_spec=action_spec)
         # TorchRL makes buffers of a list of one, and draws new weights for a single critic, so they are restored below.

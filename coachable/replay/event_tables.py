@@ -239,8 +239,15 @@ class EventTableBuffer(TensorDictReplayBuffer):
         return index
 
     def update_tensordict_priority(self, data: TensorDictBase) -> None:
-        """Set priorities from `priority_key` of a sample; if a record has several labels, the largest counts."""
+        """Set priorities from `priority_key` of a sample; if a record has several labels, the largest counts.
+
+        Raises:
+            KeyError: If the buffer is prioritised and the sample has no `index` or `priority_key`.
+        """
         if self._sampler.prioritized:
+            for key in ("index", self.priority_key):
+                if data.get(key, None) is None:
+                    raise KeyError(f"the sample has no {key!r}: expected the buffer's own sample, after its loss")
             self.update_priority(data.get("index"), data.get(self.priority_key))
 
     def update_priority(self, index: Tensor, priority: Tensor) -> None:

@@ -153,11 +153,17 @@ class StratifiedSampler(Sampler):
 
         Raises:
             RuntimeError: If the sampler is not prioritised.
+            ValueError: If the priorities have another shape or, on a CPU, are not finite.
         """
         if not self.prioritized:
             raise RuntimeError("this buffer draws uniformly within its tables: priorities need prioritized=True")
         index = torch.as_tensor(index)
         priority = torch.as_tensor(priority, device=index.device).detach().abs().double().add(_EPSILON)
+        if priority.ndim and priority.shape[: index.ndim] != index.shape:
+            raise ValueError(f"priorities of shape {tuple(priority.shape)} for slots of shape {tuple(index.shape)}")
+        if priority.device.type == "cpu" and not priority.isfinite().all():  # elsewhere it would wait for the device
+            bad = int((~priority.isfinite()).sum())
+            raise ValueError(f"{bad} of {priority.numel()} priorities are not finite: the loss has diverged")
         priority = priority.expand(index.shape) if not priority.ndim else priority.reshape(*index.shape, -1).amax(-1)
         priority = priority.pow(self.alpha)
         tree = self._tree_on(index.device)

@@ -13,7 +13,7 @@ from coachable.keys import TABLE
 from coachable.replay.n_step import NStep
 from coachable.replay.regions import Regions
 from coachable.replay.routing import EventPredicate, Route, checked_events, checked_route
-from coachable.replay.steps import Steps, flatten_time_major, read_steps
+from coachable.replay.steps import TRAJECTORY, Steps, flatten_time_major, read_steps
 from coachable.replay.windows import Copies, WindowHistory
 
 __all__ = ["TableWriter"]
@@ -83,6 +83,11 @@ class TableWriter(Writer):
         if self.history is None and self.n_step is None:
             steps = Steps.unrelated(len(rows))
         else:
+            if found_envs and self.num_envs not in (None, found_envs) and rows.get(TRAJECTORY, None) is None:
+                raise ValueError(
+                    f"extend got a batch of shape {tuple(data.shape)}, and the buffer has num_envs={self.num_envs}: "
+                    "expected (num_envs, time)"
+                )
             steps = read_steps(rows, found_envs if found_envs is not None else self.num_envs, self._arrived)
         self._arrived += len(rows)
         # Evaluated before n-step assembly, because events and routes are those of the step itself.

@@ -1,5 +1,7 @@
 """Statistics of collected episodes and of updates between two rows of the log."""
 
+import math
+import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -11,7 +13,9 @@ from torchrl.envs import Transform
 
 from coachable.keys import STYLE, STYLE_FEATURES, STYLE_REWARD, TASK_REWARD
 
-__all__ = ["EpisodeStatistics", "EpisodeSums", "Means"]
+__all__ = ["EpisodeStatistics", "EpisodeSums", "EpisodeWatch", "Means"]
+
+_LONG_EPISODE = 10_000  # steps
 
 _SUMS = "episode_sums"
 _SUMMED = {"reward": "return", TASK_REWARD: "task_return", STYLE_REWARD: "style_return"}
@@ -70,6 +74,25 @@ class Means:
         means = {name: total.item() / self._counts[name] for name, total in self._sums.items()}
         self._sums, self._counts = {}, {}
         return means
+
+
+class EpisodeWatch:
+    """Warns once if no episode ends, because a style is drawn when an episode begins."""
+
+    def __init__(self) -> None:
+        self._steps: float = 0
+
+    def add(self, data: TensorDictBase) -> None:
+        """Add collected transitions `[N, T]` of N environments."""
+        self._steps += math.inf if data.get(("next", "done")).any() else data.shape[-1]
+        if _LONG_EPISODE <= self._steps < math.inf:
+            self._steps = math.inf
+            warnings.warn(
+                f"no episode has ended in {_LONG_EPISODE:,} steps of each environment: a style is drawn when an "
+                f"episode begins, so only {data.numel() // data.shape[-1]} styles were seen. Expected a time limit, "
+                "such as gymnasium.wrappers.TimeLimit or torchrl.envs.StepCounter",
+                stacklevel=2,
+            )
 
 
 class EpisodeStatistics:

@@ -22,7 +22,7 @@ from coachable.replay.replay_files import read_replay
 from coachable.training.async_collector import AsyncCollector
 from coachable.training.checkpoint import CheckpointStore, find_checkpoint, read_state
 from coachable.training.collection import collector_state, load_collector_state, simulation_env
-from coachable.training.episodes import EpisodeStatistics, Means
+from coachable.training.episodes import EpisodeStatistics, EpisodeWatch, Means
 from coachable.training.learner import Learner
 from coachable.training.logging import MetricsLog, Progress
 from coachable.training.rng import rng_state, set_rng_state
@@ -127,6 +127,7 @@ class Trainer:
             learner.scale_entropy_weight(factor)  # refuses now what it cannot scale later
         self._throttle = Throttle(settings.throttle)
         self._episodes = EpisodeStatistics(style_terms)
+        self._watch = EpisodeWatch()
         self._losses = Means()
         self._latest: dict[str, float] = {}
         self._evaluations = self._logged_frames = self._filled_from = 0  # the last: when the replay buffer was empty
@@ -203,6 +204,8 @@ class Trainer:
             stored = data.select(*self.replay_keys)
             require_finite(stored)
             self._episodes.add(data.reshape(-1))
+            if not isinstance(self.collector, AsyncCollector):  # whose batches are of one worker each
+                self._watch.add(data)
             steps = stored.shape[-1:] if isinstance(self.replay, EventTableBuffer) else ()  # its rows are environments
             self.replay.extend(stored.reshape(-1, *steps))
             if isinstance(self.collector, AsyncCollector) and isinstance(self.replay, EventTableBuffer):

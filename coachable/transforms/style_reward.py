@@ -4,6 +4,7 @@ from collections.abc import Iterable
 
 import torch
 from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import Transform
 
@@ -28,7 +29,8 @@ class StyleRewardTransform(Transform):
     Raises:
         KeyError: If the environment declares no `task_reward`, or a step emits no `task_reward`, `style_features` or
             style.
-        ValueError: If the environment declares nested `style_features`.
+        ValueError: If the environment declares nested `style_features`, or a step emits features or a task reward that
+            do not have the environment's batch shape and a last dimension.
     """
 
     def __init__(self, style_reward: StyleReward) -> None:
@@ -46,7 +48,11 @@ class StyleRewardTransform(Transform):
             )
         if features is None or task_reward is None:
             raise KeyError(f"after a step the environment emitted {_listed(next_tensordict.keys())}: {_EXPECTED}")
+        if features.shape[:-1] != theta.shape[:-1]:  # terms would broadcast features (N,) silently
+            raise ValueError(f"{STYLE_FEATURES} is {_shape(features)}: expected {_shape(theta[..., 0], 'F')}")
         value = self.style_reward(features, theta)
+        if task_reward.shape != value.shape:
+            raise ValueError(f"{TASK_REWARD} is {_shape(task_reward)}: expected {_shape(value)}")
         next_tensordict.set(STYLE_REWARD, value)
         return next_tensordict.set("reward", task_reward + value)
 
@@ -88,6 +94,10 @@ class StyleRewardTransform(Transform):
             task = spec[TASK_REWARD]
             spec[STYLE_REWARD] = Unbounded(shape=task.shape, dtype=torch.float32, device=task.device)
         return spec
+
+
+def _shape(tensor: Tensor, *further: str) -> str:
+    return f"({', '.join([*map(str, tensor.shape), *further])}{',' if tensor.ndim + len(further) == 1 else ''})"
 
 
 def _listed(keys: Iterable[NestedKey]) -> str:

@@ -108,6 +108,8 @@ def test_a_single_critic() -> None:
     for params in (loss.qvalue_network_params, loss.target_qvalue_network_params):
         assert torch.equal(params["module", "trunk", "head", "weight"][0], weight)  # not drawn again
     loss(make_batch(AXES))["loss_qvalue"].backward()
+    with pytest.raises(ValueError, match="the same critic more than once"):
+        RACLoss(actor, [critic, critic])
     critics = [p for name, p in loss.named_parameters() if name.startswith("qvalue_network_params")]
     assert len(critics) == len(list(critic.parameters()))
     assert all(p.grad is not None and p.grad.isfinite().all() for p in critics)

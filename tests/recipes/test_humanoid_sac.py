@@ -145,6 +145,11 @@ def test_an_empty_path_is_refused():
         checked_arguments("humanoid_sac", ["preset=smoke", "resume="])
 
 
+def test_a_domain_that_nobody_registers_is_refused():
+    with pytest.raises(ValueError, match=r"domain=humanoit: expected a registered one\. Did you mean humanoid\?"):
+        compose_config("humanoid_sac", ["preset=smoke", "domain=humanoit"])
+
+
 def test_one_critic_is_refused_where_the_loss_takes_the_smaller_value(tmp_path):
     config = compose_config("humanoid_sac", ["preset=smoke", "network.num_critics=1", f"run_dir={tmp_path}"])
     with pytest.raises(ValueError, match=r"network.num_critics is 1: expected at least 2 with loss=sac"):

@@ -126,3 +126,10 @@ def test_streams_that_cannot_be_told_apart_are_an_error():
 def test_unknown_table():
     with pytest.raises(KeyError, match="hit"):
         one_event_buffer(1).table("miss")
+
+
+def test_a_batch_of_another_number_of_environments_is_refused():
+    """Exchanged dimensions would be read as steps of other environments."""
+    rb = EventTableBuffer({"default": 9, "hit": 9}, events=KeyEvents(["hit"]), event_horizon=1, num_envs=2)
+    with pytest.raises(ValueError, match=r"shape \(3, 2\), and the buffer has num_envs=2: expected \(num_envs, time\)"):
+        rb.extend(steps(range(6), [False] * 6).reshape(3, 2))

@@ -245,3 +245,16 @@ def test_on_a_gpu():
     batch["td_error"] = torch.rand(64, device="cuda")
     rb.update_tensordict_priority(batch)
     assert rb.sample(64)["priority_weight"].isfinite().all()
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_priorities_that_are_not_finite_are_refused(bad):
+    rb = filled({"a": 8}, prioritized=True)
+    slots = rb.sample(4)["index"]
+    with pytest.raises(ValueError, match="1 of 4 priorities are not finite"):
+        rb.update_priority(slots, torch.tensor([1.0, bad, 1.0, 1.0]))
+    with pytest.raises(ValueError, match=r"priorities of shape \(3,\) for slots of shape \(4,\)"):
+        rb.update_priority(slots, torch.ones(3))
+    with pytest.raises(KeyError, match="the sample has no 'td_error'"):
+        rb.update_tensordict_priority(rb.sample(4))
+    rb.sample(4)

@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 
 from coachable.keys import STYLE, STYLE_FEATURES, STYLE_REWARD, TASK_REWARD
-from coachable.training.episodes import EpisodeStatistics
+from coachable.training.episodes import EpisodeStatistics, EpisodeWatch
 
 
 def transitions(done, terminated, sums=None, features=None):
@@ -54,3 +54,16 @@ def test_steps_of_a_long_batch_count_as_much_as_those_of_a_short_one():
     statistics.add(transitions([False], [False]))  # task reward 0
     statistics.add(transitions([False] * 3, [False] * 3))  # 0, 1, 2
     assert statistics.flush()["step/task_reward"] == pytest.approx(3.0 / 4.0)
+
+
+def test_a_training_whose_episodes_never_end_is_told_so():
+    running = TensorDict({"next": {"done": torch.zeros(3, 5_000, 1, dtype=torch.bool)}}, [3, 5_000])
+    watch = EpisodeWatch()
+    watch.add(running)
+    with pytest.warns(UserWarning, match=r"no episode has ended in 10,000 steps .* only 3 styles were seen"):
+        watch.add(running)
+    watch.add(running)  # once is enough
+    ended = EpisodeWatch()
+    ended.add(TensorDict({"next": {"done": torch.ones(3, 1, 1, dtype=torch.bool)}}, [3, 1]))
+    for _ in range(3):
+        ended.add(running)

@@ -10,6 +10,7 @@ from torchrl.envs import (
     RenameTransform,
     RewardSum,
     SerialEnv,
+    Transform,
     TransformedEnv,
     check_env_specs,
     step_mdp,
@@ -134,3 +135,29 @@ def test_nested_features_are_refused_when_the_specs_are_read(space, make_style_r
     env = coachable_env(make_base_env(nested=True), space, make_style_reward(space))
     with pytest.raises(ValueError, match=r"declare style_features with the entries values: expected one tensor"):
         _ = env.observation_spec
+
+
+class Squeezed(Transform):
+    """An environment that forgets the last dimension of an entry."""
+
+    def __init__(self, key):
+        super().__init__()
+        self.key = key
+
+    def _step(self, tensordict, next_tensordict):
+        return next_tensordict.set(self.key, next_tensordict[self.key][..., 0])
+
+
+@pytest.mark.parametrize(
+    "key, message",
+    [
+        ("style_features", r"style_features is \(4,\): expected \(4, F\)"),
+        ("task_reward", r"task_reward is \(4,\): expected \(4, 1\)"),
+    ],
+)
+def test_entries_without_a_last_dimension_are_refused(key, message, make_base_env, space, make_style_reward):
+    """They would broadcast, so that every environment was paid for the features of another one."""
+    transforms = Compose(Squeezed(key), StyleSampler(space, seed=0), StyleRewardTransform(make_style_reward(space)))
+    env = TransformedEnv(make_base_env(4), transforms)
+    with pytest.raises(ValueError, match=message):
+        env.rand_step(env.reset())

@@ -1,6 +1,5 @@
-"""Gymnasium both ways: a wrapped environment is a Gymnasium environment, and a Gymnasium environment trains here."""
+"""`GymnasiumEnv`: an environment of Gymnasium trains here."""
 
-import functools
 import re
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from torchrl.envs.utils import check_env_specs
 from torchrl.objectives import SACLoss
 
 from coachable.networks import make_critic, make_gaussian_actor
-from coachable.styles import Choice, PointMass, Setpoint, StyleRangeWarning, StyleReward, StyleSpace, Term
+from coachable.styles import Setpoint, StyleReward, StyleSpace, Term
 from coachable.training import Learner
 from coachable.training.collection import evaluate_policy, make_collector
 from coachable.training.episodes import EpisodeSums
@@ -23,202 +22,10 @@ from coachable.transforms import coachable_env
 
 gymnasium = pytest.importorskip("gymnasium")
 from gymnasium import spaces  # noqa: E402
-from gymnasium.utils.env_checker import check_env  # noqa: E402
 
-from coachable.gym import GymnasiumEnv, StyleWrapper  # noqa: E402
+from coachable.gym import GymnasiumEnv  # noqa: E402
 from coachable.gym.actions import action_components, native_action  # noqa: E402
-
-STEPS = 5
-
-
-class Walk(gymnasium.Env):
-    """A walk on a line: moves by the action, pays 1 per step, ends beyond 3 (terminated) or after 5 steps."""
-
-    action_space = spaces.Box(-1.0, 1.0, (1,))
-    observation_space = spaces.Box(-10.0, 10.0, (2,))
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.position, self.steps = self.np_random.uniform(-1, 1), 0
-        return self._observation(), {"options": options}
-
-    def step(self, action):
-        self.position += float(action[0])
-        self.steps += 1
-        return self._observation(), 1.0, abs(self.position) > 3, self.steps >= STEPS, {"moved": float(action[0])}
-
-    def _observation(self):
-        return np.array([self.position, self.steps / STEPS], dtype=np.float32)
-
-
-SPACE = StyleSpace([Setpoint("stride", -1.0, 1.0), Choice("hat", ("red", "blue"))])
-
-
-def style_reward():
-    """Minus the distance between the move and the requested one; a red hat costs 10."""
-    return StyleReward(
-        SPACE,
-        {
-            "stride": Term(lambda f, s: -(f[..., 0] - s["stride"]).abs(), parameters=("stride",)),
-            "hat": Term(lambda f, s: -10.0 * s["hat"][..., 0], parameters=("hat",)),
-        },
-    )
-
-
-def moved(observation, action, info):
-    assert info["moved"] == action[0]
-    return action
-
-
-@pytest.fixture
-def env():
-    return StyleWrapper(Walk(), style_reward(), moved)
-
-
-# -- out ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.filterwarnings("ignore:.*different from the unwrapped version.*:UserWarning")
-@pytest.mark.parametrize("flat", [False, True])
-def test_gymnasium_approves(flat):
-    check_env(StyleWrapper(Walk(), style_reward(), moved, flat=flat), skip_render_check=True)
-
-
-def test_a_registered_environment_can_be_made_again():
-    env = StyleWrapper(gymnasium.make("Pendulum-v1"), style_reward(), lambda o, a, i: a)
-    again = gymnasium.make(env.spec)
-    assert isinstance(again, StyleWrapper) and again.observation_space == env.observation_space
-
-
-def test_the_observation_is_a_dict_or_one_vector(env):
-    observation, info = env.reset(seed=0)
-    assert set(observation) == {"observation", "style"}
-    flat = StyleWrapper(Walk(), style_reward(), moved, flat=True)
-    vector, _ = flat.reset(seed=0)
-    np.testing.assert_array_equal(vector, np.concatenate([observation["observation"], observation["style"]]))
-    np.testing.assert_array_equal(info["style"], observation["style"])
-    assert vector.dtype == np.float32 and vector.shape == flat.observation_space.shape == (5,)
-
-
-class Seeing(Walk):
-    """A walk whose observation is of any kind."""
-
-    def __init__(self, space):
-        self.observation_space = space
-
-    def _observation(self):
-        return self.observation_space.sample()
-
-
-@pytest.mark.parametrize("space", [spaces.Dict(a=spaces.Box(-1.0, 1.0, (2,))), spaces.Tuple([spaces.Discrete(3)])])
-def test_a_dict_observation_has_to_be_flattened(space):
-    with pytest.raises(ValueError, match=r"the observation is a (Dict|Tuple), .* pass flat=True for one vector"):
-        StyleWrapper(Seeing(space), style_reward(), moved)
-    env = StyleWrapper(Seeing(space), style_reward(), moved, flat=True)
-    observation, _ = env.reset(seed=0)
-    assert env.observation_space.contains(observation)
-
-
-def test_an_observation_without_a_fixed_size_cannot_be_flattened():
-    space = spaces.Dict(a=spaces.Sequence(spaces.Box(-1.0, 1.0, (2,))))
-    with pytest.raises(ValueError, match="has no fixed size, so flat=True cannot make one vector of it"):
-        StyleWrapper(Seeing(space), style_reward(), moved, flat=True)
-
-
-def test_the_reward_is_of_the_style_that_was_shown(env):
-    env.set_style({"stride": 0.5, "hat": "blue"})
-    env.reset(seed=0)
-    env.set_style({"stride": -0.5, "hat": "blue"})  # shown from the next observation on
-    observation, reward, _, _, info = env.step(np.array([0.25], dtype=np.float32))
-    assert reward == pytest.approx(1.0 - 0.25)
-    assert info["task_reward"] == 1.0 and info["style_reward"] == pytest.approx(-0.25)
-    np.testing.assert_array_equal(observation["style"], [-0.5, 0, 1])
-    np.testing.assert_array_equal(info["style"], [-0.5, 0, 1])
-    _, reward, *_ = env.step(np.array([0.25], dtype=np.float32))
-    assert reward == pytest.approx(1.0 - 0.75)
-
-
-def test_a_style_is_drawn_per_episode_and_kept_within(env):
-    shown = []
-    for episode in range(20):
-        observation, _ = env.reset(seed=3 if episode == 0 else None)
-        shown.append(observation["style"])
-        for _ in range(3):
-            observation, *_ = env.step(np.zeros(1, dtype=np.float32))
-            np.testing.assert_array_equal(observation["style"], shown[-1])
-    assert len({float(style[0]) for style in shown}) == 20
-    env.reset(seed=3)
-    np.testing.assert_array_equal(env.reset()[0]["style"], shown[1])  # the seed also restarts the draws
-
-
-def test_the_draws_are_the_environments_own():
-    """Neither torch's global generator nor another wrapper's decides them."""
-    first, second = (StyleWrapper(Walk(), style_reward(), moved) for _ in range(2))
-    torch.manual_seed(0)
-    a = first.reset(seed=1)[0]["style"]
-    torch.manual_seed(5)
-    np.testing.assert_array_equal(second.reset(seed=1)[0]["style"], a)
-    assert not np.array_equal(second.reset(seed=2)[0]["style"], a)
-
-
-def test_a_held_style_stays_until_it_is_released(env):
-    env.set_style({"hat": "blue", "stride": 1.0})
-    for _ in range(3):
-        np.testing.assert_array_equal(env.reset()[0]["style"], [1, 0, 1])
-    env.set_style(None)
-    assert len({float(env.reset()[0]["style"][0]) for _ in range(5)}) == 5
-    env.set_style([0.25, 1, 0])
-    np.testing.assert_array_equal(env.reset()[0]["style"], [0.25, 1, 0])
-
-
-def test_bad_requests_change_nothing(env):
-    env.set_style({"stride": 0.5})
-    for request, message in [
-        ({"pace": 1.0}, "unknown style parameter 'pace'"),
-        ({"hat": "green"}, "is not an option"),
-        ([0.5, 1.0], r"expected \(3,\)"),
-        ([float("nan"), 1, 0], "NaN"),
-    ]:
-        with pytest.raises(ValueError, match=message):
-            env.set_style(request)
-    with pytest.raises(ValueError, match="outside"):
-        env.set_style({"stride": 2.0}, strict=True)
-    np.testing.assert_array_equal(env.reset()[0]["style"], [0.5, 1, 0])
-    with pytest.warns(StyleRangeWarning, match="stride = 2 lies outside"):
-        env.set_style({"stride": 2.0})
-    np.testing.assert_array_equal(env.reset()[0]["style"], [1, 1, 0])
-
-
-def test_styles_are_drawn_from_the_sampler_of_the_space():
-    reward = style_reward()
-    reward.space = reward.space.with_sampler(PointMass([0.5, 0, 1]))
-    env = StyleWrapper(Walk(), reward, moved)
-    np.testing.assert_array_equal(env.reset()[0]["style"], [0.5, 0, 1])
-
-
-def test_options_reach_the_environment_inside(env):
-    assert env.reset(options={"level": 2})[1]["options"] == {"level": 2}
-
-
-def test_features_of_another_shape_are_refused():
-    env = StyleWrapper(Walk(), style_reward(), lambda o, a, i: float(a[0]))
-    env.reset()
-    with pytest.raises(ValueError, match=r"returned shape \(\): expected \(F,\)"):
-        env.step(np.zeros(1, dtype=np.float32))
-
-
-def test_vectorised_environments_collect_the_style():
-    make = functools.partial(StyleWrapper, Walk(), style_reward(), moved)
-    vector = gymnasium.vector.SyncVectorEnv([lambda: make(), lambda: StyleWrapper(Walk(), style_reward(), moved)])
-    observation, info = vector.reset(seed=0)
-    np.testing.assert_array_equal(observation["style"], info["style"])
-    assert observation["style"].shape == (2, 3)
-    vector.call("set_style", {"stride": 0.5})
-    observation, *_ = vector.step(np.zeros((2, 1), dtype=np.float32))
-    np.testing.assert_array_equal(observation["style"], [[0.5, 1, 0]] * 2)
-
-
-# -- in -----------------------------------------------------------------------------------------------------------
+from tests.gym_walk import SPACE, STEPS, Walk, moved, style_reward  # noqa: E402
 
 
 @pytest.mark.parametrize(
@@ -427,3 +234,39 @@ def test_wrappers_with_running_means_start_alike_with_the_same_seed():
 
     starts = [GymnasiumEnv(make, moved, 2, seed=0).reset()["observation"] for _ in range(2)]
     torch.testing.assert_close(*starts, rtol=0, atol=0)
+
+
+def returns(*result):
+    class Odd(Walk):
+        def step(self, action):
+            observation, *_, info = super().step(action)
+            return (observation, *result, info)
+
+    return Odd
+
+
+@pytest.mark.parametrize(
+    "result, message",
+    [
+        ((None, False, False), "step returned reward=None: expected one number"),
+        (("1.5", False, False), "step returned reward='1.5'"),
+        ((np.ones(2), False, False), r"step returned reward=array\(\[1., 1.\]\)"),
+        ((1.0, "False", False), "step returned terminated='False'"),
+        ((1.0, False, None), "step returned truncated=None"),
+        ((1.0, False), "step returned 4 values: expected observation, reward, terminated, truncated and info"),
+    ],
+)
+def test_results_of_a_step_that_are_no_numbers_are_refused(result, message):
+    with pytest.raises(ValueError, match=message):
+        GymnasiumEnv(returns(*result), moved)
+
+
+def test_a_reward_may_be_an_array_of_one_number():
+    env = GymnasiumEnv(returns(np.array([1.5]), np.array(False), np.bool_(True)), moved, num_envs=1)
+    after = env.rand_step(env.reset())["next"]
+    assert after["task_reward"].item() == 1.5 and after["truncated"].item() and not after["terminated"].item()
+
+
+def test_a_function_that_makes_no_environment_is_refused():
+    with pytest.raises(ValueError, match="make returned None: expected an environment of Gymnasium"):
+        GymnasiumEnv(lambda: None, moved)
