@@ -169,8 +169,7 @@ class EnvPictures:
         try:
             picture = simulation.render()
         except Exception as error:  # environments of other libraries may raise anything
-            reason = f"its render raised {type(error).__name__} {error}".rstrip()
-            raise RenderingError(f"{name} draws no pictures: {reason}") from error
+            raise RenderingError(f"{name} draws no pictures: {str(error) or type(error).__name__}") from error
         return self._fitted(picture)
 
     def _draw_mujoco(self, model: Any, data: Any) -> np.ndarray:

@@ -16,7 +16,6 @@ from coachable.styles import Setpoint, StyleSpace
 pytest.importorskip("gymnasium")
 
 GUESTS = {"leaning_pendulum": "lean", "placed_cartpole": "place"}  # by name: the parameter of its style
-OBS_DIM = {"leaning_pendulum": 3, "placed_cartpole": 5}
 TRAINING = "sac_training"
 SOURCES = Path(__file__).parent / "guests"
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -46,7 +45,7 @@ def guest(request, tmp_path_factory):
 def run(guest, tmp_path_factory):
     """Folder of a short training."""
     folder = tmp_path_factory.mktemp("runs") / guest
-    importlib.import_module(TRAINING).train(load_domain(guest), OBS_DIM[guest], folder, frames=240)
+    importlib.import_module(TRAINING).train(load_domain(guest), folder, frames=240)
     return str(folder)
 
 

@@ -189,7 +189,8 @@ def _parse(message: str | bytes) -> dict[str, Any]:
     request = parse_json(message, "the message", _LONGEST)
     if not isinstance(request, dict):
         raise ValueError(f"the message is a {type(request).__name__}: expected an object with the entry 'do'")
-    if not isinstance(request.get("id", 0), int | str):
+    own = request.get("id", 0)
+    if not isinstance(own, int | str) and not (isinstance(own, float) and math.isfinite(own)):
         raise ValueError("the id of the message is neither a number nor a text")
     return request
 

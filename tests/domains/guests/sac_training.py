@@ -1,4 +1,4 @@
-"""Training without a recipe: soft actor-critic with relabelled styles, for a domain with one action."""
+"""Training without a recipe: soft actor-critic with relabelled styles, for a domain of continuous actions."""
 
 from functools import partial
 from pathlib import Path
@@ -12,13 +12,14 @@ from coachable.networks import make_critic, make_gaussian_actor
 from coachable.transforms import TaskImpersonation
 
 
-def train(domain: Domain, obs_dim: int, run: Path, frames: int = 20_000) -> None:
-    """Train an agent of a domain whose observation has `obs_dim` numbers; `run` is then an agent for every command."""
-    space = domain.make_space()
-    sizes = {"obs_dim": obs_dim, "action_dim": 1, "widths": [64, 64]}
+def train(domain: Domain, run: Path, frames: int = 20_000) -> None:
+    """Train an agent of a domain; the folder `run` is then an agent for every command."""
+    space, env = domain.make_space(), domain.make_env(1)
+    obs_dim, action_dim = env.observation_spec["observation"].shape[-1], env.action_spec.shape[-1]
+    sizes = {"obs_dim": obs_dim, "action_dim": action_dim, "widths": [64, 64]}
     actor = make_gaussian_actor(space=space, **sizes)
     critics = [make_critic(space=space, **sizes) for _ in range(2)]
-    loss = SACLoss(actor, critics, action_spec=Bounded(-1.0, 1.0, (1,)), loss_function="l2")
+    loss = SACLoss(actor, critics, action_spec=Bounded(-1.0, 1.0, (action_dim,)), loss_function="l2")
     loss.make_value_estimator(gamma=0.98)
     relabel = TaskImpersonation(domain.make_reward(space), n=2)
     network = {"actor": {"_target_": "coachable.networks.make_gaussian_actor", **sizes}}

@@ -152,6 +152,9 @@ assert.equal(fragmentOf(entries, request), "#pose=down&step_length=0.50&course=0
 assert.deepEqual(fromFragment(entries, fragmentOf(entries, request), defaultsOf(entries)), request);
 const foreign = fromFragment(entries, "#pose=<b>&step_length=1e9&course=NaN&x=1", request);
 assert.deepEqual(foreign, { pose: "down", step_length: entries[1].to, course: 0 });
+const between = fromFragment(entries, "#step_length=0.476&course=35.2", request); // the slider has steps of 0.01 and 10
+assert.deepEqual([between.step_length, between.course], [0.48, 40]);
+assert.equal(fragmentOf(entries, between), "#pose=down&step_length=0.48&course=40");
 assert.ok(isOutside(entries[1], 0.66) && !isOutside(entries[1], 0.65) && !isOutside(entries[2], 180));
 const readout = new Readout([{ name: "held" }, { name: "length", at_marks: true }], 3);
 assert.equal(readout.mean("held"), null);
@@ -205,8 +208,9 @@ assert.deepEqual(along(manifest, styles[4], "fuel"), [[0, 3], [100, 4]]);
 assert.deepEqual(along(manifest, styles[4], "tire"), [[0, 2], [9, 4]]);
 assert.equal(fragmentOf(manifest, 4), "#tire=9&fuel=100");
 assert.deepEqual(fromFragment(manifest, fragmentOf(manifest, 4, 2.5)), { number: 4, moment: 2.5 });
+assert.deepEqual(fromFragment(manifest, fragmentOf(manifest, 4, 0)), { number: 4, moment: 0 });
 assert.deepEqual(fromFragment(manifest, "#tire=<b>&fuel=1e9&t=-3"), { number: 2, moment: 0 });
-assert.deepEqual(fromFragment(manifest, "#tire=NaN&fuel=&t=x"), { number: 0, moment: 0 });
+assert.deepEqual(fromFragment(manifest, "#tire=NaN&fuel=&t=x"), { number: 0, moment: null });
 for (const packed of [true, false]) {
   const recording = await decode(new Uint8Array(Buffer.from(packed ? PACKED : PLAIN, "base64")));
   assert.equal(recording.frames, 2);

@@ -37,14 +37,14 @@ class RecordedPage extends Page {
       this.cannotDraw(error);
     }
     this.panel = new RecordedPanel(at("requests"), at("others"), manifest, (name, value) => this.ask(name, value));
-    this.time = moment; // [s]
+    this.time = moment ?? 0; // [s]
     await this.select(number);
   }
 
   start() {
     addEventListener("hashchange", () => {
       const { number, moment } = fromFragment(this.manifest, location.hash);
-      if (moment) this.seek(moment);
+      this.time = moment ?? this.time; // in the recording that is then shown, which may be longer
       this.select(number);
     });
     addEventListener("resize", () => this.panel.select(this.wanted));
@@ -100,6 +100,7 @@ class RecordedPage extends Page {
   /** Go to a moment [s]. */
   seek(moment) {
     this.time = Math.min(moment, this.length);
+    at("moment").value = this.time;
     this.ended = null;
     this.tell("");
   }

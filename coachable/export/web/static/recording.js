@@ -57,7 +57,7 @@ export function along(manifest, style, name) {
   return values.map((value) => [value, find(value)]).filter(([, number]) => number >= 0);
 }
 
-/** The recording that is most like what the fragment of an address names, and the moment in it [s]. */
+/** The recording that is most like what the fragment of an address names, and the moment in it [s], null if it names none. */
 export function fromFragment(manifest, fragment) {
   const given = new URLSearchParams(fragment.replace(/^#/, ""));
   const style = { ...manifest.recordings[manifest.opens ?? 0].style };
@@ -67,8 +67,8 @@ export function fromFragment(manifest, fragment) {
       style[name] = kind === "choice" ? text : Number(text);
     }
   }
-  const moment = Number(given.get("t"));
-  return { number: nearest(manifest, style), moment: Number.isFinite(moment) ? Math.max(moment, 0) : 0 };
+  const moment = given.get("t")?.trim();
+  return { number: nearest(manifest, style), moment: moment && Number.isFinite(Number(moment)) ? Math.max(Number(moment), 0) : null };
 }
 
 /** The fragment of an address that names a recording, and a moment in it [s] if one is given. */

@@ -70,7 +70,9 @@ export function fromFragment(entries, fragment, request) {
     if (entry.options) {
       if (entry.options.includes(text)) result[entry.name] = text;
     } else if (Number.isFinite(Number(text))) {
-      result[entry.name] = Math.min(Math.max(Number(text), entry.from), entry.to);
+      const steps = Math.round((Number(text) - entry.from) / entry.step); // a slider has no values between its steps
+      const value = Number((entry.from + steps * entry.step).toPrecision(9));
+      result[entry.name] = Math.min(Math.max(value, entry.from), entry.to);
     }
   }
   return result;
