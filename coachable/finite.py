@@ -4,7 +4,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-__all__ = ["LARGEST", "NonFiniteError", "require_finite", "require_finite_action"]
+__all__ = ["LARGEST", "NonFiniteError", "require_action", "require_finite"]
 
 LARGEST = 1e18  # float32 ends at 3.4e38: squares of larger numbers, summed over a batch, are infinite
 
@@ -41,15 +41,20 @@ def require_finite(data: TensorDictBase) -> None:
     )
 
 
-def require_finite_action(action: Tensor) -> None:
-    """Refuse actions that contain NaN.
+def require_action(action: Tensor, num_envs: int, width: int) -> None:
+    """Refuse actions of another shape, and those that contain NaN.
 
     Args:
-        action: Actions `(environments, components)`.
+        action: Actions `(num_envs, width)`.
+        num_envs: Number of environments.
+        width: Numbers of an action.
 
     Raises:
         NonFiniteError: If an action contains NaN; the message names the first such environment.
+        ValueError: If the shape is another one.
     """
+    if action.shape != (num_envs, width):
+        raise ValueError(f"action has the shape {tuple(action.shape)}: expected ({num_envs}, {width})")
     missing = action.isnan()
     if missing.any():
         row = missing.flatten(1).any(1).nonzero()[0].item()

@@ -13,7 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 
 from coachable.distributions.action_heads import ActionHeads
-from coachable.finite import require_finite_action
+from coachable.finite import require_action
 from coachable.gym.actions import action_components, native_action
 from coachable.gym.checked_features import Features, checked_features, flat_observation
 from coachable.keys import STYLE_FEATURES, TASK_REWARD
@@ -99,9 +99,7 @@ class GymnasiumEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actions = tensordict.get("action").detach()
-        require_finite_action(actions)
-        if actions.shape[-1] != self.heads.action_dim:
-            raise ValueError(f"an action has {actions.shape[-1]} numbers: expected {self.heads.action_dim}")
+        require_action(actions, len(self.envs), self.heads.action_dim)
         choices = self.heads.choices(actions).tolist() if self.heads.categorical else [[]] * len(self.envs)
         axes = self.heads.split(actions)[1].clamp(-1.0, 1.0).tolist()
         rewards = np.zeros(len(self.envs))

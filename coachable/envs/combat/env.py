@@ -38,7 +38,7 @@ from coachable.envs.combat.traits import (
     site_table,
 )
 from coachable.envs.combat.traps import TrapNumbers
-from coachable.finite import require_finite_action
+from coachable.finite import require_action
 from coachable.keys import EVENTS, SCENARIO, STYLE_FEATURES, TASK_REWARD
 from coachable.ranges import AMOUNT, COUNT, Range
 from coachable.specs import set_specs
@@ -200,7 +200,7 @@ class CombatEnv(EnvBase):
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action").detach()
-        require_finite_action(action)
+        require_action(action, self.num_envs, GAMEPAD.action_dim)
         pad = canonical_rows(action.to(torch.float32).T.contiguous())
         noise = Noise.draw(self.num_enemies, self.num_envs, self._random)
         components = run_step(self.state, pad, self.rules, noise, self._ammo, self._sections)

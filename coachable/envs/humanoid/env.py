@@ -30,7 +30,7 @@ from coachable.envs.humanoid.observation import (
 )
 from coachable.envs.humanoid.rewards import COSTS, bearing_reward, move_reward, walk_costs
 from coachable.envs.humanoid.simulation import HumanoidSimulation, Kinematics
-from coachable.finite import require_finite_action
+from coachable.finite import require_action
 from coachable.keys import STYLE_FEATURES, TASK_REWARD
 from coachable.ranges import COUNT, NOT_NEGATIVE, POSITIVE, Range
 from coachable.specs import set_specs
@@ -178,7 +178,7 @@ class HumanoidEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action").detach()
-        require_finite_action(action)
+        require_action(action, self.num_envs, NUM_ACTIONS)
         controls = np.clip(action.numpy().astype(np.float64), -1.0, 1.0)
         diverged = self.simulation.step(controls, self._pushes())
         self.steps += 1

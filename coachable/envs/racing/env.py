@@ -27,7 +27,7 @@ from coachable.envs.racing.race.rivals import Rivals
 from coachable.envs.racing.race.run import RUN_ROWS, Field, Run
 from coachable.envs.racing.race.scenarios import Conditions, Scenario, Starter, race_scenarios
 from coachable.envs.racing.race.task import TaskWeights
-from coachable.finite import require_finite_action
+from coachable.finite import require_action
 from coachable.keys import SCENARIO, STYLE_FEATURES, TASK_REWARD
 from coachable.ranges import COUNT
 from coachable.specs import set_specs
@@ -236,9 +236,7 @@ class RacingEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict.get("action").detach()
-        if action.shape != (self.num_envs, 2):
-            raise ValueError(f"action has shape {tuple(action.shape)}: expected ({self.num_envs}, 2), steer and pedals")
-        require_finite_action(action)
+        require_action(action, self.num_envs, 2)  # steering and pedals
         action = action.clamp(-1.0, 1.0).to(torch.float32)
         if self.driver is not None and self.controlled < self.cars:
             driven = self.driver(self.field, self._observation[self.num_envs :])

@@ -189,6 +189,8 @@ def test_a_diverged_policy_is_named():
     env = make_env()
     with pytest.raises(ValueError, match="action contains NaN"):
         env.step(env.reset().set("action", torch.full((3, 24), torch.nan)))
+    with pytest.raises(ValueError, match=r"action has the shape \(3, 1\): expected \(3, 24\)"):
+        env.step(env.reset().set("action", torch.zeros(3, 1)))
 
 
 def check_invariants(env: CombatEnv, before: State, transition: TensorDict) -> None:

@@ -205,6 +205,8 @@ def test_a_diverged_policy_is_named():
     env = make_env()
     with pytest.raises(ValueError, match="action contains NaN"):
         env.step(env.reset().set("action", torch.full((3, 21), torch.nan)))
+    with pytest.raises(ValueError, match=r"action has the shape \(3, 1\): expected \(3, 21\)"):
+        env.step(env.reset().set("action", torch.zeros(3, 1)))
 
 
 @pytest.mark.parametrize(
