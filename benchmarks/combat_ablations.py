@@ -29,6 +29,7 @@ from recipe_config import compose_config
 from coachable.domain import load_domain
 from coachable.domains.combat.fights import damage_rows, fight_matrix, style_label
 from coachable.domains.combat.styles import single_styles
+from coachable.envs.combat.traits import MACHINE_NAMES
 from coachable.evaluation.curves import read_metric, summarise_runs
 from coachable.evaluation.statistics import bootstrap_interval
 from coachable.evaluation.style_grid import write_csv
@@ -44,6 +45,8 @@ VARIANTS: dict[str, list[str]] = {
     "samples_1000": ["entropy_samples=1000"],
     "impersonation_0": ["impersonation.n=0"],
     "impersonation_2": ["impersonation.n=2"],
+    "impersonation_4": ["impersonation.n=4"],
+    "impersonation_8": ["impersonation.n=8"],
     "uniform": ["replay=uniform"],
     "one_hot": ["sampler=one_hot"],
     "independent": ["sampler=independent"],
@@ -55,6 +58,8 @@ LABELS = {
     "samples_1000": "1000 entropy samples",
     "impersonation_0": "no impersonation",
     "impersonation_2": "2 further styles",
+    "impersonation_4": "4 further styles",
+    "impersonation_8": "8 further styles",
     "uniform": "uniform replay",
     "one_hot": "styles one-hot",
     "independent": "styles independent",
@@ -62,7 +67,7 @@ LABELS = {
 }
 PANELS = {
     "loss and its entropy samples": ("sac", "samples_1", "samples_1000"),
-    "impersonation and replay": ("impersonation_0", "impersonation_2", "uniform"),
+    "impersonation and replay": ("impersonation_0", "impersonation_2", "impersonation_4", "impersonation_8", "uniform"),
     "training styles": ("one_hot", "independent"),
     "gradients": ("unclipped",),
 }
@@ -102,7 +107,7 @@ def evaluation(training: Trainer, config: dict[str, Any], episodes: int) -> Call
     space = domain.make_space()
     agent = LoadedPolicy(training.collector.policy, space, config, {})
     cells = single_styles(space)
-    machines = [(name,) for name in config["env"]["machines"]]
+    machines = [(name,) for name in config["env"]["machines"] or MACHINE_NAMES]
 
     def evaluate() -> dict[str, float]:
         with preserved_rng():

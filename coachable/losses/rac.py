@@ -21,7 +21,7 @@ class RACLoss(ActorCriticLoss):
     SAC's one sample:
     `L_pi = mean(alpha R - min_k Q_k(s, relaxed action))`,
     `y = r + gamma (1 - d)(min_k Q_k(s', hard action) - alpha R(s'))`,
-    `L_Q = sum_k 1/2 mean (Q_k - y)^2` (paper, Appendix B).
+    `L_Q = sum_k 1/2 mean (Q_k - y)^2`. The paper (Appendix B) gives R; the other terms are those of SAC.
 
     Args:
         actor_network: Policy, from `make_mixed_actor` or `make_gaussian_actor`.

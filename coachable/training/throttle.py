@@ -8,9 +8,9 @@ __all__ = ["Throttle"]
 class Throttle:
     """Limit on the number of env-steps per second.
 
-    The paper throttles the humanoid's collection to 60 env-steps/s, so that the learner makes many updates per step
-    (section "DMC Humanoid"). The limit holds for the average since the first frame. After a pause, such as that for a
-    checkpoint, the collection catches up by at most `burst` seconds' worth of frames.
+    The paper limits the humanoid's training to 60 env-steps/s (section "DMC Humanoid"). The limit holds for the average
+    since the first frame. After a pause, such as that for a checkpoint, the collection catches up by at most `burst`
+    seconds' worth of frames.
 
     Args:
         rate: Highest rate [env-steps/s]; None never waits.

@@ -95,7 +95,7 @@ def humanoid_style_reward(
 
     The paper's tolerances are narrow: far from the target, such as 90 degrees at a shoulder or 0.2 m in a step, an
     improvement earns almost nothing. The guides reward the same quantities over their whole range. With guide scales of
-    0 the reward is the paper's.
+    0 only the paper's terms remain; docs/deviations.md says how they are combined.
 
     A space with a speed adds two terms, which the paper does not have. `speed` is the closeness of the speed of each
     step, its length over its duration, to the request. `speed_guide` is the loss of `move_reward` for walking at

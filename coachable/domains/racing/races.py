@@ -75,10 +75,10 @@ class _RaceMeasures(TelemetryMeasures):
 def evaluate_aggressiveness(domain: Domain, agent: LoadedPolicy, out: Path, settings: EvaluationSettings) -> str:
     """Race pairs with rising margins against three other copies of the agent, and write the results.
 
-    The lateral margin of the pair rises while its longitudinal one is 0, as in the paper; then the longitudinal margin
-    rises while the lateral one is 0.5 m. The files are `races.csv` (by margin, setting and requested value),
-    `circuits.csv` (laps of `drive_circuits`), `bounds.csv` (the targets of the family with what was measured),
-    `radar.png`, `report.md` and `summary.json`.
+    The lateral margin of the pair rises while its longitudinal one is 0; then the longitudinal margin rises while the
+    lateral one is 0.5 m. The paper gives no value of the longitudinal margin, which the opponents share. The files are
+    `races.csv` (by margin, setting and requested value), `circuits.csv` (laps of `drive_circuits`), `bounds.csv` (the
+    targets of the family with what was measured), `radar.png`, `report.md` and `summary.json`.
 
     Args:
         domain: Domain racing_aggressiveness, as the agent was trained in.

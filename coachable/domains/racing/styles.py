@@ -79,8 +79,8 @@ def drift_style_reward(space: StyleSpace, *, in_corners: bool = False, angle_sca
         space: Result of `drift_style_space`.
         in_corners: Whether positive weights pay in corners only (our choice). There g_i counts in proportion to
             `cornering`, and the slip angle of the rear tyres is replaced by the `inward_angle` of the car. Negative
-            weights pay everywhere. False is the paper's literal reward, of which spinning anywhere earns most.
-        angle_scale: Factor of a positive weight of the rear slip angle; 1 in the paper.
+            weights pay everywhere. With False, spinning anywhere earns most.
+        angle_scale: Factor of a positive weight of the rear slip angle.
 
     Raises:
         ValueError: If `in_corners` is neither true nor false, which older files write as 1 and 0.
@@ -110,7 +110,7 @@ def resource_style_reward(space: StyleSpace, *, gained: float = 1.0, defended: f
 
     Args:
         space: Result of `resource_style_space`.
-        gained: Factor of the metres gained; 1 in the paper.
+        gained: Factor of the metres gained.
         defended: Factor of the metres gained on cars behind; `gained` by default.
     """
     terms = {

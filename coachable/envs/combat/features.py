@@ -39,7 +39,7 @@ _PLACE = ("forward", "left", "up", "sine", "slow_sine", "slowest_sine")  # entri
 _AT = f"{c.FPS * 2:g} frames"
 _SPEED = f"{1 / _SPEED_SCALE:g} m/s"
 
-# Names are the paper's rows of its importance tables.
+# Names are the rows of the paper's importance tables; stamina, type and resistances are ours.
 _PLAYER = (
     Signal("Player health", 1, "full health"),
     Signal("Quick-tool: health bucket", 2, "full", ("berries", "missing_health")),

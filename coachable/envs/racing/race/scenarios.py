@@ -68,7 +68,9 @@ def drift_scenarios() -> tuple[Scenario, ...]:
 
 
 def race_scenarios(cars: int, shares: Mapping[str, float] | None = None) -> tuple[Scenario, ...]:
-    """Return the kinds of starts that a training mixes (paper, Appendix C: scenarios of Gran Turismo).
+    """Return the kinds of starts that a training mixes.
+
+    The paper has scenarios "similar" to those of Wurman et al. (2022), without a list.
 
     Args:
         cars: Number of cars in a race.
