@@ -1,6 +1,6 @@
 """Train the DMC cheetah to run at a requested speed: your own environment, made coachable without touching the library.
 
-python recipes/cheetah_speed.py                           minutes on two cores
+python recipes/cheetah_speed.py                           three to six minutes on one core
 python recipes/cheetah_speed.py preset=smoke              every part once, within a minute
 python recipes/cheetah_speed.py loss=cat_rac seed=1       another loss; see --help for all groups
 

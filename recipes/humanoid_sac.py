@@ -3,8 +3,8 @@
 python recipes/humanoid_sac.py                            on a CPU or a GPU
 python recipes/humanoid_sac.py preset=smoke               every part once, within a minute
 python recipes/humanoid_sac.py preset=paper               the paper's settings
-python recipes/humanoid_sac.py family=gait                walking speed as a third style
-python recipes/humanoid_sac.py loss=qr_sac                another loss; see --help for all groups
+python recipes/humanoid_sac.py family=gait                walking speed as a third parameter of the style
+python recipes/humanoid_sac.py loss=sac                   another loss; see --help for all groups
 python recipes/humanoid_sac.py train.batch_size=512 seed=1 run_dir=runs/mine
 python recipes/humanoid_sac.py resume=runs/mine           continue where it stopped
 python recipes/humanoid_sac.py init_from=runs/mine        new training from its actor and critics

@@ -1,1 +1,1 @@
-"""Coaching a trained agent: the session, the page in the browser, and the export to other programs."""
+"""Coaching a trained agent: the session, phrases, and the page in the browser."""
