@@ -1,4 +1,4 @@
-"""Combat env steps per second for several batch sizes, split by phase.
+"""Combat env steps per second for several batch sizes.
 
     python benchmarks/combat.py --envs 64 512 2048 8192 16384
     python benchmarks/combat.py --envs 2048 --side-by-side 2 --peers .venv-bench/bin/python
@@ -14,7 +14,6 @@ import resource
 import statistics
 import sys
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -23,38 +22,7 @@ import torch
 from combat_workers import DRAWN, FIGHTS, advance
 from contest import Worker, measure
 
-from coachable.envs.combat import CombatEnv, env, fight, step_frames
-
-# Where the time of a step goes: module, function.
-PHASES: list[tuple[Any, str]] = [
-    (env, "canonical_rows"),
-    (fight, "command"),
-    (step_frames, "move_player"),
-    (step_frames, "turn_camera"),
-    (step_frames, "shoot"),
-    (step_frames, "damage_parts"),
-    (step_frames, "build_up"),
-    (step_frames, "swing"),
-    (step_frames, "spring_traps"),
-    (step_frames, "run_elements"),
-    (step_frames, "take_damage"),
-    (step_frames, "decide"),
-    (step_frames, "move_machines"),
-    (step_frames, "strike_player"),
-    (env, "observe"),
-    (env, "start_fights"),
-    (env, "look_up_traits"),
-]
-
-
-def timed(function: Callable[..., Any], total: dict[str, float], name: str) -> Callable[..., Any]:
-    def call(*args: Any, **kwargs: Any) -> Any:
-        start = time.process_time()
-        result = function(*args, **kwargs)
-        total[name] += time.process_time() - start
-        return result
-
-    return call
+from coachable.envs.combat import CombatEnv
 
 
 def bench(num_envs: int, steps: int, device: str) -> dict[str, float]:
@@ -75,21 +43,6 @@ def bench(num_envs: int, steps: int, device: str) -> dict[str, float]:
         "ms_per_batch_step": 1e3 * wall / steps,
         "state_kilobytes_per_fight": state / num_envs / 1024,
     }
-
-
-def split(num_envs: int, steps: int) -> dict[str, float]:
-    """Return the milliseconds of CPU time per batch step in each phase."""
-    total = {name: 0.0 for _, name in PHASES}
-    originals = [(module, name, getattr(module, name)) for module, name in PHASES]
-    for module, name, function in originals:
-        setattr(module, name, timed(function, total, name))
-    start = time.process_time()
-    fights = CombatEnv(num_envs, seed=0)
-    advance(fights, fights.reset(), fights.action_spec.rand((DRAWN,)), steps)
-    total["everything"] = time.process_time() - start
-    for module, name, function in originals:
-        setattr(module, name, function)
-    return {name: 1e3 * seconds / steps for name, seconds in total.items()}
 
 
 def side_by_side(processes: int, steps: int) -> float:
@@ -119,7 +72,6 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=30)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--split", type=int, default=2048, help="batch size whose phases are timed, 0 for none")
     parser.add_argument("--side-by-side", type=int, default=0, metavar="PROCESSES", help="0 for none")
     parser.add_argument("--peers", help="interpreter with vizdoom")
     parser.add_argument("--json", type=Path, help="where to write the numbers")
@@ -132,11 +84,8 @@ def main() -> None:
         rows.append(row)
         print("| {envs} | {steps_per_second:,.0f} | {steps_per_cpu_second:,.0f} |".format(**row), end="")
         print(" {ms_per_batch_step:.1f} | {state_kilobytes_per_fight:.1f} |".format(**row), flush=True)
-    phases = split(args.split, args.steps) if args.split and args.device == "cpu" else {}
-    for name, milliseconds in sorted(phases.items(), key=lambda item: -item[1]):
-        print(f"{name:>16} {milliseconds:8.2f} ms")
     print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB")
-    found: dict[str, Any] = {"rows": rows, "phases": phases}
+    found: dict[str, Any] = {"rows": rows}
     if args.side_by_side:
         found["side_by_side"] = side_by_side(args.side_by_side, args.steps)
         print(f"{args.side_by_side} processes at once: {found['side_by_side']:,.0f} steps/s")

@@ -13,7 +13,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from coachable.replay import EventTableBuffer, StyleEvents, SumTree
+from coachable.replay import EventTableBuffer, StyleEvents
 from coachable.styles import (
     ContinuousOneHot,
     Mixture,
@@ -148,38 +148,3 @@ def test_relabelling(benchmark, n):
         labels_per_second=BATCH * (n + 1) / with_it,
     )
     benchmark(relabelled.sample)
-
-
-@pytest.mark.parametrize("steps", [1, 16, 64])
-@pytest.mark.parametrize("n_steps", [1, 7])
-def test_writing(benchmark, steps, n_steps):
-    """`extend` of 32 environments times `steps`, event detection, n-step assembly and copies included."""
-    buffer = stratified(**({"n_steps": 7, "gamma": 0.99} if n_steps == 7 else {}))
-    plain = TensorDictReplayBuffer(storage=LazyTensorStorage(40_000))
-    batches = [transitions(steps * ENVS) for _ in range(8)]
-    for batch in batches:
-        buffer.extend(batch), plain.extend(batch.clone())
-    turn = iter(range(10**9))
-    copies = iter(range(10**9))
-    ours, theirs = alternate(
-        lambda: buffer.extend(batches[next(turn) % 8]), lambda: plain.extend(batches[next(copies) % 8].copy()), 100
-    )
-    frames = steps * ENVS
-    benchmark.extra_info.update(
-        frames_per_second=frames / ours, plain_frames_per_second=frames / theirs, milliseconds=ours * 1e3
-    )
-    benchmark(lambda: buffer.extend(batches[next(turn) % 8]))
-
-
-@pytest.mark.parametrize("slots", [2**16, 2**20])
-def test_sum_tree(benchmark, slots):
-    """One update and one draw of a batch."""
-    tree = SumTree([slots], [0])
-    tree.update(torch.arange(slots), torch.rand(slots))
-    region = torch.zeros(BATCH, dtype=torch.long)
-    slot, value = torch.randint(slots, (BATCH,)), torch.rand(BATCH)
-    update, draw = alternate(
-        lambda: tree.update(slot, value), lambda: tree.draw(region, torch.rand(BATCH, dtype=torch.float64))
-    )
-    benchmark.extra_info.update(slots=slots, update_microseconds=update * 1e6, draw_microseconds=draw * 1e6)
-    benchmark(lambda: tree.draw(region, torch.rand(BATCH, dtype=torch.float64)))

@@ -15,8 +15,6 @@ from coachable.code_version import RECIPES
 from coachable.gl import RenderingError, choose_gl_backend
 from coachable.shipped import SOURCE_HELP, require_agent
 
-__all__ = ["main"]
-
 _LARGEST = 2**31 - 1
 
 

@@ -7,8 +7,6 @@ from pathlib import Path
 
 from coachable import __version__
 
-__all__ = ["RECIPES", "code_version"]
-
 _PACKAGE = Path(__file__).resolve().parent
 RECIPES = str(next(p for p in (_PACKAGE / "recipes", _PACKAGE.parent / "recipes", _PACKAGE) if p.is_dir()))
 """Folder of the recipes: in the installed package, or beside it in a clone."""

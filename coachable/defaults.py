@@ -1,7 +1,5 @@
 """Defaults of a `Domain` that declares only an environment, a style space and a style reward."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from itertools import product
 from typing import Any
@@ -26,16 +24,6 @@ from coachable.styles import (
     WeightedSum,
     feature,
 )
-
-__all__ = [
-    "EnvPictures",
-    "RewardMeasures",
-    "WorkedOut",
-    "simulation_of",
-    "steps_per_episode",
-    "style_grid",
-    "time_per_step",
-]
 
 _SLACK = 0.05  # of a set-point's range: a measured value this close to the request complies
 _MET = 0.9  # least tolerance with which a choice counts as met

@@ -11,8 +11,6 @@ from typing import Literal
 
 from coachable.extras import EXTRAS, how_to_install
 
-__all__ = ["Check", "examine"]
-
 Verdict = Literal["ok", "note", "problem"]
 _SHOWN = ("torch", "torchrl", "tensordict", "mujoco", "dm_control", "numpy", "hydra-core", "wandb")
 PYTHON = ((3, 11), (3, 12))  # first and last version for which all dependencies have files

@@ -3,8 +3,6 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["EXTRAS", "from_extra", "how_to_install"]
-
 # Distributions by extra.
 EXTRAS = {
     "ui": ("viser",),

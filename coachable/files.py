@@ -13,20 +13,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = [
-    "CheckpointError",
-    "check_contained",
-    "check_finite",
-    "load_state",
-    "parse_json",
-    "refusing",
-    "save_state",
-    "space_named",
-    "sync_folder",
-    "tensor_bytes",
-    "write_text",
-]
-
 _PLAIN = (bool, int, float, str, type(None))
 _MOST_ENTRIES = 10_000_000  # of the containers of a file
 

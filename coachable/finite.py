@@ -4,8 +4,6 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-__all__ = ["LARGEST", "NonFiniteError", "require_action", "require_finite"]
-
 LARGEST = 1e18  # float32 ends at 3.4e38: squares of larger numbers, summed over a batch, are infinite
 
 

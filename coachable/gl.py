@@ -1,7 +1,5 @@
 """Choice of the OpenGL library for rendering, before MuJoCo is imported."""
 
-from __future__ import annotations
-
 import ctypes.util
 import os
 

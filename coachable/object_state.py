@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 import torch
 
-__all__ = ["UnsavableError", "load_object", "save_object"]
-
 # Types whose attributes are their state, by module.
 _STATEFUL = {"gymnasium": ("Env",), "dm_env": ("Environment",), "dm_control.rl.control": ("Task",)}
 

@@ -1,7 +1,5 @@
 """Offscreen rendering of MuJoCo models."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -9,8 +7,6 @@ import mujoco
 import numpy as np
 
 from coachable.gl import INSTALL_HINT, NO_BACKEND, RenderingError, choose_gl_backend
-
-__all__ = ["OffscreenMujoco"]
 
 
 class OffscreenMujoco:

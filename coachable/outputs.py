@@ -1,15 +1,11 @@
 """Atomic output: files and folders that are either complete or not written at all."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-
-__all__ = ["complete_file", "complete_folder"]
 
 
 @contextlib.contextmanager

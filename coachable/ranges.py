@@ -1,13 +1,9 @@
 """Ranges of numbers, and checks with an error message for numbers outside of them."""
 
-from __future__ import annotations
-
 import math
 import numbers
 from dataclasses import dataclass
 from typing import Any
-
-__all__ = ["AMOUNT", "COUNT", "FINITE", "NOT_NEGATIVE", "POSITIVE", "SHARE", "Range", "around"]
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,7 @@
 """Agents that ship with the library, and what a name means: a shipped agent or a file; imports no torch."""
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
-
-__all__ = ["SOURCE_HELP", "located", "require_agent", "shipped_agents"]
 
 SOURCE_HELP = "a run's folder, a checkpoint, a weights file, an exported model, or a domain that ships with weights"
 

@@ -1,11 +1,7 @@
 """`Signal`: the declaration of a block of an observation or of an action, which explanations and contracts read."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
-
-__all__ = ["Signal", "entry_names"]
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,5 @@
 """Specs of environments that emit an observation, a task reward and style features."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import torch
@@ -9,8 +7,6 @@ from torchrl.data import Binary, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from coachable.keys import STYLE_FEATURES, TASK_REWARD
-
-__all__ = ["set_specs"]
 
 
 def set_specs(

@@ -16,12 +16,13 @@ import torch
 from recipe_config import run_recipe
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Binary, Bounded
 from torchrl.envs import Compose, EnvBase
 
 from coachable.fast import accelerate
 from coachable.keys import EVENTS, STYLE_FEATURES, TASK_REWARD
 from coachable.replay import KeyEvents
+from coachable.specs import set_specs
 from coachable.styles import StyleReward, StyleSpace, Weight, WeightedFeature
 from coachable.styles.mixtures import style_mixture
 from coachable.training.episodes import EpisodeSums
@@ -46,17 +47,9 @@ class RareTargets(EnvBase):
 
     def __init__(self, num_envs: int = 64, seed: int = 0) -> None:
         super().__init__(batch_size=[num_envs])
-        shape = (num_envs,)
-        observations = {"observation": 3, TASK_REWARD: 1, STYLE_FEATURES: TARGETS}
-        self.observation_spec = Composite(
-            **{name: Unbounded((num_envs, width)) for name, width in observations.items()},
-            **{EVENTS: Binary(TARGETS, (num_envs, TARGETS), dtype=torch.bool)},
-            shape=shape,
-        )
-        self.action_spec = Bounded(-1.0, 1.0, (num_envs, 2))
-        self.reward_spec = Unbounded((num_envs, 1))
-        done = {name: Binary(1, (num_envs, 1), dtype=torch.bool) for name in ("done", "terminated", "truncated")}
-        self.done_spec = Composite(done, shape=shape)
+        events = Binary(TARGETS, (num_envs, TARGETS), dtype=torch.bool)
+        action = Bounded(-1.0, 1.0, (num_envs, 2))
+        set_specs(self, action=action, observation=3, style_features=TARGETS, further={EVENTS: events})
         angles = torch.arange(TARGETS) * (2 * math.pi / TARGETS)
         self.targets = DISTANCE * torch.stack([angles.cos(), angles.sin()], -1)
         self.position = torch.zeros(num_envs, 2)

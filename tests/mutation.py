@@ -100,7 +100,7 @@ def operators() -> list[str]:
 
 
 def untouched(tree: ast.AST) -> Iterator[ast.AST]:
-    """Find the nodes whose changes nothing can notice: annotations, `__all__`, texts of errors, mere guards."""
+    """Find the nodes whose changes nothing can notice: annotations, texts of errors, mere guards."""
     for node in ast.walk(tree):
         match node:
             case ast.arg() | ast.AnnAssign() if node.annotation:
@@ -111,8 +111,6 @@ def untouched(tree: ast.AST) -> Iterator[ast.AST]:
                 yield node
             case ast.keyword() if node.arg in ("strict", "frozen"):  # guards that fire only where another fault is
                 yield node.value
-            case ast.Assign() if ast.unparse(node.targets[0]) == "__all__":
-                yield node
             case ast.If() if "TYPE_CHECKING" in ast.dump(node.test):
                 yield node
 

@@ -20,8 +20,6 @@ from coachable.cluster.workers import Arrival, Loss, Workers
 from coachable.code_version import code_version
 from coachable.training.async_collector import AsyncCollector
 
-__all__ = ["ClusterCollector"]
-
 _WAIT = 0.5  # [s] for a batch, after which the workers' error is looked for
 
 

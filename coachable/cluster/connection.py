@@ -14,8 +14,6 @@ from coachable.code_version import code_version
 from coachable.extras import how_to_install
 from coachable.training.worker_errors import WorkerError
 
-__all__ = ["ClusterError", "Connection"]
-
 _STORE = 512 * 2**20  # [bytes] of the object store that is started here; weights and batches take a few MB
 _ANSWER = 5.0  # [s] for the address of a cluster to accept a connection
 _FOLDER = "coachable_ray_"

@@ -5,8 +5,6 @@ from copy import deepcopy
 import torch
 from torch import Tensor, nn
 
-__all__ = ["flat_weights", "load_flat_weights", "portable_copy", "weights_of"]
-
 
 def weights_of(policy: nn.Module) -> list[Tensor]:
     """Return all parameters and buffers of floating point."""

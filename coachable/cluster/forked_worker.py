@@ -13,8 +13,6 @@ from typing import Any
 
 from coachable.cluster.worker import Batch, RolloutWorker, WorkerSettings
 
-__all__ = ["ForkedWorker", "ProcessDiedError"]
-
 _PR_SET_PDEATHSIG = 1  # of <sys/prctl.h>
 
 

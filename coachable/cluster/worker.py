@@ -21,8 +21,6 @@ from coachable.training.collection import follow_policy
 from coachable.training.rng import seed_everything
 from coachable.training.throttle import Throttle
 
-__all__ = ["MAX_WORKERS", "Batch", "RolloutWorker", "WorkerSettings"]
-
 MAX_WORKERS = 4096  # numbers of workers take 12 bits of a trajectory number, starts 19 and trajectories 32
 _BURST = 1.0  # [s] that a throttled worker catches up after a pause
 

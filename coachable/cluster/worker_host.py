@@ -7,8 +7,6 @@ from typing import Any
 from coachable.cluster.forked_worker import ForkedWorker
 from coachable.cluster.worker import Batch, RolloutWorker, WorkerSettings
 
-__all__ = ["WorkerHost"]
-
 Key = tuple[int, int]  # a worker's number, and how often it had been started before
 
 

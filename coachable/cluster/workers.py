@@ -15,8 +15,6 @@ from coachable.cluster.forked_worker import ProcessDiedError
 from coachable.cluster.worker import Batch, WorkerSettings
 from coachable.cluster.worker_host import WorkerHost
 
-__all__ = ["Arrival", "Loss", "Slot", "Workers"]
-
 _LONGEST_PAUSE = 60.0  # [s] before a worker that fails again and again is started anew
 _WAIT = 0.1  # [s] of one wait for answers, after which everything else is looked at
 _WAIT_FOR_ROOM = 0.01  # [s] the same while workers are idle because the queue is full

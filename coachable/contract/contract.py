@@ -16,8 +16,6 @@ from coachable.files import parse_json
 from coachable.signals import Signal
 from coachable.styles import StyleSpace
 
-__all__ = ["SCHEMA_VERSION", "Contract", "ContractError", "Recorded"]
-
 SCHEMA_VERSION = 3
 """Version of the file's inputs, outputs and metadata."""
 

@@ -1,7 +1,5 @@
 """Exported models: reading the file without trusting it, and running it with onnxruntime."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,8 +15,6 @@ from coachable.distributions.action_heads import ActionHeads
 from coachable.extras import from_extra
 from coachable.files import CheckpointError
 from coachable.keys import STYLE
-
-__all__ = ["OnnxPolicy", "OnnxRun", "parts_of", "read_model"]
 
 _LARGEST = 1 << 30  # [byte]
 _STANDARD = ("", "ai.onnx")  # domains of operators that every runtime has

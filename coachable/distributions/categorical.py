@@ -4,8 +4,6 @@ The functions take the values of several heads, concatenated to `(..., sum of si
 to `(..., heads, widest head)`, so that six gamepad heads need as many kernels as one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -4,8 +4,6 @@ The density contains ``log(1 - tanh(u)^2)``, which is ``log 0`` in float32 from 
 computed as ``-2 log cosh u``, where ``log cosh u = |u| - log 2 + log1p(exp(-2|u|))``.
 """
 
-from __future__ import annotations
-
 import math
 from typing import cast
 

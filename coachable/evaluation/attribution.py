@@ -1,7 +1,5 @@
 """Attribution of a policy's actions to groups of its inputs, by saliency and SHAP."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,8 +14,6 @@ from coachable.extras import from_extra
 from coachable.signals import Signal
 from coachable.styles import StyleSpace
 from coachable.training.rng import preserved_rng, seed_everything
-
-__all__ = ["METHODS", "Group", "Ranking", "input_groups", "rank_groups"]
 
 METHODS = ("SHAP", "saliency")
 _SHAP_DRAWS = 8  # baselines per state

@@ -1,7 +1,5 @@
 """`coachable curves`: draw learning curves of groups of runs, with intervals over seeds."""
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Episodes with given styles, recorded step by step."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass

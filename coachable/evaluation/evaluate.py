@@ -1,7 +1,5 @@
 """`coachable evaluate`: the style grid, the trials and the switching test of an agent, as tables and a figure."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,14 +1,11 @@
 """Settings of an evaluation."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from coachable.evaluation.episode_records import RolloutOptions
-    from coachable.evaluation.sweep import WeightSweep
+from coachable.evaluation.episode_records import RolloutOptions
+from coachable.evaluation.sweep import WeightSweep
 
 
 @dataclass(frozen=True)

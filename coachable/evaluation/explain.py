@@ -1,7 +1,5 @@
 """`coachable explain`: rank the inputs of a policy, as in the paper's tables (Appendix D)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Unpack
@@ -21,8 +19,6 @@ from coachable.evaluation.wording import readable
 from coachable.extras import from_extra
 from coachable.networks.plain import ActionOutputs
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
-
-__all__ = ["explain", "record_states"]
 
 _SHOWN = 30  # rows of the paper's tables
 _BARS = 20

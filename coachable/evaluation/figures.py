@@ -1,7 +1,5 @@
 """Figures of an evaluation, drawn without a display."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Evaluation of several agents, such as those of several training seeds, and a table that puts them side by side."""
 
-from __future__ import annotations
-
 import json
 import math
 import statistics
@@ -12,8 +10,6 @@ from typing import Any
 from coachable.evaluation.evaluate import evaluate
 from coachable.evaluation.style_grid import markdown_table, write_csv
 from coachable.training.weights import load_policy
-
-__all__ = ["evaluate_agents", "side_by_side", "table_of"]
 
 
 def evaluate_agents(sources: Sequence[str | Path], out: Path, **settings: Any) -> str:

@@ -16,8 +16,6 @@ from coachable.evaluation.many_agents import side_by_side, table_of
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
 from coachable.training.hardware import detect, share_threads
 
-__all__ = ["parse_seeds", "seed_table", "train_seeds"]
-
 _PR_SET_PDEATHSIG = 1  # of <sys/prctl.h>
 _COUNTED = ("frames", "updates", "minutes")  # from the start of each stage
 _SHOWN = (*_COUNTED, "episode/return", "eval/return")

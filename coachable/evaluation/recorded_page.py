@@ -1,7 +1,5 @@
 """`coachable export web` for simulations that do not run in a browser: a page that plays recorded episodes."""
 
-from __future__ import annotations
-
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,8 +20,6 @@ from coachable.scene.palette import css
 from coachable.scene.recorded import encode_backdrop, encode_frames
 from coachable.styles import Choice, StyleSpace, Weight
 from coachable.training.weights import LoadedPolicy
-
-__all__ = ["Recording", "export_recordings", "record"]
 
 MOST = 40
 """Largest number of recordings of a page."""

@@ -1,7 +1,5 @@
 """`coachable report`: all measurements of an agent on one page, with intervals over seeds."""
 
-from __future__ import annotations
-
 import csv
 import shlex
 from collections.abc import Mapping, Sequence
@@ -24,8 +22,6 @@ from coachable.evaluation.wording import counted, heading_of, readable
 from coachable.outputs import complete_folder
 from coachable.styles import Setpoint, StyleSpace
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy, widths_of
-
-__all__ = ["report", "write_report"]
 
 _LONGEST_TABLE = 100  # rows; longer ones stay in their files
 

@@ -1,7 +1,5 @@
 """Figures of a report: metrics per style, requested and measured values, switches, Pareto curves."""
 
-from __future__ import annotations
-
 import contextlib
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,8 +15,6 @@ from coachable.evaluation.runs import Estimate, Run, StyleTable, estimate, sweep
 from coachable.evaluation.sweep import UNIT_REWARD
 from coachable.evaluation.wording import readable, with_unit
 from coachable.styles import Choice, StyleSpace
-
-__all__ = ["draw_metrics", "draw_requests", "draw_switches", "draw_tradeoffs"]
 
 _COLUMNS = 3
 _LABEL = 36  # characters of a line of a style's name

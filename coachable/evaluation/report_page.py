@@ -1,7 +1,5 @@
 """HTML page of a report: a single file with tables and inline pictures, without scripts."""
 
-from __future__ import annotations
-
 import base64
 import html
 import math
@@ -12,8 +10,6 @@ from typing import Any
 from coachable.evaluation.runs import Estimate
 from coachable.evaluation.wording import readable
 from coachable.scene.look import ICON, TITLE, icon_link, stylesheet
-
-__all__ = ["Page", "paragraph", "picture", "shown", "table"]
 
 _NOTHING = "n/a"
 _DENSITY = 1.5  # pixels of a picture per pixel of the page

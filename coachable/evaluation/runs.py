@@ -1,7 +1,5 @@
 """Several evaluations of the same styles, one per seed or per trained agent, and their joint estimates."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -15,18 +13,6 @@ from coachable.evaluation.sweep import WeightSweep, sweep_weights
 from coachable.evaluation.switching import SwitchReport, evaluate_switching
 from coachable.styles import StyleSpace
 from coachable.training.weights import LoadedPolicy
-
-__all__ = [
-    "Estimate",
-    "Run",
-    "StyleTable",
-    "describe",
-    "estimate",
-    "evaluate_run",
-    "flat_row",
-    "response_rows",
-    "sweep_estimate",
-]
 
 _MOST_COLUMNS = 3  # of style parameters in a table
 

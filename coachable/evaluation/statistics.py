@@ -1,7 +1,5 @@
 """Statistics: interquartile mean, bootstrap and Wilson intervals, rank correlation."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import cast
 

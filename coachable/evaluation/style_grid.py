@@ -1,7 +1,5 @@
 """Style grid: several episodes for every combination of style values."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

@@ -1,7 +1,5 @@
 """Sweeps of one style weight from neutral to its maximum, for Pareto curves of style and task success."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Unpack
@@ -16,8 +14,6 @@ from coachable.evaluation.episode_records import RolloutOptions, record_styles
 from coachable.keys import STYLE_FEATURES
 from coachable.styles import StyleReward, Weight
 from coachable.training.weights import LoadedPolicy
-
-__all__ = ["UNIT_REWARD", "WeightSweep", "sweep_weights"]
 
 UNIT_REWARD = "unit_style_reward"
 """Reward per step of a weight's terms at weight 1, independent of the requested weight."""

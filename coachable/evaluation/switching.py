@@ -1,7 +1,5 @@
 """Switching test: the style changes while the agent acts."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Unpack

@@ -1,7 +1,5 @@
 """`coachable render`: film an agent whose style is switched while it acts, or several styles side by side."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import warnings

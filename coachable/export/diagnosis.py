@@ -1,7 +1,5 @@
 """Diagnosis of an environment that does not behave as a contract says: what differs, and which mistake explains it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -13,8 +11,6 @@ import numpy as np
 from coachable.contract.contract import Contract, Recorded
 from coachable.export.recorder import neutral_action
 from coachable.signals import Signal, entry_names
-
-__all__ = ["CAUSES", "Diagnosis", "diagnose"]
 
 CAUSES = (
     "order of the observation",

@@ -1,7 +1,5 @@
 """ONNX graphs from functions, also from functions that compute with NumPy."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import math
@@ -14,8 +12,6 @@ from torch import Tensor, nn
 
 from coachable.contract.exported_model import parts_of
 from coachable.extras import from_extra
-
-__all__ = ["forget_sources", "graph_of", "import_onnx", "quietly"]
 
 
 def graph_of(function: nn.Module, example: Mapping[str, Tensor], outputs: Sequence[str]) -> Any:

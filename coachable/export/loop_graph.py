@@ -1,12 +1,8 @@
 """ONNX graphs of which one part repeats, such as the substeps of a simulation."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from coachable.export.graph import import_onnx
-
-__all__ = ["repeated"]
 
 
 def repeated(before: Any, body: Any, after: Any, times: int) -> Any:

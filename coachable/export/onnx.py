@@ -1,7 +1,5 @@
 """`coachable export`: write a trained policy as one ONNX file that runs without torch."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -25,8 +23,6 @@ from coachable.outputs import complete_file
 from coachable.signals import Signal
 from coachable.styles import StyleSpace
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy, widths_of
-
-__all__ = ["contract_of", "export", "largest_difference", "write_onnx"]
 
 _SAMPLES = 256  # inputs for which they are compared
 

@@ -1,7 +1,5 @@
 """Runs of an environment from a seed, which are recorded in a contract and repeated when it is verified."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -15,8 +13,6 @@ from coachable.domain import Domain
 from coachable.keys import STYLE
 from coachable.styles import StyleSpace
 from coachable.training.rollout import Rollout
-
-__all__ = ["Rig", "neutral_action", "record"]
 
 STEPS = 200  # of the policy's run
 STYLE_STEPS = 50  # between two styles

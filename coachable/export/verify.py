@@ -1,7 +1,5 @@
 """`coachable verify`: check an exported model, the runtime and an environment against the model's contract."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -17,8 +15,6 @@ from coachable.export.diagnosis import diagnose
 from coachable.export.recorder import Rig
 from coachable.files import CheckpointError, refusing
 from coachable.signals import Signal, entry_names
-
-__all__ = ["TOLERANCE", "Verdict", "verify"]
 
 TOLERANCE = 1e-4  # in float32 torch itself is off by up to 1e-5 on some processors
 """Largest difference of an exported model's actions and probabilities from torch's, at export and when replayed."""

@@ -1,7 +1,5 @@
 """Run the residual networks of a loss through their hand-written passes while the learner updates."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -24,8 +22,6 @@ from coachable.networks.residual import ResidualMLP
 from coachable.training.backend import Backend
 from coachable.training.learner import Learner
 from coachable.training.loss_functions import LossFunctions
-
-__all__ = ["Acceleration", "When", "accelerate", "obstacle"]
 
 _LOG = logging.getLogger(__name__)
 

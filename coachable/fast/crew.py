@@ -1,7 +1,5 @@
 """Threads that work on the independent parts of an update side by side."""
 
-from __future__ import annotations
-
 import functools
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -10,8 +8,6 @@ from contextlib import contextmanager
 from itertools import pairwise
 
 import torch
-
-__all__ = ["crew", "crew_size", "cut_rows", "share_out"]
 
 _FEWEST_ROWS = 32  # of a share
 

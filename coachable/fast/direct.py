@@ -5,8 +5,6 @@ networks' passes, where further threads cannot help. Here each thread makes one 
 inputs to the parameters' gradients.
 """
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -25,8 +23,6 @@ from coachable.fast.native import load_sac
 from coachable.losses import QRSACLoss
 from coachable.networks.actors import GaussianPolicy
 from coachable.networks.critics import StyleCritic
-
-__all__ = ["DirectGradients", "Share", "has_direct_gradients"]
 
 _MOST = 8  # layers of a network, or inputs; MOST in sac.c
 _I, _F, _P = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p

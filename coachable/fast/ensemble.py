@@ -1,7 +1,5 @@
 """Build the plans of residual networks, and evaluate the critics of a loss together, without vmap."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Mapping
 from typing import Any

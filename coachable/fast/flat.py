@@ -1,7 +1,5 @@
 """Gradients and rounded copies of a network's parameters, each kind in one contiguous buffer."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

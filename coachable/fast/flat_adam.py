@@ -1,7 +1,5 @@
 """Adam in one pass over memory, which also renews the rounded copies and moves the target network."""
 
-from __future__ import annotations
-
 import ctypes
 import itertools
 from functools import partial
@@ -14,8 +12,6 @@ from torch.autograd.graph import increment_version
 from coachable.fast.crew import crew_size, share_out
 from coachable.fast.flat import FlatBuffers
 from coachable.fast.native import KERNEL_THREADS, load_kernels
-
-__all__ = ["FlatAdam"]
 
 
 class FlatAdam(torch.optim.Adam):

@@ -8,8 +8,6 @@ Numerics at bfloat16: products accumulate in float32; layer-norm statistics, hea
 float32; activations between the layers are bfloat16.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -20,8 +18,6 @@ from coachable.fast.crew import crew_size
 from coachable.fast.native import KERNEL_THREADS, load_kernels
 from coachable.fast.passes import Layer, Member, TorchPasses
 from coachable.fast.workspace import Workspace
-
-__all__ = ["Layer", "Member", "Plan", "residual_network"]
 
 _SIZES = 4  # batch sizes for which memory is kept ready
 

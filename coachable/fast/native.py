@@ -1,7 +1,5 @@
 """Build and load `kernels.c` and `sac.c` with the machine's C compiler, where there is one."""
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import hashlib

@@ -1,7 +1,5 @@
 """Forward and backward of residual layers by hand, in torch's operations."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

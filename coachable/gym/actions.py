@@ -1,14 +1,10 @@
 """Conversion between Gymnasium action spaces and the action tensor: categorical heads, then axes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-
-__all__ = ["action_components", "native_action"]
 
 
 def action_components(space: spaces.Space) -> tuple[list[int], int]:

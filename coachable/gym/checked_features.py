@@ -1,15 +1,11 @@
 """Style features and flat observations of one step of a Gymnasium environment."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike
-
-__all__ = ["Features", "checked_features", "flat_observation"]
 
 Features: TypeAlias = Callable[[Any, Any, dict[str, Any]], ArrayLike]
 """Function `(observation, action, info) -> (F,)` that computes the style features of one step, independent of theta.

@@ -1,7 +1,5 @@
 """`GymnasiumEnv`: a TorchRL environment of several copies of a Gymnasium environment."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -19,8 +17,6 @@ from coachable.gym.checked_features import Features, checked_features, flat_obse
 from coachable.keys import STYLE_FEATURES, TASK_REWARD
 from coachable.object_state import load_object, save_object
 from coachable.specs import set_specs
-
-__all__ = ["GymnasiumEnv"]
 
 
 class GymnasiumEnv(EnvBase):

@@ -1,7 +1,5 @@
 """`StyleWrapper`: a Gymnasium environment that shows a style and rewards following it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
@@ -17,8 +15,6 @@ from coachable.gym.checked_features import Features, checked_features, flat_obse
 from coachable.keys import STYLE, STYLE_REWARD, TASK_REWARD
 from coachable.styles import StyleReward
 from coachable.transforms.style_sampler import derive_seed
-
-__all__ = ["StyleWrapper"]
 
 
 class StyleWrapper(gymnasium.Wrapper, RecordConstructorArgs):

@@ -1,7 +1,5 @@
 """Cat-RAC: RAC with a categorical critic trained on HL-Gauss encodings of its targets (Appendix B)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Numerics of the losses in pure torch: bootstrap targets, pessimistic quantiles, quantile regression."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

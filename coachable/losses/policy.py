@@ -1,7 +1,5 @@
 """`PolicyReader`, which converts the output of a supported TorchRL actor to a `MixedAction`."""
 
-from __future__ import annotations
-
 from typing import Any, cast
 
 import torch

@@ -1,7 +1,5 @@
 """QR-SAC: soft actor-critic with quantile critics (Appendix B; Wurman et al. 2022)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """RAC, a soft actor-critic with one regulariser per action component (Appendix B)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

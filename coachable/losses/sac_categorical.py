@@ -1,7 +1,5 @@
 """Categorical SAC, the ablation of Cat-RAC's entropy estimate (Appendix D, ablation figure)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Style-conditioned tanh-Gaussian policies."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from typing import Any, Protocol
 

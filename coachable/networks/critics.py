@@ -1,7 +1,5 @@
 """Style-conditioned action-value networks."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Protocol
 

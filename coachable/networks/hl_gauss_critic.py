@@ -1,7 +1,5 @@
 """Critics whose value is a distribution over HL-Gauss bins."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

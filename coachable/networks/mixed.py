@@ -1,7 +1,5 @@
 """Policies over mixed discrete-continuous actions in one tensor (Appendices B and C)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Policies as plain functions of tensors, for export and explanation."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch
@@ -11,8 +9,6 @@ from torch import Tensor, nn
 from coachable.distributions.categorical import EPSILON
 from coachable.networks.actors import GaussianPolicy
 from coachable.networks.mixed import MixedPolicy
-
-__all__ = ["ActionOutputs", "DeterministicAction", "policy_network"]
 
 _SCALE = 2.0**20  # cancels; without it the exporter rounds EPSILON to 0, and a head without preferences is 0 / 0
 

@@ -8,8 +8,6 @@ collects, is evaluated or computes the actions of a target therefore has no drop
 mode.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Literal
 

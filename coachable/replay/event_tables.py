@@ -19,8 +19,6 @@ from coachable.replay.stratified import StratifiedSampler, allot
 from coachable.replay.table_settings import checked_horizon, checked_proportions, make_regions
 from coachable.replay.table_writer import TableWriter
 
-__all__ = ["EventTableBuffer"]
-
 
 class EventTableBuffer(TensorDictReplayBuffer):
     """Replay buffer of several first-in-first-out tables, each of which fills an exact share of every batch.

@@ -11,8 +11,6 @@ from coachable.keys import EVENTS, STYLE_FEATURES, STYLE_REWARD, TASK_REWARD
 from coachable.ranges import COUNT, SHARE
 from coachable.replay.steps import Steps
 
-__all__ = ["NStep"]
-
 Key = str | tuple[str, ...]
 REWARDS = (("next", "reward"), ("next", TASK_REWARD), ("next", STYLE_REWARD))
 

@@ -12,8 +12,6 @@ from tensordict import TensorDict
 
 from coachable.files import CheckpointError, refusing, write_text
 
-__all__ = ["read_records", "record_bytes", "write_records"]
-
 _VERSION = 2
 _INDEX = "index.json"
 _CHUNK = 65_536  # records per copy, which limits the extra memory

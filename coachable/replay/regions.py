@@ -5,8 +5,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Regions"]
-
 
 class Regions:
     """Positions of the records of each table in one storage.

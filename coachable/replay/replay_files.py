@@ -12,8 +12,6 @@ from torchrl.envs import EnvBase
 from coachable.files import load_state, refusing, save_state
 from coachable.replay.records import read_records, write_records
 
-__all__ = ["read_replay", "replay_bytes", "write_replay"]
-
 
 def write_replay(replay: ReplayBuffer, folder: Path) -> None:
     """Write the filled part of a buffer over a `LazyTensorStorage`, with the state of its writer, sampler, transforms.

@@ -15,8 +15,6 @@ from torch import Tensor
 from coachable.keys import EVENTS, SCENARIO, STYLE
 from coachable.styles import StyleSpace, Weight
 
-__all__ = ["EventPredicate", "KeyEvents", "KeyRoute", "PredicateEvents", "Route", "StyleEvents"]
-
 
 @runtime_checkable
 class EventPredicate(Protocol):

@@ -7,8 +7,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage
 
-__all__ = ["RowStorage"]
-
 
 class RowStorage(LazyTensorStorage):
     """`LazyTensorStorage` that reads rows with `index_select`, which copies a row at once instead of number by number.

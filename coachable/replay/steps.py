@@ -8,8 +8,6 @@ import torch
 from tensordict import LazyStackedTensorDict, TensorDictBase
 from torch import Tensor
 
-__all__ = ["Steps", "flatten_time_major", "read_steps"]
-
 TRAJECTORY = ("collector", "traj_ids")
 _MASK = ("collector", "mask")
 

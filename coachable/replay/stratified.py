@@ -13,8 +13,6 @@ from torchrl.data.replay_buffers.samplers import Sampler
 from coachable.replay.regions import Regions
 from coachable.replay.sum_tree import SumTree
 
-__all__ = ["StratifiedSampler", "allot"]
-
 _EPSILON = 1e-8  # added to priorities, so that none is 0
 
 

@@ -10,8 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["SumTree"]
-
 
 class SumTree:
     """Priorities of the slots of several contiguous regions, and draws from a region in proportion to them.

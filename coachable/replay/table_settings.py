@@ -8,8 +8,6 @@ from coachable.ranges import COUNT, Range
 from coachable.replay.regions import Regions
 from coachable.replay.routing import EventPredicate, Route
 
-__all__ = ["checked_horizon", "checked_proportions", "make_regions"]
-
 
 def make_regions(capacities: Mapping[str, int], route: Route | None, events: EventPredicate | None) -> Regions:
     """Return the regions of the tables: routed tables, then event tables.

@@ -16,8 +16,6 @@ from coachable.replay.routing import EventPredicate, Route, checked_events, chec
 from coachable.replay.steps import TRAJECTORY, Steps, flatten_time_major, read_steps
 from coachable.replay.windows import Copies, WindowHistory
 
-__all__ = ["TableWriter"]
-
 
 class TableWriter(Writer):
     """Writer of an `EventTableBuffer`, which contains the cursors of the tables and the state of open episodes.

@@ -8,8 +8,6 @@ import torch
 
 from coachable.replay.steps import Episodes, Steps
 
-__all__ = ["Copies", "WindowHistory"]
-
 Array = np.ndarray
 
 

@@ -1,7 +1,5 @@
 """Frames between two control steps, so that slow control steps are drawn smoothly."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What a domain shows of a state: primitives, labels, gauges and a legend."""
 
-from __future__ import annotations
-
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol

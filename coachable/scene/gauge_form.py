@@ -1,7 +1,5 @@
 """`GaugeForm`, which makes a gauge from numbers, here and on the exported page."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Looks that the live page, the static page, reports, films and figures share: colours, type, title and icon."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from pathlib import Path
 from urllib.parse import quote

@@ -4,8 +4,6 @@ The hues are those of Okabe and Ito, which people with any of the common kinds o
 (https://jfly.uni-koeln.de/color/). Each of them is readable on the light and on the dark page.
 """
 
-from __future__ import annotations
-
 Colour = tuple[int, int, int]
 """Red, green and blue from 0 to 255."""
 

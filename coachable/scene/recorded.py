@@ -4,8 +4,6 @@ A file is compressed with gzip. It holds the length of a header in bytes (uint32
 and after it the arrays that `arrays` in the header lists by name, type, shape and offset from the header's end.
 """
 
-from __future__ import annotations
-
 import gzip
 import json
 from collections.abc import Hashable, Mapping, Sequence
@@ -18,8 +16,6 @@ from coachable.scene.between import alike
 from coachable.scene.frame import Backdrop, Frame
 from coachable.scene.palette import css
 from coachable.scene.parts import SHAPES, Batch, Parts, multiplied, rotated
-
-__all__ = ["encode_backdrop", "encode_figures", "encode_frames"]
 
 _RIGID = 2e-3  # [m] and of quaternions: primitives that differ less from a rigid figure belong to it
 _DIGITS = 3  # of the places and sizes of marks [m]

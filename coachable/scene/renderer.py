@@ -1,7 +1,5 @@
 """Pictures of scenes for films, drawn off-screen by MuJoCo, with labels, gauges and a map."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 

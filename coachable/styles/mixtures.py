@@ -8,8 +8,6 @@ from coachable.styles.parameters import Setpoint, Weight
 from coachable.styles.samplers import ContinuousOneHot, Mixture, OneHot, PointMass, Product, Sampler, Shared, Uniform
 from coachable.styles.space import StyleSpace
 
-__all__ = ["Single", "own", "single_weight", "style_mixture", "with_extremes", "with_requests"]
-
 Single = Literal["continuous_one_hot", "one_hot", "independent"]
 
 

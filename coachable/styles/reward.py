@@ -9,8 +9,6 @@ from torch import Tensor, nn
 from coachable.styles.space import StyleSpace
 from coachable.styles.terms import StyleTerm
 
-__all__ = ["StyleReward"]
-
 
 class StyleReward(nn.Module):
     """Sum of scaled style terms, `sum_k scale_k * term_k(features, theta)` (paper: `sum_i w_i g_i(s, a; xi_i)`).

@@ -15,18 +15,6 @@ from torch import Generator, Tensor
 from coachable.ranges import COUNT, FINITE, SHARE
 from coachable.styles.sampler_base import Sampler, constant, numbers
 
-__all__ = [
-    "ContinuousOneHot",
-    "Mixture",
-    "OneHot",
-    "PointMass",
-    "Product",
-    "Sampler",
-    "Shared",
-    "Uniform",
-    "UniformChoice",
-]
-
 
 def _check_finite(sampler: Sampler, values: tuple[float, ...]) -> None:
     for value in values:

@@ -19,8 +19,6 @@ from coachable.styles.samplers import Product, Sampler, Uniform, UniformChoice
 from coachable.styles.validation import StyleRangeWarning, violations
 from coachable.styles.view import StyleView
 
-__all__ = ["StyleSpace"]
-
 SCHEMA_VERSION = 1
 _KINDS: dict[str, type] = {"weight": Weight, "setpoint": Setpoint, "choice": Choice}
 

@@ -7,8 +7,6 @@ from typing import Any
 from tensordict import TensorDictBase
 from torch import Tensor
 
-__all__ = ["AsyncCollector"]
-
 
 class AsyncCollector(ABC):
     """Iterator of batches that workers collect on their own.

@@ -1,7 +1,5 @@
 """Backend of a learner in plain torch: evaluates networks and steps parameters."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal, cast
@@ -12,8 +10,6 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule, SoftUpdate
 
 from coachable.training.loss_functions import LossFunctions
-
-__all__ = ["Backend"]
 
 
 class Backend:

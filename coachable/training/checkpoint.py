@@ -34,17 +34,6 @@ from coachable.files import (
 from coachable.replay.records import record_bytes
 from coachable.replay.replay_files import write_replay
 
-__all__ = [
-    "CheckpointError",
-    "CheckpointStore",
-    "check_fits",
-    "check_unused",
-    "check_writable",
-    "claim_folder",
-    "find_checkpoint",
-    "read_state",
-]
-
 SCHEMA_VERSION = 1
 _LATEST = "LATEST"
 _STATE = "state.pt"

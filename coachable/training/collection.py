@@ -22,18 +22,6 @@ from coachable.training.rollout import Rollout
 from coachable.training.simulators import UnsavableError, load_simulator, save_simulator
 from coachable.training.worker_errors import ReportingCollector
 
-__all__ = [
-    "SelfPlayEnv",
-    "collector_state",
-    "evaluate_policy",
-    "follow_policy",
-    "load_collector_state",
-    "make_collector",
-    "require_same_bounds",
-    "simulation_env",
-]
-
-
 _ELSEWHERE = "environments in other processes cannot be saved (collector=direct saves its own)"
 
 

@@ -11,8 +11,6 @@ from coachable.training.checkpoint import CheckpointError, CheckpointStore, chec
 from coachable.training.hardware import share_threads
 from coachable.training.trainer import Trainer
 
-__all__ = ["Curriculum"]
-
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
 
 

@@ -13,8 +13,6 @@ from torchrl.envs import Transform
 
 from coachable.keys import STYLE, STYLE_FEATURES, STYLE_REWARD, TASK_REWARD
 
-__all__ = ["EpisodeStatistics", "EpisodeSums", "EpisodeWatch", "Means"]
-
 _LONG_EPISODE = 10_000  # steps
 
 _SUMS = "episode_sums"

@@ -9,8 +9,6 @@ import torch
 
 from coachable.training.precision import supports_bf16
 
-__all__ = ["Hardware", "Threads", "choose_preset", "detect", "estimate_update_seconds", "pick_device", "share_threads"]
-
 _MAX_LEARNER_THREADS = 8  # 512-wide layers do not fill more cores; the barriers cost more than they bring
 _SAMPLE_SECONDS = 0.1  # over which the cores are watched
 _PROC_STAT = Path("/proc/stat")

@@ -13,9 +13,6 @@ from typing import Any, TextIO
 
 from tqdm import tqdm
 
-__all__ = ["MetricsLog", "Progress", "wandb_logger"]
-
-
 _MOVE = "Move it away to go on with a new one"
 
 

@@ -1,7 +1,5 @@
 """Functions of a loss module that an update evaluates."""
 
-from __future__ import annotations
-
 import logging
 import os
 import shutil
@@ -12,8 +10,6 @@ import torch
 from torchrl.objectives import LossModule
 
 from coachable.ranges import SHARE
-
-__all__ = ["LossFunctions", "check_loss", "compiled", "loss_functions"]
 
 _LOG = logging.getLogger(__name__)
 

@@ -1,7 +1,5 @@
 """Choice of the numeric precision in which a device trains."""
 
-from __future__ import annotations
-
 from typing import Literal, get_args
 
 import torch

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 import torch
 
-__all__ = ["RandomStream", "preserved_rng", "rng_state", "seed_everything", "set_rng_state"]
-
 _NUMPY = ("name", "keys", "position", "has_gauss", "cached")  # of its legacy state
 _BORROWED = threading.RLock()  # one stream at a time uses the global generator
 

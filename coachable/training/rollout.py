@@ -1,7 +1,5 @@
 """`Rollout`: steps of a policy in a batch of environments, for evaluations, films, sessions and recordings."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 
@@ -13,8 +11,6 @@ from torchrl.envs.utils import step_mdp
 
 from coachable.keys import STYLE
 from coachable.training.rng import RandomStream
-
-__all__ = ["Rollout", "StyleSchedule"]
 
 StyleSchedule = Callable[[int], Tensor]
 """Function from the number of a step, from 0, to theta (N, d)."""

@@ -6,8 +6,6 @@ from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
 
 from coachable.object_state import UnsavableError, load_object, save_object
 
-__all__ = ["ResumableEnv", "UnsavableError", "load_simulator", "save_simulator"]
-
 _WRAPPED = ("DMControlWrapper", "GymWrapper")  # TorchRL's environments around one of another library, in `_env`
 
 

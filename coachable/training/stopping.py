@@ -7,8 +7,6 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-__all__ = ["stop_signals"]
-
 
 @contextmanager
 def stop_signals() -> Iterator[threading.Event]:

@@ -2,8 +2,6 @@
 
 import time
 
-__all__ = ["Throttle"]
-
 
 class Throttle:
     """Limit on the number of env-steps per second.

@@ -4,8 +4,6 @@ from dataclasses import dataclass, field, fields
 
 from coachable.ranges import AMOUNT, COUNT, NOT_NEGATIVE, SHARE, Range
 
-__all__ = ["TrainSettings"]
-
 
 @dataclass(frozen=True)
 class TrainSettings:

@@ -1,7 +1,5 @@
 """Trained parameters of a loss, and the replacement of those that an optimiser steps."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch
@@ -10,8 +8,6 @@ from tensordict.nn import TensorDictParams
 from torch import Tensor, nn
 from torch.autograd.graph import increment_version
 from torchrl.objectives import LossModule
-
-__all__ = ["Watch", "adopt_actor", "follow", "loaded", "share_actor", "trained_parameters"]
 
 
 def trained_parameters(loss_module: LossModule) -> dict[str, list[str]]:

@@ -33,8 +33,6 @@ from coachable.training.train_settings import TrainSettings
 from coachable.training.weights import require_same_agent
 from coachable.training.worker_errors import WorkerError, update_workers, worker_errors
 
-__all__ = ["REPLAY_KEYS", "Trainer", "replay_keys"]
-
 _WAIT = 0.5  # [s] for a batch of workers, after which a signal to stop is looked for
 
 REPLAY_KEYS: tuple[NestedKey, ...] = (

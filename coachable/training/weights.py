@@ -22,17 +22,6 @@ from coachable.shipped import located, shipped_agents
 from coachable.styles import Choice, StyleSpace
 from coachable.training.checkpoint import SCHEMA_VERSION, CheckpointError, check_fits, find_checkpoint, read_state
 
-__all__ = [
-    "LoadedPolicy",
-    "agent_state",
-    "domain_of",
-    "export_weights",
-    "initialise_from",
-    "load_policy",
-    "require_same_agent",
-    "widths_of",
-]
-
 _CRITICS = "qvalue_network_params."
 _PATHS = ("run_dir", "resume", "init_from")  # describe the machine that trained, not the agent
 _AGENT = {"domain": str, "space": dict, "config": dict, "network": dict, "actor": dict, "critics": dict}

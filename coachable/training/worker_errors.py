@@ -10,8 +10,6 @@ from typing import Any
 
 from torchrl.collectors import Collector
 
-__all__ = ["ReportingCollector", "WorkerError", "check_workers", "update_workers", "worker_errors"]
-
 _LENGTH = 1000  # characters of a message, short enough that messages of workers do not mix
 _ANSWER = 0.5  # [s] after which a worker that has not taken new weights may have ended
 _GRACE = 3.0  # [s] between a worker's message and its end, longer than the workers need to take new weights

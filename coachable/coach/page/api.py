@@ -1,7 +1,5 @@
 """`CoachApi`: coaching from other programs, as JSON over HTTP and a WebSocket on the page's port."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json
@@ -21,8 +19,6 @@ from coachable.coach.session.readout import StyleReport
 from coachable.coach.session.session import CoachSession
 from coachable.files import parse_json
 from coachable.styles import StyleRangeWarning
-
-__all__ = ["PATH", "PROTOCOL", "CoachApi"]
 
 PATH = "/api"
 PROTOCOL = "coachable-v1"

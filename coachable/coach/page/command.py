@@ -1,7 +1,5 @@
 """`coachable coach`: serve the coaching page of an agent."""
 
-from __future__ import annotations
-
 import argparse
 import io
 import threading

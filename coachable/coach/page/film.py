@@ -1,7 +1,5 @@
 """Films of recorded sessions, which are replayed and drawn."""
 
-from __future__ import annotations
-
 import tempfile
 import threading
 from collections.abc import Callable, Iterator

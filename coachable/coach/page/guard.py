@@ -5,8 +5,6 @@ sits between viser and the `websockets` library that it uses: it checks the head
 each message.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import http

@@ -1,7 +1,5 @@
 """Looks of the page: title, icon, dark mode and the place of the gauges, which viser has no settings for."""
 
-from __future__ import annotations
-
 import gzip
 import re
 from functools import lru_cache

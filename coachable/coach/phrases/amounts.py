@@ -1,7 +1,5 @@
 """Values of numeric parameters from requests such as "0.4 m", "a bit longer", "twice as much" or "avoid"."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import cast
 

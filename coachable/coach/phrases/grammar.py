@@ -4,8 +4,6 @@ The grammar consists of rules, the names, options and help texts of the paramete
 `coachable.coach.phrases.vocabulary`. It reports words that are not among these.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Division of a phrase into single requests."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field

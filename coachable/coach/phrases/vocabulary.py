@@ -1,7 +1,5 @@
 """English vocabulary of the phrase box, and the tokeniser."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator
 

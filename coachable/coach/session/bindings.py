@@ -1,7 +1,5 @@
 """Bindings of keys and of a gamepad's axes and buttons to parameters, made from their declarations."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -9,8 +7,6 @@ from coachable.coach.session.session import CoachSession
 from coachable.domain import Control
 from coachable.ranges import around
 from coachable.styles import Choice, StyleSpace
-
-__all__ = ["Binding", "make_bindings"]
 
 # Pairs of neighbouring keys, for less and more, and axes and pairs of buttons of the standard gamepad of browsers.
 _KEYS = ("qw", "as", "zx", "er", "df", "cv", "ty", "gh", "bn", "ui", "jk", "op", "lm", "12", "34", "56", "78", "90")

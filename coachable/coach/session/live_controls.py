@@ -1,7 +1,5 @@
 """Live controls of a session: their values, and how they approach requested ones."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import cast

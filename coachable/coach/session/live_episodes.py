@@ -1,7 +1,5 @@
 """Episodes of a policy in one environment, one after the other."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 from tensordict import TensorDictBase

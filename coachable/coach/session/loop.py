@@ -1,7 +1,5 @@
 """Real-time loop that steps a session in its own thread; other threads submit their changes through a queue."""
 
-from __future__ import annotations
-
 import math
 import queue
 import threading

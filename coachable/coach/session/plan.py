@@ -1,7 +1,5 @@
 """Schedules of styles in words, such as "0: T-pose; 3: arms up, shorter steps"."""
 
-from __future__ import annotations
-
 import re
 from operator import itemgetter
 

@@ -1,7 +1,5 @@
 """Requested and measured style, as a session reports them."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass

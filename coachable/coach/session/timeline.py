@@ -1,7 +1,5 @@
 """Timeline of a session: the recording of past events, and the coming events of a plan or a replay."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator, Mapping
 from typing import Any

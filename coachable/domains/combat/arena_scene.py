@@ -1,7 +1,5 @@
 """Sites of fights: ground, walls, pillars and what lies around."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,16 +1,15 @@
 """Evaluation of style switches during sequences of fights: the effect of each switch and its delay."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from tqdm import tqdm
 
+from coachable.domain import Domain
 from coachable.envs.combat.constants import PLAYER_HP
 from coachable.envs.combat.tables import ELEMENTS, STYLES
 from coachable.envs.combat.traits import MACHINE_NAMES
@@ -19,12 +18,7 @@ from coachable.evaluation.switching import SWITCH_PERIOD
 from coachable.evaluation.wording import readable
 from coachable.styles import StyleSpace
 from coachable.training.rollout import Rollout
-
-if TYPE_CHECKING:
-    from coachable.domain import Domain
-    from coachable.training.weights import LoadedPolicy
-
-__all__ = ["SOURCES", "STATES", "CoachedFights", "draw_timeline", "fight_coached", "requests_of"]
+from coachable.training.weights import LoadedPolicy
 
 SOURCES = STYLES[:8]
 STATES = tuple(style for style in STYLES if style in ELEMENTS)

@@ -1,7 +1,5 @@
 """Declaration of the combat domain."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial

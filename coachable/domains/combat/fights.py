@@ -1,14 +1,13 @@
 """Evaluation of fights in every style: damage matrix, wins, parts, response to a weight, and switches (paper)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 
+from coachable.domain import Domain
 from coachable.domains.combat.coached_fight import (
     SOURCES,
     STATES,
@@ -27,10 +26,7 @@ from coachable.evaluation.style_grid import markdown_table, policy_sentence, row
 from coachable.evaluation.sweep import WeightSweep, sweep_weights
 from coachable.evaluation.wording import readable
 from coachable.styles import StyleSpace
-
-if TYPE_CHECKING:
-    from coachable.domain import Domain
-    from coachable.training.weights import LoadedPolicy
+from coachable.training.weights import LoadedPolicy
 
 PARTS = STYLES[8:11]
 COMPOSED_WEAPON, COMPOSED_ELEMENTS = "corrosive_blastsling", ("acid", "adhesive", "purgewater")  # those of its bombs

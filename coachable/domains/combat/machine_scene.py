@@ -1,7 +1,5 @@
 """Shapes of the machines, built from primitives by body plan, and of the player."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Measures of damage, states and parts in a fight, for comparison with the requested style."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import torch

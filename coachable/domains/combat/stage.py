@@ -1,7 +1,5 @@
 """Scene of a fight: site, player, machines with their parts, attacks, traps, elements and health."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Hashable, Mapping, Sequence
 from typing import cast

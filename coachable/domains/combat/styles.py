@@ -1,7 +1,5 @@
 """Style space of the combat domain, with 18 weights, their ranges and the training mixture (paper, Appendix C)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from coachable.envs.combat.rewards import REWARD_SCALES

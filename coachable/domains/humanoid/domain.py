@@ -1,7 +1,5 @@
 """Declaration of the humanoid domain."""
 
-from __future__ import annotations
-
 from functools import partial
 
 from coachable.domain import Domain

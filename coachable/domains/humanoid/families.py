@@ -1,7 +1,5 @@
 """Families of styles of the humanoid: arm pose and step length, or also the walking speed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Declaration of the domain humanoid_gait, in which the walking speed is a style, too."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

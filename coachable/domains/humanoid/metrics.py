@@ -1,7 +1,5 @@
 """Measures of the humanoid's style, for comparison with the requested one."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

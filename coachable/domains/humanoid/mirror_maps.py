@@ -5,8 +5,6 @@ signs stay the same if the axis on one side is the mirror image of that on the o
 otherwise (shoulders, ankle_x).
 """
 
-from __future__ import annotations
-
 from coachable.envs.humanoid.features import NUM_ARM_JOINTS, STYLE_FEATURES_SIZE, STYLED_SPEED_SIZE
 from coachable.envs.humanoid.model import ARM_JOINTS
 from coachable.envs.humanoid.observation import ACTION_GROUPS, OBSERVATION_GROUPS

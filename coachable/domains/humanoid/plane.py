@@ -1,23 +1,19 @@
 """Evaluation of the humanoid over the plane of walking speed and step length."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from coachable.domain import Domain
 from coachable.domains.humanoid.metrics import LENGTH_TOLERANCE, SPEED_TOLERANCE
 from coachable.evaluation.evaluate import evaluate_styles
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import drawing
 from coachable.evaluation.style_grid import StyleGrid, markdown_table, mean_of, rows_where, write_csv
 from coachable.evaluation.wording import readable
-
-if TYPE_CHECKING:
-    from coachable.domain import Domain
-    from coachable.training.weights import LoadedPolicy
+from coachable.training.weights import LoadedPolicy
 
 LEAST_SURVIVAL = 0.9  # share of the episodes without a fall
 _PANELS = {  # label, format, values at the ends of the colours

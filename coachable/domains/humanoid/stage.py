@@ -1,7 +1,5 @@
 """Scene of the humanoid: the walker on marked ground, with its footprints and the lengths of its last steps."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Style spaces of the humanoid and the reward terms of its styles: arm pose, step length, and walking speed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

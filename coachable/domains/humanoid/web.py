@@ -1,7 +1,5 @@
 """The humanoid on a page: its physics, and its features as one function with explicit memory."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Bounds that racing agents should reach, beside what was measured, with intervals."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any

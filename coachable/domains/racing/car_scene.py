@@ -1,7 +1,5 @@
 """Shapes of racing cars, and how much their wheels slip."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 

@@ -1,7 +1,5 @@
 """The circuit in the racing scene: tarmac, lines, kerbs, run-off, walls and trees."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from coachable.envs.racing.circuit.track import Track

@@ -1,7 +1,5 @@
 """Function that declares the three racing domains, one per family of styles."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial

@@ -1,13 +1,12 @@
 """Evaluation of drifting: the sideslip under rising weights, in corners and on straights, and its cost in pace."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from coachable.domain import Domain
 from coachable.domains.racing.bounds import bounds_report, bounds_summary, drift_bounds, lap_bounds
 from coachable.domains.racing.families import home_track
 from coachable.domains.racing.laps import circuits_report, circuits_summary, drive_circuits
@@ -24,10 +23,7 @@ from coachable.evaluation.style_grid import (
     rows_where,
     write_results,
 )
-
-if TYPE_CHECKING:
-    from coachable.domain import Domain
-    from coachable.training.weights import LoadedPolicy
+from coachable.training.weights import LoadedPolicy
 
 ANGLE = "sideslip_corners"
 JUDGED = "rear slip angle"  # sweep of the weight that the slider of drifting moves

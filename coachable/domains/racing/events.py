@@ -1,7 +1,5 @@
 """Rare or hard events that fill the replay tables of racing (Kompella et al. 2023)."""
 
-from __future__ import annotations
-
 import math
 
 from tensordict import TensorDictBase

@@ -1,7 +1,5 @@
 """Training environments, style spaces and style rewards of the three families of styles."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple

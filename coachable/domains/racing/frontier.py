@@ -7,8 +7,6 @@ stage the programme chooses throttle or brakes to minimise lap time + λ · reso
 trade-off on this line, apart from the effects that a point mass neglects.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Sequence

@@ -1,12 +1,11 @@
 """Laps on circuits that an agent was trained on and on others, beside quasi-steady-state laps."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from coachable.domain import Domain
 from coachable.domains.racing.families import training_tracks, typical_car
 from coachable.domains.racing.frontier import TANK, LapProgramme
 from coachable.domains.racing.metrics import TelemetryMeasures
@@ -18,10 +17,7 @@ from coachable.evaluation.episode_records import record_styles
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.statistics import bootstrap_interval
 from coachable.evaluation.style_grid import markdown_table, mean_of, rows_where
-
-if TYPE_CHECKING:
-    from coachable.domain import Domain
-    from coachable.training.weights import LoadedPolicy
+from coachable.training.weights import LoadedPolicy
 
 TRIAL_STEPS = 6000  # ten minutes: two laps of the longest circuit
 DRIVEN = (*SHIPPED, *HELD_OUT)

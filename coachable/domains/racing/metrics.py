@@ -1,7 +1,5 @@
 """Measures of the style in which a car was driven, for comparison with the requested one."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

@@ -5,8 +5,6 @@ swap sides, and quantities that point to the left change their sign. Task reward
 side, so that they stay as they are.
 """
 
-from __future__ import annotations
-
 from tensordict import NestedKey
 
 from coachable.envs.racing.env import RacingEnv

@@ -4,18 +4,17 @@ Two of the five cars have the margin under test, the other three have moderate o
 ("pursuer") or first ("leader"), as in Werner et al. (2023). The results are its wins, places, overtakes and contacts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from coachable.domain import Domain
 from coachable.domains.racing.bounds import FOLLOWS, bound, bounds_report, bounds_summary, lap_bounds, rank_interval
 from coachable.domains.racing.families import home_track
 from coachable.domains.racing.laps import circuits_report, circuits_summary, drive_circuits
@@ -30,10 +29,7 @@ from coachable.evaluation.figures import drawing, shade
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
 from coachable.evaluation.style_grid import markdown_table, mean_of, policy_sentence, rows_where, write_results
 from coachable.keys import STYLE_FEATURES
-
-if TYPE_CHECKING:
-    from coachable.domain import Domain
-    from coachable.training.weights import LoadedPolicy
+from coachable.training.weights import LoadedPolicy
 
 CARS = 5
 SETTINGS = {"pursuer": (3, 4), "leader": (0, 1)}  # slots of the pair on the grid, 0 in front

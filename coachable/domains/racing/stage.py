@@ -1,7 +1,5 @@
 """Scene of a race: the circuit, the cars, and skid marks where their wheels slide."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Hashable, Mapping
 from typing import cast

@@ -1,15 +1,14 @@
 """Evaluation of saving: gain and cost of stints under rising weights, with the frontier (paper, Figure 2)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from coachable.domain import Domain
 from coachable.domains.racing.bounds import (
     bounds_report,
     bounds_summary,
@@ -30,10 +29,7 @@ from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import drawing, shade
 from coachable.evaluation.statistics import bootstrap_interval, comparison_interval, rank_correlation
 from coachable.evaluation.style_grid import markdown_table, mean_of, policy_sentence, rows_where, write_results
-
-if TYPE_CHECKING:
-    from coachable.domain import Domain
-    from coachable.training.weights import LoadedPolicy
+from coachable.training.weights import LoadedPolicy
 
 WEIGHTS = {"fuel": "fuel", "tyre": "tire"}  # style weight of each resource
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the largest weight

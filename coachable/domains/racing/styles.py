@@ -1,7 +1,5 @@
 """Style spaces and rewards of drifting, saving and aggressiveness, with the paper's ranges and laws (Appendix C)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import torch

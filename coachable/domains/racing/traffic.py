@@ -1,16 +1,15 @@
 """Evaluation of overtaking and defending in traffic under rising weights, for the tyre and fuel family."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from coachable.domain import Domain
 from coachable.domains.racing.metrics import TelemetryMeasures
 from coachable.domains.racing.races import race_alike
 from coachable.envs.racing.race.features import DEFEND, OVERTAKE
@@ -20,10 +19,7 @@ from coachable.evaluation.figures import drawing, shade
 from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
 from coachable.evaluation.style_grid import markdown_table, rows_where
 from coachable.keys import STYLE_FEATURES
-
-if TYPE_CHECKING:
-    from coachable.domain import Domain
-    from coachable.training.weights import LoadedPolicy
+from coachable.training.weights import LoadedPolicy
 
 CARS = 3
 SLOTS = {"overtake": CARS - 1, "defend": 0}  # slot of the car whose weight rises: last, or first

@@ -1,7 +1,5 @@
 """A car alone on a circuit on a page: a control step of `RacingEnv` as functions of one row of numbers."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any

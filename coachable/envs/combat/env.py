@@ -1,7 +1,5 @@
 """`CombatEnv`, a TorchRL environment of N fights against machines."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

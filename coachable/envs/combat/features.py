@@ -1,7 +1,5 @@
 """Observations in named groups, aligned with the camera and roughly within [-1, 1] (paper, Appendix C)."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

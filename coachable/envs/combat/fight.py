@@ -1,7 +1,5 @@
 """One step of N fights from the gamepad's state to the components of the reward, for `CombatEnv`."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -5,8 +5,6 @@ outputs"). The 864 raw combinations of the heads have 315 different meanings, be
 on its buttons. `canonical_rows` maps every raw action to the one that the game uses.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

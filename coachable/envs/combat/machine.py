@@ -1,7 +1,5 @@
 """Attacks, phases and motion of the machines, and their hits on the player."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

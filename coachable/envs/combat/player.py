@@ -1,7 +1,5 @@
 """Intent of the player in a step, and the motion and camera of each frame."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

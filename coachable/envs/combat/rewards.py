@@ -1,7 +1,5 @@
 """Raw components of a step, and the weights that make the task reward, style features and events of them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

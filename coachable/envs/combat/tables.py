@@ -3,8 +3,6 @@
 The second row of each file gives the origin of each column: `paper` (tables of Appendix C and D) or `ours`.
 """
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

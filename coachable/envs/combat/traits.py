@@ -1,7 +1,5 @@
 """Numbers of the tables for the machines, weapons and sites of every fight, as tensors with the fights last."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

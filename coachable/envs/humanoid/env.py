@@ -1,7 +1,5 @@
 """`HumanoidEnv`: N walking humanoids as one TorchRL environment."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Style features of the humanoid: arm angles, and what the gait did in this control step."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from coachable.envs.humanoid.gait import StepReport

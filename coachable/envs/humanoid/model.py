@@ -6,8 +6,6 @@ has only the sensors that our features need and every force switched off, so tha
 geometry of any state.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files

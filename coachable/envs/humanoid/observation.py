@@ -1,7 +1,5 @@
 """The humanoid's observation: the suite's 67 numbers, the pelvis orientation and the gait, relative to the course."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from coachable.envs.humanoid.model import EXTREMITIES, JOINTS, MOTORS

@@ -1,7 +1,5 @@
 """Task reward of the humanoid: move forward along the course, facing it, without waste, head up and torso upright."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Batched physics of the humanoid: N states stepped in one call by `mujoco.rollout`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import mujoco

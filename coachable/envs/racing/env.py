@@ -1,7 +1,5 @@
 """`RacingEnv`, a TorchRL environment of B races of A cars with one row per car."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

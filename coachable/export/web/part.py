@@ -1,7 +1,5 @@
 """`WebPart`: what a domain that MuJoCo simulates adds to the page that `coachable export web` writes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -9,8 +7,6 @@ from typing import Any, ClassVar
 from torch import Tensor, nn
 
 from coachable.export.graph import graph_of
-
-__all__ = ["Measure", "PagePart", "WebPart", "WebScene"]
 
 _OUTPUTS = ("observation", "measured", "mark", "memory_after", "terminated")
 _MODELS = {"dynamics": "dynamics.xml", "kinematics": "kinematics.xml"}

@@ -1,7 +1,5 @@
 """Files of other projects that the page needs: pinned, checked, and taken from npm or from a folder."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import io
@@ -15,8 +13,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-
-__all__ = ["Package", "packages", "provide"]
 
 _SECONDS = 600  # that npm may take for a package
 

@@ -1,7 +1,5 @@
 """`coachable export web`: write a folder that any static host serves, in which an agent acts in the browser."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -20,8 +18,6 @@ from coachable.export.web.pinned_files import Package, packages, provide
 from coachable.outputs import complete_folder
 from coachable.scene.look import ICON, stylesheet
 from coachable.training.weights import LoadedPolicy
-
-__all__ = ["about", "copy_page", "export_page", "finish_page", "manifest_of"]
 
 _POLICY = "policy.onnx"
 _VENDORED = "third_party"

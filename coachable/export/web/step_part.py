@@ -1,7 +1,5 @@
 """`StepPart`: what a domain whose own step is exported adds to the page that `coachable export web` writes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -17,8 +15,6 @@ from coachable.scene.gauge_form import GaugeForm
 from coachable.scene.palette import Colour, css
 from coachable.scene.parts import Parts
 from coachable.scene.recorded import encode_backdrop, encode_figures
-
-__all__ = ["OUTPUTS", "StepPart", "Steps", "step_graph"]
 
 OUTPUTS = ("observation", "measured", "figures", "marks", "gauges", "camera", "memory_after", "terminated")
 """Outputs of the graph of a control step, see `Steps.judge`."""

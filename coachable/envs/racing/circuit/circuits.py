@@ -1,7 +1,5 @@
 """Circuits by name. All were made for this library and use no third-party data."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import lru_cache

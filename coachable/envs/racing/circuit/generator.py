@@ -1,7 +1,5 @@
 """Generator of random circuits, from which trainings and held-out evaluations take theirs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Computation of the line of least curvature through a track, which fast laps stay close to."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Quasi-steady-state speeds that friction, power and brakes allow along a line."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Planar rigid body with forces of steered and unsteered wheels, implicit velocities and impulses."""
 
-from __future__ import annotations
-
 import operator
 from functools import reduce
 from typing import Any, NamedTuple, TypeVar

@@ -4,8 +4,6 @@ Cars of B races are laid out as (A, B). Rolling the first axis by k pairs car i 
 visits every pair. For even A the last k visits its pairs twice, so that they count half.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """Model of the engine, the automatic gearbox, the differential and the fuel."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Control steps of N cars with substeps, contacts and their compilation."""
 
-from __future__ import annotations
-
 import logging
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Names of the rows of the packed tensors of a car's state and inputs."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from torch import Tensor

@@ -1,7 +1,5 @@
 """The road near a car, with signed distances to an arc of the centre line, surfaces beside the track and walls."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """Tyre model with combined slip, implicit wheel spin, heat and wear."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

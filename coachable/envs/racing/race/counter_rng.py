@@ -1,7 +1,5 @@
 """Random numbers that are a function of a race's seed and episode, independent of the other races."""
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """`LineFollower`, a scripted driver with traction control that serves as baseline and as opponent."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Style features of racing, which are slip, metres gained, wear, fuel, and gaps to other cars."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """`Garage`, which assigns a car model to each race."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -1,7 +1,5 @@
 """Observations of a driver, scaled by known ranges."""
 
-from __future__ import annotations
-
 import math
 
 import torch

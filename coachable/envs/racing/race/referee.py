@@ -1,7 +1,5 @@
 """`Referee`, pure functions for the inputs, rewards and observations of a control step, which can be compiled."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Functions that put stranded cars back on the track, as racing games do."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """`Rivals`, a mixture of scripted opponents and past copies of the agent's policy."""
 
-from __future__ import annotations
-
 import copy
 from collections import deque
 from typing import Any

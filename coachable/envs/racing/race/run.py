@@ -1,7 +1,5 @@
 """State of the task beside that of the physics, and quantities derived from both."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

@@ -1,7 +1,5 @@
 """Task reward and style features of one control step (docs/domains/racing.md, Rewards)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 
