@@ -198,7 +198,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--minutes",
         type=float,
-        help="of each training; default: 30 for walker-walk, walker-run and quadruped-walk, 90 for others",
+        help=f"of each training; default: {', '.join(f'{task} {m:g}' for task, m in MINUTES.items())}, others 90",
     )
     parser.add_argument("--threads", type=int, default=2, help="cores of each contestant")
     parser.add_argument("--clock", choices=["wall", "cpu"], default="wall", help="cpu: processor time of all threads")

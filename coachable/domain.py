@@ -26,8 +26,8 @@ from coachable.transforms import CoachableEnv, coachable_env
 _GROUP = "coachable.domains"  # entry points: name = "package.module:DOMAIN"
 
 
-class StyleMeasures(Protocol):
-    """Measured style of an agent, in the units of the request."""
+class StepMeasures(Protocol):
+    """What is measured in each env step."""
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
         """Measure one env step.
@@ -39,6 +39,10 @@ class StyleMeasures(Protocol):
             Measured values (N,) by name.
         """
         ...
+
+
+class StyleMeasures(StepMeasures, Protocol):
+    """Measured style of an agent, in the units of the request."""
 
     def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
         """Summarise whole episodes, or parts of them.

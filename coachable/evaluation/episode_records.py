@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from coachable.domain import Domain, StyleMeasures
+from coachable.domain import Domain, StepMeasures
 from coachable.keys import STYLE, TASK_REWARD
 from coachable.styles import StyleSpace
 from coachable.training.rollout import Rollout, StyleSchedule
@@ -57,7 +57,7 @@ def record_episodes(
     env: EnvBase,
     policy: TensorDictModuleBase,
     style: Tensor | StyleSchedule,
-    measures: StyleMeasures,
+    measures: StepMeasures,
     *,
     steps: int,
     seed: int,
@@ -111,7 +111,7 @@ def record_styles(
     style: Tensor | StyleSchedule,
     label: str,
     *,
-    measures: StyleMeasures | None = None,
+    measures: StepMeasures | None = None,
     steps: int | None = None,
     seed: int = 0,
     num_threads: int | None = None,

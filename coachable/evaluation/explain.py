@@ -112,12 +112,6 @@ class _Observations:
         self._step += 1
         return {}
 
-    def summarise(self, record: Any, alive: Tensor) -> dict[str, Tensor]:
-        return {}
-
-    def complies(self, record: Any) -> Tensor:
-        raise NotImplementedError
-
 
 def _side_by_side(rankings: Sequence[Ranking]) -> str:
     columns: dict[str, str] = {"rank": ""}

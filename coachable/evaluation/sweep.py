@@ -99,6 +99,3 @@ class _WithUnitReward:
         own = {name: values for name, values in record.items() if name != UNIT_REWARD}
         paid = torch.where(alive, record[UNIT_REWARD], torch.nan).nanmean(0)
         return {**self._measures.summarise(own, alive), UNIT_REWARD: paid}
-
-    def complies(self, record: Mapping[str, Tensor]) -> Tensor:
-        return self._measures.complies(record)

@@ -1,6 +1,5 @@
 """Statistics of collected episodes and of updates between two rows of the log."""
 
-import math
 import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -78,13 +77,17 @@ class EpisodeWatch:
     """Warns once if no episode ends, because a style is drawn when an episode begins."""
 
     def __init__(self) -> None:
-        self._steps: float = 0
+        self._steps = 0
+        self._watches = True
 
     def add(self, data: TensorDictBase) -> None:
         """Add collected transitions `[N, T]` of N environments."""
-        self._steps += math.inf if data.get(("next", "done")).any() else data.shape[-1]
-        if _LONG_EPISODE <= self._steps < math.inf:
-            self._steps = math.inf
+        if not self._watches:
+            return
+        self._steps += data.shape[-1]
+        ended = bool(data.get(("next", "done")).any())
+        self._watches = not ended and self._steps < _LONG_EPISODE
+        if not ended and not self._watches:
             warnings.warn(
                 f"no episode has ended in {_LONG_EPISODE:,} steps of each environment: a style is drawn when an "
                 f"episode begins, so only {data.numel() // data.shape[-1]} styles were seen. Expected a time limit, "

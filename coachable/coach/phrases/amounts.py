@@ -14,6 +14,7 @@ from coachable.coach.phrases.vocabulary import (
     STRONGLY,
     TURNS,
     UNITS,
+    is_own_unit,
     own_unit,
     stem,
 )
@@ -154,7 +155,7 @@ def _given(p: Weight | Setpoint, segment: Segment, now: float, sign: float | Non
             return now * (1 + sign * number / 100)
         share = number / 100
         return p.low + (p.high - p.low) * (1.0 - share if sense < 0 else share)
-    if unit not in UNITS and unit not in ("", own_unit(p.unit)):
+    if is_own_unit(unit) and unit != own_unit(p.unit):
         return f"{readable(p.name)} {f'is in {p.unit}' if p.unit else 'has no unit'}"
     if unit in UNITS:
         if dimension_of(p) != UNITS[unit][0]:

@@ -12,7 +12,7 @@ from typing import Any, cast
 from coachable.coach.phrases import segments
 from coachable.coach.phrases.amounts import Last, amount, dimension_of, wrapped
 from coachable.coach.phrases.segments import Mention, Segment
-from coachable.coach.phrases.vocabulary import FILLERS, RESERVED, mark_own_units, own_unit, stem, tokenise
+from coachable.coach.phrases.vocabulary import FILLERS, RESERVED, is_own_unit, mark_own_units, own_unit, stem, tokenise
 from coachable.domain import Words
 from coachable.evaluation.wording import readable, readable_number
 from coachable.styles import Choice, Parameter, StyleSpace, Weight
@@ -284,7 +284,7 @@ class StyleGrammar:
                 return (), f" (nothing here has a {dimension})"
         else:
             fitting = [n for n in numeric if dimension_of(self.parameters[n]) != "angle"]
-        if segment.number is not None and segment.number[1].startswith("°"):
+        if segment.number is not None and is_own_unit(segment.number[1]):
             fitting = [n for n in numeric if own_unit(self.parameters[n].unit) == segment.number[1]] or fitting
         if segment.every:
             return tuple(fitting), ""  # "both 0.5 m"

@@ -24,6 +24,7 @@ from coachable.coach.phrases.vocabulary import (
     SEPARATORS,
     STRONGLY,
     UNITS,
+    is_own_unit,
     stem,
 )
 
@@ -232,12 +233,11 @@ def _take(segment: Segment, tokens: Sequence[str], i: int, ignored: Collection[s
         segment.unknown.append(word)
     elif word[-1].isdigit():
         unit = stem(tokens[i + 1]) if i + 1 < len(tokens) else ""
-        own = unit.startswith("°") and unit not in UNITS
-        known = unit in PERCENT or unit in UNITS or own
+        known = unit in PERCENT or unit in UNITS or is_own_unit(unit)
         segment.signed, segment.number = word.startswith("+"), (float(word), unit if known else "")
         segment.absolute |= i > 0 and tokens[i - 1] == "to"
         if known:
-            segment.words += [] if own else [tokens[i + 1]]
+            segment.words += [] if is_own_unit(unit) else [tokens[i + 1]]
             segment.dimension = segment.dimension or UNITS.get(unit, ("", 1.0))[0]
             return 2
     elif word in NEGATIONS:

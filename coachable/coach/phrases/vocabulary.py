@@ -125,6 +125,11 @@ def own_unit(unit: str) -> str:
     return "" if not letters or stem(unit) in UNITS else f"°{stem(letters)}"
 
 
+def is_own_unit(token: str) -> bool:
+    """Return whether a token is one of `own_unit`."""
+    return token.startswith("°") and token not in UNITS
+
+
 def mark_own_units(phrase: str, units: Iterable[str]) -> str:
     """Replace units behind numbers by their tokens, see `own_unit`.
 

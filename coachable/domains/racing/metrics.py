@@ -160,22 +160,6 @@ class TelemetryMeasures:
         told = transition.get(("next", "telemetry"))
         return {name: told[:, column] for name, column in self._columns.items()}
 
-    def summarise(self, record: Mapping[str, Tensor], alive: Tensor) -> dict[str, Tensor]:
-        """Return no summaries, because the evaluation computes its own.
-
-        Args:
-            record: Not used.
-            alive: Not used.
-
-        Returns:
-            An empty dictionary.
-        """
-        return {}
-
-    def complies(self, record: Mapping[str, Tensor]) -> Tensor:
-        """Return whether the car is on the track in each step, (T, N) bool; see `StyleMeasures.complies`."""
-        return record["off"] == 0.0
-
 
 def whole_turns(heading: Tensor, alive: Tensor) -> Tensor:
     """Return the largest rotation in one direction in whole turns, (N,), from the headings in the steps that count.
