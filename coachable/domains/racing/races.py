@@ -19,8 +19,10 @@ from coachable.domains.racing.bounds import FOLLOWS, bound, bounds_report, bound
 from coachable.domains.racing.families import home_track
 from coachable.domains.racing.laps import circuits_report, circuits_summary, drive_circuits
 from coachable.domains.racing.metrics import TelemetryMeasures, nearest_gaps
+from coachable.envs.racing.physics.cars import POOL_GT3
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
 from coachable.envs.racing.race.features import anyone_beside, anyone_in_line
+from coachable.envs.racing.race.garage import GT3_POOL, POOL
 from coachable.envs.racing.race.run import Run
 from coachable.envs.racing.race.scenarios import rolling_start
 from coachable.evaluation.episode_records import record_episodes
@@ -81,8 +83,8 @@ def evaluate_aggressiveness(domain: Domain, agent: LoadedPolicy, out: Path, sett
         agent: Policy of all five cars, which acts deterministically.
         out: Folder, which is created if it is missing.
         settings: `episodes` is the number of races per setting, margin and combination of the other cars' margins, of
-            which there are eight. A race ends when the first car has driven four laps, or after `steps`, 10,000 by
-            default.
+            which there are eight; with seven, each of the 50 GT3 cars of a pool drives. A race ends when the first car
+            has driven four laps, or after `steps`, 10,000 by default.
 
     Returns:
         The report as Markdown.
@@ -313,6 +315,8 @@ def draw_radar(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Mapping[str, Any]) -> str:
     text = "# racing, aggressiveness: requested margin and measured behaviour\n\n"
     text += f"{policy_sentence(agent)} in all five cars; {summary['races_per_row']} races per row, {LAPS} laps, "
+    if agent.config.get("env", {}).get("car") in (POOL, GT3_POOL):
+        text += f"the {POOL_GT3} GT3-like cars of the pool in turn, one model per race, "
     text += f"rolling start, seed {summary['seed']}. Two cars, which start last (pursuer) or first (leader), keep the "
     text += f"requested margin; their lateral margin is {FIXED['lateral']:g} m and their longitudinal one "
     text += f"{FIXED['longitudinal']:g} m otherwise. The other three keep 0.5 or 0.75 m laterally.\n\n"

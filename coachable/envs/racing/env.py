@@ -57,7 +57,8 @@ class RacingEnv(EnvBase):
         track: Name of a circuit, a `Track`, several of them, or the name of a set, see `load_tracks`. With several
             circuits, races take turns on them: race b drives its episode e on circuit b + e, modulo the number of
             circuits, all counted from 0.
-        car: Name of a shipped car, or "pool" for cars drawn from a pool, one model per race and episode.
+        car: Name of a shipped car, "pool" for cars drawn from a pool of 530, one model per race and episode, or
+            "gt3_pool" for its 50 GT3-like cars in turn.
         adaptive: Whether cars of the pool that spin are drawn more often; otherwise all are equally likely.
         scenarios: Kinds of starts of the episodes; by default the mixture of `race_scenarios`.
         conditions: Tyres and fuel at the start.

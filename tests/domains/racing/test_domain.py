@@ -113,6 +113,13 @@ def test_pictures_follow_the_car():
     renderer.close()
 
 
+def test_an_agent_of_all_cars_is_measured_with_the_gt3_cars():
+    domain = load_domain("racing_aggressiveness", {"env": {"track": "ring", "car": "pool"}})
+    env = domain.make_env(num_envs=2, seed=0)
+    assert env.garage.pool.shape[1] == 50 and domain.make_web is None
+    assert sum(group.width for group in domain.observation_groups) == env.observation_size
+
+
 def test_a_domain_is_as_its_training_made_it():
     settings = {"_target_": "x", "family": "resources", "num_envs": 256, "track": "ring", "car": "gt3"}
     # As a configuration has them; a file must not choose what is imported and called.

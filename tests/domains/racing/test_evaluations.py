@@ -40,7 +40,9 @@ def scripted(family, car, **settings):
     made = []
 
     def make_env(**options):
-        driver = LineFollower(load_tracks(options.get("track", "ring")), load_car(car), grip=0.8)
+        driver = LineFollower(
+            load_tracks(options.get("track", "ring")), load_car("gt3" if car == "pool" else car), grip=0.8
+        )
         made.append((domain.make_env(**options), driver))
         return made[-1][0]
 
@@ -265,6 +267,16 @@ def test_races_of_the_scripted_driver(tmp_path, one_circuit):
     # A rolling start puts 14 m between cars; one driver on one line hardly ever brings them beside each other.
     assert all(0.0 <= float(row["beside"]) < 0.05 for row in rows)
     assert "races per row, 4 laps" in report and (tmp_path / "radar.png").exists()
+
+
+def test_races_in_the_cars_of_a_pool(tmp_path, one_circuit):
+    domain, agent = scripted("aggressiveness", "pool")
+    made = []
+    seen = replace(domain, make_env=lambda **options: made.append(domain.make_env(**options)) or made[-1])
+    report = evaluate_aggressiveness(seen, agent, tmp_path, EvaluationSettings(episodes=1, steps=3, progress=False))
+    models = made[0].garage.model.reshape(20, 8)  # margins and settings, races of each
+    assert (models == models[0]).all() and len(models[0].unique()) == 8
+    assert "the 50 GT3-like cars of the pool in turn" in report
 
 
 def test_traffic_of_the_scripted_driver(tmp_path, monkeypatch):

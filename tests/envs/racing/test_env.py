@@ -15,7 +15,7 @@ from coachable.domains.racing import (
     resource_style_space,
 )
 from coachable.envs.racing import RacingEnv
-from coachable.envs.racing.physics.cars import Resources
+from coachable.envs.racing.physics.cars import Resources, car_pool
 from coachable.envs.racing.physics.state import HEATS, ROW, WEARS
 from coachable.envs.racing.race.counter_rng import normal, uniforms
 from coachable.envs.racing.race.driver import LineFollower
@@ -396,3 +396,16 @@ def test_cars_of_the_pool_that_spin_are_drawn_more_often(adaptive):
     found = float((garage.model == 7).float().mean())
     assert abs(found - share) < 5 * math.sqrt(share * (1 - share) / races)
     assert len(garage.model.unique()) == 530
+
+
+def test_the_gt3_cars_of_the_pool_take_turns():
+    env = RacingEnv(2 * 50, cars=2, car="gt3_pool", track="ring", seed=3)
+    env.reset()
+    first, pool = env.garage.model, car_pool()
+    assert first.sort().values.tolist() == list(range(50))
+    assert torch.equal(env.garage.car.mass, pool[0, first].repeat(2))  # the cars of a race are alike
+    env.reset()
+    assert torch.equal(env.garage.model, (first + 1) % 50)
+    env.set_seed(3)
+    env.reset()
+    assert torch.equal(env.garage.model, first)

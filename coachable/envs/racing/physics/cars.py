@@ -13,7 +13,7 @@ from torch import Tensor
 
 CARS = ("gt3", "x2019", "street")
 MAX_GEARS = 8
-_POOL_CARS, _POOL_GT3 = 530, 50  # cars of the pool, and those of them that are derived from the GT3 car
+POOL_CARS, POOL_GT3 = 530, 50  # cars of the pool, and those of them that are derived from the GT3 car
 
 COMPOUNDS = tuple(
     f"{kind}_{hardness}" for kind in ("comfort", "sport", "race") for hardness in ("hard", "medium", "soft")
@@ -174,8 +174,8 @@ def car_pool() -> Tensor:
     ]
     generator = torch.Generator().manual_seed(0)
     columns = []
-    for index in range(_POOL_CARS):
-        base = archetypes[0 if index < _POOL_GT3 else index % len(archetypes)]
+    for index in range(POOL_CARS):
+        base = archetypes[0 if index < POOL_GT3 else index % len(archetypes)]
         mass, power, grip, lift, drag, shift = (1 + 0.08 * (2 * torch.rand(6, generator=generator) - 1)).tolist()
         moved = (shift - 1) * (base.front_axle + base.rear_axle) / 2
         car = replace(
