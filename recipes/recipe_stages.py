@@ -30,9 +30,8 @@ def composed_stages(cfg: DictConfig, said: Iterable[str], removed: Iterable[str]
     values: dict[str, Any] = {}
     for key in said:
         if key.split(".")[0] not in _OF_THE_RUN:
-            group = OmegaConf.select(
-                cfg, key
-            )  # has a type; what refers to others, such as ${gamma}, stays as it stands
+            # A group has a type. Other values may refer to settings, such as ${gamma}, and stay as they are written.
+            group = OmegaConf.select(cfg, key)
             values[key] = group if isinstance(group, DictConfig) else reduce(getitem, key.split("."), given)
     current = cfg.copy()
     current.stages = []

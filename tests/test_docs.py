@@ -177,6 +177,13 @@ def test_commands_of_recipes_name_what_exists(recipe):
     assert [mistake_in(command) for command in found] == [None] * len(found)
 
 
+def test_every_preset_and_every_choice_of_a_group_is_described():
+    page = (ROOT / "docs" / "configuration.md").read_text()
+    choices = [file.stem for file in CONFIGS.glob("*/**/*.yaml")]
+    assert len(choices) > 30
+    assert [choice for choice in choices if f"`{choice}`" not in page] == []
+
+
 @pytest.mark.parametrize(
     "line, mistake",
     [
