@@ -18,12 +18,14 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from coachable.domain import Domain
+from coachable.domains.combat.fights import PARTS
 from coachable.domains.combat.styles import single_styles
 from coachable.envs.combat import constants as c
 from coachable.envs.combat.gamepad import HEADS
 from coachable.envs.combat.state import BERRY, DODGE
 from coachable.envs.combat.tables import SITES
-from coachable.evaluation.statistics import bootstrap_interval
+from coachable.envs.combat.traits import MACHINE_NAMES
+from coachable.evaluation.statistics import wilson_interval
 from coachable.evaluation.style_grid import markdown_table
 from coachable.training.rollout import Rollout
 from coachable.training.weights import LoadedPolicy, domain_of, load_policy
@@ -70,7 +72,7 @@ def damage_taken(before: Tensor, after: Tensor, eaten: Tensor) -> Tensor:
 
 def fight(domain: Domain, agent: LoadedPolicy, way: str, fights: int) -> dict[str, np.ndarray]:
     """Return sums over each fight: outcome, damage taken, evasions, berries, and how probable the policy makes them."""
-    cells, machines = single_styles(agent.space), list(agent.config["env"]["machines"])
+    cells, machines = single_styles(agent.space), agent.config["env"]["machines"] or MACHINE_NAMES
     rows = list(product(cells, machines, range(fights)))
     theta = agent.space.make_all(cell for cell, _, _ in rows)
     env = domain.styled_env(agent.space, len(rows), seed=0)
@@ -92,7 +94,7 @@ def fight(domain: Domain, agent: LoadedPolicy, way: str, fights: int) -> dict[st
         values = {
             "won": measured["won"],
             "damage": measured["damage"],
-            "requested": measured["requested"].nan_to_num(),
+            "requested": measured["requested_damage"].nan_to_num(),
             "taken": damage_taken(hp, state.hp, eaten),
             "evasions": ((state.timers[DODGE] > 0) & (state.timers[DODGE] > evading)).float(),
             "berries": eaten,
@@ -106,7 +108,9 @@ def fight(domain: Domain, agent: LoadedPolicy, way: str, fights: int) -> dict[st
             sums[name] = sums.get(name, torch.zeros(len(rows))) + torch.where(alive, value, 0.0)
         alive = alive & ~transition.get(("next", "done"))[:, 0]
     env.close()
-    asked = torch.tensor([max(cell.values()) > 0 for cell, _, _ in rows])
+    asked = torch.tensor(
+        [any(weight > 0 and name not in PARTS for name, weight in cell.items()) for cell, _, _ in rows]
+    )
     return {name: value.numpy() for name, value in sums.items()} | {"asked": asked.numpy()}
 
 
@@ -124,7 +128,7 @@ def main() -> None:
         rows, beliefs = [], []
         for way in WAYS:
             sums = fight(domain, agent, way, args.fights)
-            low, high = bootstrap_interval(sums["won"], resamples=500)
+            low, high = wilson_interval(int(sums["won"].sum()), len(sums["won"]))
             asked = sums["asked"]
             score = sums["requested"][asked].sum() / max(sums["damage"][asked].sum(), 1e-9)
             row = {"agent": source, "way": way, "fights": len(asked), "interval": f"{low:.1%} to {high:.1%}"}

@@ -304,7 +304,7 @@ class Domain:
             reward: Style reward; by default the domain's own.
             **options: Further arguments of `make_env`.
         """
-        if _takes(self.make_env, "num_threads"):
+        if accepts(self.make_env, "num_threads"):
             options["num_threads"] = num_threads
         simulation = self.make_env(num_envs=num_envs, **options)
         reward = self.make_reward(space) if reward is None else reward
@@ -351,7 +351,7 @@ def _cells(grid: Mapping[str, Sequence[Any]] | Sequence[Mapping[str, Any]]) -> l
     return [dict(cell) for cell in grid]
 
 
-def _takes(function: Any, argument: str) -> bool:
+def accepts(function: Any, argument: str) -> bool:
     """Return whether a function, or the constructor of a class, accepts a keyword argument."""
     while isinstance(function, partial) or hasattr(function, "__wrapped__"):
         function = function.func if isinstance(function, partial) else function.__wrapped__

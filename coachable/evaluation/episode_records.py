@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from coachable.domain import Domain, StepMeasures
+from coachable.domain import Domain, StepMeasures, accepts
 from coachable.keys import STYLE, TASK_REWARD
 from coachable.styles import StyleSpace
 from coachable.training.rollout import Rollout, StyleSchedule
@@ -123,7 +123,14 @@ def record_styles(
     Styles are theta (N, d) for whole episodes, or a function from the step to theta, for styles that change. The label
     is that of the progress bar. `RolloutOptions` describes `steps`, `seed`, `num_threads` and `progress`; other options
     are those of `Domain.styled_env`.
+
+    Raises:
+        ValueError: If `steps` exceeds the length of an episode, and the environment takes no `episode_steps`.
     """
+    if steps is not None and steps > domain.episode_steps:
+        if not accepts(domain.make_env, "episode_steps"):
+            raise ValueError(f"steps is {steps}: expected at most {domain.episode_steps}, the length of an episode")
+        env_options = {"episode_steps": steps, **env_options}
     count = len(style(0) if callable(style) else style)
     return record_episodes(
         domain.styled_env(space, count, seed=seed, num_threads=num_threads, **env_options),

@@ -13,7 +13,7 @@ from tensordict.nn import InteractionType, TensorDictModuleBase
 
 from coachable.domain import Domain
 from coachable.evaluation.episode_records import RolloutOptions, record_styles
-from coachable.evaluation.statistics import bootstrap_interval, rank_correlation
+from coachable.evaluation.statistics import bootstrap_interval, rank_correlation, wilson_interval
 from coachable.evaluation.wording import with_unit
 from coachable.styles import Setpoint, StyleSpace
 from coachable.training.weights import LoadedPolicy
@@ -36,12 +36,12 @@ class StyleGrid:
     steps: int
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return one row per cell: style, mean of each metric, and its 95 % bootstrap interval over episodes."""
+        """Return one row per cell: style, mean of each metric, and its 95 % interval over episodes (`interval_of`)."""
         rows = []
         for index, cell in enumerate(self.cells):
             row: dict[str, Any] = {**cell, "episodes": self.episodes["survived"].shape[1]}
             for name, values in self.episodes.items():
-                low, high = bootstrap_interval(values[index])
+                low, high = interval_of(name, values[index])
                 column = measured_column(name, cell)
                 row |= {column: mean_of(values[index]), f"{column}_low": low, f"{column}_high": high}
             rows.append(row)
@@ -110,6 +110,18 @@ def evaluate_grid(
     values |= {"task_return": record.task_return, **domain.measures.summarise(record.measures, record.alive)}
     shaped = {name: value.reshape(len(cells), episodes).double().numpy() for name, value in values.items()}
     return StyleGrid(cells, shaped, options.get("seed", 0), options.get("steps") or domain.episode_steps)
+
+
+def interval_of(name: str, values: np.ndarray) -> tuple[float, float]:
+    """Compute the 95 % interval of the mean of a metric: Wilson's for the share that survived, otherwise by bootstrap.
+
+    If all episodes survived, resampling them would give an interval without width.
+
+    Args:
+        name: The metric.
+        values: Values (n,) of the episodes; NaN are left out.
+    """
+    return wilson_interval(round(values.sum()), len(values)) if name == "survived" else bootstrap_interval(values)
 
 
 def measured_column(name: str, cell: Mapping[str, Any]) -> str:

@@ -54,6 +54,9 @@ def test_each_cell_gets_its_style_and_its_metrics(grid):
         assert row["measured_speed"] == pytest.approx(obeyed)
         assert row["error"] == pytest.approx(abs(obeyed - row["speed"]))
         assert row["episodes"] == 3
+        # Wilson's interval: three episodes that all survive say little about the next one.
+        survived = (row["survived_low"], row["survived_high"])
+        assert survived == pytest.approx((0.4385, 1.0) if row["survived"] else (0.0, 0.5615), abs=1e-4)
 
 
 def test_an_episode_counts_until_its_end(grid):
@@ -188,6 +191,17 @@ def test_an_unknown_domain_is_refused_with_the_known_ones():
 def test_no_episodes_are_refused():
     with pytest.raises(ValueError, match="at least 1, got 0"):
         evaluate_grid(DOMAIN, POLICY, SPACE, episodes=0)
+
+
+def test_longer_episodes_are_those_of_the_environment():
+    made = []
+    domain = replace(DOMAIN, make_env=lambda num_envs, episode_steps=10: made.append(episode_steps) or ToyEnv(num_envs))
+    for steps in (10, 15):
+        grid = evaluate_grid(domain, POLICY, SPACE, episodes=1, steps=steps, progress=False)
+        assert grid.steps == steps and grid.episodes["steps"].max() == steps
+    assert made == [10, 15]
+    with pytest.raises(ValueError, match="steps is 15: expected at most 10, the length of an episode"):
+        evaluate_grid(DOMAIN, POLICY, SPACE, episodes=1, steps=15, progress=False)
 
 
 def test_a_grid_too_small_for_a_line_is_drawn_although_only_the_request_is_published(tmp_path):

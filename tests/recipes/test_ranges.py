@@ -140,7 +140,7 @@ def test_what_a_target_checks_itself_is_refused_before_anything_is_written(argum
             "network.critic.widths=[]",
             r"network.critic.widths=\[\]: expected a list of at least one entry, each a whole number",
         ),
-        ("critic_support.v_min=700", r"critic_support.v_min=700.*: expected less than v_max, which is 650.0"),
+        ("critic_support.v_min=900", r"critic_support.v_min=900.*: expected less than v_max, which is 800.0"),
         ("replay.gamma=-1", r"replay.gamma=-1: expected a number in \[0, 1\]"),
         ("style_reward.pose_scale=nan", r"style_reward.pose_scale=nan: expected a number of at least 0"),
     ],

@@ -94,7 +94,7 @@ class WalkFeatures(nn.Module):
         kinematics = read_kinematics(sensors.numpy(), model)
         report = gait.update(kinematics, state[:, model.knee_positions], np.zeros((1, 2)), course)
         features = pack_style_features(state[:, model.arm_positions], report)
-        observation = torch.from_numpy(observe(state, speeds, kinematics, course, gait.observe()))
+        observation = torch.from_numpy(observe(state, speeds, kinematics, course, gait.observe(course)))
         transition: Any = {
             STYLE: style,
             ("next", "observation"): observation,

@@ -14,9 +14,10 @@ from coachable.domains.racing.metrics import DRIFT_DEG, DRIFT_SPEED, GRIP_DEG
 from coachable.envs.racing.race.features import CORNER_RADIUS, DRIFT_NAMES
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.figures import drawing
-from coachable.evaluation.statistics import bootstrap_interval, comparison_interval, rank_correlation
+from coachable.evaluation.statistics import comparison_interval, rank_correlation
 from coachable.evaluation.style_grid import (
     evaluate_grid,
+    interval_of,
     markdown_table,
     mean_of,
     policy_sentence,
@@ -100,7 +101,7 @@ def _rows(sweep: str, episodes: Mapping[str, np.ndarray]) -> list[dict[str, Any]
     for index, weight in enumerate(WEIGHTS):
         row: dict[str, Any] = {"sweep": sweep, "weight": weight}
         for name in _METRICS:
-            low, high = bootstrap_interval(episodes[name][index])
+            low, high = interval_of(name, episodes[name][index])
             row |= {name: mean_of(episodes[name][index]), f"{name}_low": low, f"{name}_high": high}
         low, high = comparison_interval(episodes["pace"][index], neutral, np.divide)
         row |= {"pace_kept": row["pace"] / mean_of(neutral), "pace_kept_low": low, "pace_kept_high": high}

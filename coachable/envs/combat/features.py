@@ -226,7 +226,7 @@ def _player_rows(s: State, ammo: Tensor, axes: Tensor, episode_steps: int) -> Te
         timers[STAGGER],
         *others,
         *one_hot_rows(s.site, len(SITES)),
-        s.steps / episode_steps,
+        (s.steps / episode_steps).clamp(max=1.0),  # live fights have no limit
         *one_hot_rows(s.weapon, len(WEAPONS)),
         *one_hot_rows(s.section, AMMO_SLOTS),
         *element,

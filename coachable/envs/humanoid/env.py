@@ -276,7 +276,7 @@ class HumanoidEnv(EnvBase):
         self.steps[rows] = 0
         self._push_left[rows] = 0
         kinematics = self.simulation.kinematics(rows)
-        feet = rotate_to_course(kinematics.feet, self.course[rows])
+        feet = kinematics.feet[..., :2]
         self.gait.reset(rows, self._random.integers(0, 2, len(rows)), feet, self._knees()[rows], kinematics.soles)
         self._observation[rows] = self._observe(kinematics, rows)
 
@@ -320,4 +320,4 @@ class HumanoidEnv(EnvBase):
     def _observe(self, kinematics: Kinematics, rows: np.ndarray) -> np.ndarray:
         """Return the scaled observation (len(rows), 82) float32 of the states that `kinematics` belongs to."""
         positions, velocities = self.simulation.positions[rows], self.simulation.velocities[rows]
-        return observe(positions, velocities, kinematics, self.course[rows], self.gait.observe()[rows])
+        return observe(positions, velocities, kinematics, self.course[rows], self.gait.observe(self.course)[rows])

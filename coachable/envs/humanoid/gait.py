@@ -66,8 +66,7 @@ class GaitTracker:
         first_step: (N,) bool, no strike yet in this episode.
         knee_min: (N, 2) smallest angle of each knee since the step began [rad].
         knee_max: (N, 2) largest one [rad].
-        step_vector: (N, 2) (x, y) of the foot to strike relative to the other one when the step began, along and across
-            the course [m].
+        step_vector: (N, 2) x and y of the foot to strike relative to the other one when the step began [m].
         stride_vector: (N, 2) the same when the stride began, one step earlier [m].
         step_max: time without a strike after which a step counts as timed out [s].
     """
@@ -116,7 +115,7 @@ class GaitTracker:
         Args:
             rows: (M,) indices of the envs.
             expected: (M,) foot that must strike first.
-            feet: (M, 2, 2) foot positions along and across the course [m].
+            feet: (M, 2, 2) x and y of the feet [m].
             knees: (M, 2) knee angles [rad].
             soles: (M, 2, 2) x and y of the soles [m].
         """
@@ -155,8 +154,8 @@ class GaitTracker:
         own, other = self.prints[index, expected], self.prints[index, 1 - expected]
         feet = kinematics.feet[..., :2]
         apart = feet[index, expected] - feet[index, 1 - expected]
-        vectors = rotate_to_course(np.stack([soles[index, expected] - other, other - own, apart], axis=1), course)
-        step, before, apart = vectors[:, 0], vectors[:, 1], vectors[:, 2]
+        vectors = rotate_to_course(np.stack([soles[index, expected] - other, other - own], axis=1), course)
+        step, before = vectors[:, 0], vectors[:, 1]
         length, previous = step[:, 0], before[:, 0]
         forward = (length > 0) & (previous > 0)
         fraction = np.where(forward, length / np.where(forward, length + previous, 1.0), 0.0)
@@ -198,18 +197,22 @@ class GaitTracker:
         self.knee_min = np.where(column, knees, self.knee_min)
         self.knee_max = np.where(column, knees, self.knee_max)
 
-    def observe(self) -> np.ndarray:
+    def observe(self, course: np.ndarray) -> np.ndarray:
         """Return what the policy observes of the current step.
+
+        Args:
+            course: (N,) direction that counts as forward, counter-clockwise from +x [rad].
 
         Returns:
             (N, 11): one-hot of the expected foot 2, smallest and largest angle of each knee since the step began 4
-            [rad], start vectors of the step and of the stride 4 [m], time since the last strike / step_max 1, up to 2.
+            [rad], start vectors of the step and of the stride along and across the course 4 [m], time since the last
+            strike / step_max 1, up to 2.
         """
+        vectors = rotate_to_course(np.stack([self.step_vector, self.stride_vector], axis=1), course)
         onehot = np.stack([self.expected == 0, self.expected == 1], axis=1)
         timer = np.minimum(self.clock * CONTROL_STEP / self.step_max, 2.0)
-        return np.concatenate(
-            [onehot, self.knee_min, self.knee_max, self.step_vector, self.stride_vector, timer[:, None]], axis=1
-        )
+        starts = vectors.reshape(-1, 4)
+        return np.concatenate([onehot, self.knee_min, self.knee_max, starts, timer[:, None]], axis=1)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return every per-env array by name, for checkpoints."""

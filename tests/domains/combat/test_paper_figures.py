@@ -1,8 +1,10 @@
 """The paper's figures: what is counted in a grid of fights, and that every file is written."""
 
+from argparse import Namespace
 from dataclasses import replace
 
 import apex_fight
+import combat_ablations
 import combat_modes
 import matplotlib.image
 import numpy as np
@@ -206,6 +208,12 @@ def test_a_berry_restores_no_more_than_is_missing():
     before, after = torch.tensor([400.0, 650.0, 650.0, 500.0]), torch.tensor([505.0, 700.0, 620.0, 450.0])
     taken = combat_modes.damage_taken(before, after, torch.tensor([1.0, 1.0, 1.0, 0.0]))
     assert taken.tolist() == [0.0, 0.0, 80.0, 50.0]
+
+
+def test_ablations_of_a_preset_with_stages_are_refused(tmp_path):
+    args = Namespace(threads=1, preset="full_cpu", frames=None, episodes=1)
+    with pytest.raises(SystemExit, match="preset full_cpu has stages: expected one without"):
+        combat_ablations.train("base", 0, tmp_path / "run", args)
 
 
 def test_brittle_phases_are_counted_by_hand():

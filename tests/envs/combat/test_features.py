@@ -74,6 +74,8 @@ def test_the_player():
     expected = [*one_hot(WEAPON, 6), *one_hot(SECTION, 3), *element, *shares]
     assert found["Active weapon + ammo"] == close(expected)
     assert found["Weapon wheel open"] == [0.0, 1.0]
+    s.steps = 3 * s.steps * 5  # a live fight has no limit
+    assert seen(env)["Player game state"][-1] == 1.0
     s.section, s.berries = torch.tensor([0]), torch.zeros(1)  # no element; nothing to heal with
     assert seen(env)["Active weapon + ammo"][9:17] == one_hot(7, 8)
     assert seen(env)["Quick-tool: health bucket"] == [0.0, 0.0]

@@ -273,8 +273,21 @@ def test_only_speeds_of_joints_are_scaled():
     np.testing.assert_allclose(seen[:, :40], suite[:, :40], atol=1e-6)
     np.testing.assert_allclose(seen[:, 40:67], 0.1 * simulation.velocities, atol=1e-6)
     np.testing.assert_allclose(seen[:, 67:71], kinematics.pelvis_quaternion, atol=1e-6)
-    np.testing.assert_allclose(seen[:, 71:], env.gait.observe(), atol=1e-6)
+    np.testing.assert_allclose(seen[:, 71:], env.gait.observe(env.course), atol=1e-6)
     assert sum(group.width for group in OBSERVATION_GROUPS) == 82
+
+
+def test_directions_turn_with_the_course():
+    """As if the walkers had been turned instead: a course to the left lets everything point to the right."""
+    env = make_env(num_envs=4)
+    roll(env, actions(env, 40))
+    before = env._observe(env.simulation.kinematics(), np.arange(4))
+    env.steer(np.pi / 2)
+    after = env._observe(env.simulation.kinematics(), np.arange(4))
+    for start in (77, 79):  # of the step and of the stride
+        assert np.abs(before[:, start : start + 2]).max() > 0.1
+        np.testing.assert_allclose(after[:, start], before[:, start + 1], atol=1e-6)
+        np.testing.assert_allclose(after[:, start + 1], -before[:, start], atol=1e-6)
 
 
 def test_joints_and_motors_have_the_names_of_the_model():

@@ -102,10 +102,10 @@ def test_time_out_is_flagged_in_every_step_beyond_step_max():
     tracker = make_tracker(step_max=3 * CONTROL_STEP)
     flags = [bool(advance(tracker, 0.0, 0.0, DOWN, DOWN).timed_out[0]) for _ in range(5)]
     assert flags == [False, False, False, True, True]
-    assert tracker.observe()[0, -1] == pytest.approx(5 / 3)
+    assert tracker.observe(AHEAD)[0, -1] == pytest.approx(5 / 3)
     for _ in range(5):
         advance(tracker, 0.0, 0.0, DOWN, DOWN)
-    assert tracker.observe()[0, -1] == 2.0  # clipped
+    assert tracker.observe(AHEAD)[0, -1] == 2.0  # clipped
 
 
 @pytest.mark.parametrize("expected", [0, 1])
@@ -115,8 +115,8 @@ def test_an_episode_starts_with_the_foot_to_strike_relative_to_the_other(expecte
     tracker.reset(np.array([0, 1]), np.full(2, expected), feet, np.zeros((2, 2)), feet)
     right_from_left = np.array([[0.5, -0.25], [0.5, -0.4]])
     wanted = right_from_left if expected == 0 else -right_from_left
-    np.testing.assert_allclose(tracker.observe()[:, 6:8], wanted)
-    np.testing.assert_allclose(tracker.observe()[:, 8:10], wanted)
+    np.testing.assert_allclose(tracker.observe(np.zeros(2))[:, 6:8], wanted)
+    np.testing.assert_allclose(tracker.observe(np.zeros(2))[:, 8:10], wanted)
 
 
 def test_reset_touches_only_the_given_rows():
