@@ -83,6 +83,7 @@ def rival_env(num_envs: int = AGENTS * 21, **options: Any) -> RacingEnv:
         "controlled": AGENTS if num_envs % AGENTS == 0 and options.get("cars", CARS) >= AGENTS else 1,
         "driver": Rivals(driver, (space.low, space.high), slowest=0.8 / RIVALS_GRIP),
         "car": CAR["aggressiveness"],
+        "opponents": True,
         "scenarios": race_scenarios(CARS),
     }
     return RacingEnv(num_envs, **{**defaults, **options, "track": tracks})

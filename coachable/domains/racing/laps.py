@@ -31,7 +31,7 @@ def cut_laps(distance: np.ndarray, off: np.ndarray, length: float) -> tuple[np.n
 
     Args:
         distance: Distance covered at each step (T,) [m].
-        off: Whether three wheels are off the track at each step (T,).
+        off: Whether three wheels are off the track at any time of each step (T,).
         length: Length of the circuit [m].
 
     Returns:
@@ -77,7 +77,7 @@ def drive_circuits(domain: Domain, agent: LoadedPolicy, settings: EvaluationSett
         agent.space,
         agent.space.default.repeat(count, 1),
         f"{len(tracks)} circuits",
-        measures=TelemetryMeasures("distance", "off"),
+        measures=TelemetryMeasures("distance", "off", "off_time"),
         track=tracks,  # row i is on circuit i modulo their number
         cars=1,
         controlled=1,
@@ -87,13 +87,13 @@ def drive_circuits(domain: Domain, agent: LoadedPolicy, settings: EvaluationSett
         episode_steps=steps + 1,
         **{**settings.rollout, "steps": steps},
     )
-    distance, off = (record.measures[name].double().numpy() for name in ("distance", "off"))
+    distance, off, off_time = (record.measures[name].double().numpy() for name in ("distance", "off", "off_time"))
     alive = record.alive.numpy()
     trained, car = training_tracks(family, trained_in), load_car(typical_car(family, trained_in))
     rows = []
     for index, track in enumerate(tracks):
         own = range(index, count, len(tracks))
-        driven = [(distance[:, i][alive[:, i]], off[:, i][alive[:, i]]) for i in own]
+        driven = [(distance[:, i][alive[:, i]], off_time[:, i][alive[:, i]] > 0.0) for i in own]
         times, clean, _ = zip(*(cut_laps(*drive, track.length) for drive in driven), strict=True)
         [bound] = LapProgramme(track, car, Resources(), fuel=load).laps("fuel", [0.0])
         flying = np.array([*np.concatenate([lap[1:] for lap in times]), np.nan])
@@ -111,7 +111,7 @@ def drive_circuits(domain: Domain, agent: LoadedPolicy, settings: EvaluationSett
                 "over": mean / bound.time - 1.0,
                 "over_low": low,
                 "over_high": high,
-                "off": float(np.concatenate([flags for _, flags in driven]).mean()),
+                "off": float(np.concatenate([off[:, i][alive[:, i]] for i in own]).mean()),
                 "retired": float(1.0 - record.survived.double().numpy()[list(own)].mean()),
             }
         )

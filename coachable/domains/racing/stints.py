@@ -163,7 +163,7 @@ def _drive(
         space,
         theta,
         f"{label}: {count} stints",
-        measures=TelemetryMeasures("distance", "fuel", "wear", "off"),
+        measures=TelemetryMeasures("distance", "fuel", "wear", "off_time"),
         scenarios=SOLO,
         episode_steps=options["steps"] + 1,
         **options,
@@ -177,7 +177,7 @@ def _drive(
 def _stint(measured: Mapping[str, np.ndarray], alive: np.ndarray, row: int, length: float, resource: str) -> Stint:
     """Return the stint of one row from the measures (T, N) of all cars."""
     driven = {name: values[:, row][alive[:, row]] for name, values in measured.items()}
-    distance, off = driven["distance"], driven["off"]
+    distance, off = driven["distance"], driven["off_time"] > 0.0
     left = driven["fuel" if resource == "fuel" else "wear"]
     running = left > 0.0 if resource == "fuel" else left < 1.0  # later steps use nothing
     distance, off, left = distance[running], off[running], left[running]

@@ -83,7 +83,7 @@ class RacingEnv(EnvBase):
         seed: Seed of the starts; each race, up to `copies`, has a random stream of its own.
         num_threads: Ignored; torch's own threads are used.
 
-    Keys written: `observation` (N, D), `task_reward` (N, 1), `style_features` (N, 10 + 3 (A - 1)), `telemetry` (N, 14),
+    Keys written: `observation` (N, D), `task_reward` (N, 1), `style_features` (N, 10 + 3 (A - 1)), `telemetry` (N, 15),
     `scenario` (N, 1) int64, `done`, `terminated`, `truncated` (N, 1).
 
     Raises:

@@ -24,6 +24,7 @@ from coachable.envs.racing.circuit.track import Track
 from coachable.envs.racing.physics.cars import load_car
 from coachable.envs.racing.physics.state import ROW
 from coachable.envs.racing.race.driver import LineFollower
+from coachable.envs.racing.race.referee import TELEMETRY
 from coachable.evaluation.evaluation_settings import EvaluationSettings
 from coachable.evaluation.statistics import wilson_interval
 from coachable.training.weights import LoadedPolicy
@@ -67,7 +68,7 @@ def test_laps_of_a_stint_are_cut_at_the_line():
     off = np.zeros((100, 1))
     off[30] = 1.0
     fuel = 100.0 - 0.1 * np.arange(1, 101)[:, None]
-    measured = {"distance": distance, "off": off, "fuel": fuel, "wear": np.zeros((100, 1))}
+    measured = {"distance": distance, "off_time": off, "fuel": fuel, "wear": np.zeros((100, 1))}
     stint = _stint(measured, np.ones((100, 1), dtype=bool), 0, 75.0, "fuel")
     np.testing.assert_allclose(stint.laps, 2.5)
     assert stint.clean.tolist() == [True, False, True, True]
@@ -77,7 +78,7 @@ def test_laps_of_a_stint_are_cut_at_the_line():
 
 
 def test_an_empty_tank_ends_the_stint():
-    measured = {"distance": np.full((50, 1), 40.0), "off": np.zeros((50, 1)), "wear": np.zeros((50, 1))}
+    measured = {"distance": np.full((50, 1), 40.0), "off_time": np.zeros((50, 1)), "wear": np.zeros((50, 1))}
     measured["distance"][:20, 0] = 2.0 * np.arange(1, 21)
     measured["fuel"] = np.maximum(19.0 - np.arange(50.0), 0.0)[:, None]
     stint = _stint(measured, np.ones((50, 1), dtype=bool), 0, 1000.0, "fuel")
@@ -214,6 +215,26 @@ def test_a_driver_who_never_drifts(tmp_path, one_circuit):
     assert all(float(row["turns"]) == 0.0 for row in rows)
     assert sum(float(row["turned_per_km"]) == float(row["backwards"]) == 0.0 for row in rows) >= 14
     assert (tmp_path / "drift.png").stat().st_size > 10_000
+
+
+def test_a_lap_with_a_short_excursion_is_not_clean(one_circuit):
+    domain, agent = scripted("drift", "street")
+
+    def make_env(**options):
+        env = domain.make_env(**options)
+        judge = env._judge
+
+        def judge_once(*args):
+            verdict = judge(*args)
+            verdict.telemetry[0, TELEMETRY.index("off_time")] = 0.02 * (env._steps[0] == 3)  # of 0.1 s: no "off"
+            return verdict
+
+        env._judge = judge_once
+        return env
+
+    seen = replace(domain, make_env=make_env)
+    [row] = drive_circuits(seen, agent, EvaluationSettings(episodes=2, steps=900, progress=False))
+    assert row["laps"] >= 4 and row["clean_laps"] == 1.0 - 1.0 / row["laps"] and row["off"] == 0.0
 
 
 def test_laps_on_shipped_held_out_and_own_circuits(tmp_path, monkeypatch):

@@ -178,7 +178,7 @@ def test_off_course_costs_the_squared_speed():
     after = env.step(start.set("action", torch.zeros(1, 2)))["next"]
     kmh = 3.6 * after["telemetry"][0, T["speed"]]
     slip = -after["task_reward"].item() - 0.01 * 0.1 * kmh.item() ** 2
-    assert after["telemetry"][0, T["off"]] == 1
+    assert after["telemetry"][0, T["off"]] == 1 and after["telemetry"][0, T["off_time"]] == pytest.approx(0.1)
     assert -1e-3 < slip < 0.05
 
 

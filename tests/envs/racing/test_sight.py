@@ -223,6 +223,7 @@ def test_the_engine_turns_with_the_driven_wheels():
         torch.tensor([1.0, 0.5, 1.0, 1.0]),
     )
     packed[SPINS] = torch.tensor([[40.0], [50.0], [60.0], [70.0]]) * factor
+    packed[ROW["fuel"]] = 1.0
     run = Run(*torch.ones(25, 4, dtype=F64).unbind(0))
     columns = own_car(car, wheels, packed, run, tyre_view(car, wheels, packed, torch.ones(4, dtype=F64)), 1000.0)
     rpm, gear, torque = columns[own_columns("powertrain")]
@@ -231,6 +232,9 @@ def test_the_engine_turns_with_the_driven_wheels():
     torch.testing.assert_close(gear * 8.0, packed[ROW["gear"]])
     expected = torch.tensor([car.torque, 0.5 * car.torque, car.power / omega[2], 0.0], dtype=F64)
     torch.testing.assert_close(torque * car.torque, expected)
+    packed[ROW["fuel"]] = 0.0
+    columns = own_car(car, wheels, packed, run, tyre_view(car, wheels, packed, torch.ones(4, dtype=F64)), 1000.0)
+    assert not columns[own_columns("powertrain")][2].any()
     assert rpm[2] < 1.0 < rpm[3] and expected[2] < car.torque < car.power / omega[1]
 
 

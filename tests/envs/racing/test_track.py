@@ -63,6 +63,12 @@ def circle_lines(n=60, radius=100.0, width=5.0):
     return [f"{radius * math.cos(a)}, {radius * math.sin(a)}, {width}, {width}" for a in angles]
 
 
+def rounded(n):
+    """A circle in decimetres, whose points are two thirds of a metre apart."""
+    points = [[float(value) for value in line.split(",")] for line in circle_lines(n)]
+    return [f"{x:.1f}, {y:.1f}, {right}, {left}" for x, y, right, left in points]
+
+
 def test_a_track_from_a_file(tmp_path):
     track = Track.from_csv(circle_file(tmp_path / "circle.csv", ["# x_m,y_m,w_right,w_left", *circle_lines()]))
     assert track.name == "circle"
@@ -92,13 +98,30 @@ def test_a_first_point_that_is_repeated_changes_nothing():
         (lambda lines: [*lines[:5], "1, 2, 3", *lines[5:]], r"line 6.*expected x, y"),
         (lambda lines: circle_lines(width=0.8), r"0\.80 m wide.*at least 3"),
         (lambda lines: lines[:4], "4 points"),
-        (lambda lines: [line.replace(",", ";") for line in lines], "has 0 points: .* separated by commas"),
+        (lambda lines: [line.replace(",", ";") for line in lines], r"line 1.*separated by commas"),
         (lambda lines: [*lines[:5], lines[4], *lines[5:]], "points 5 and 6 are the same"),
         (lambda lines: circle_lines(radius=9000.0), "is 56[0-9]{3} m long: expected 100 to 30000 m"),
         (lambda lines: [*lines[:5], "1e300, 1, 5, 5", *lines[5:]], r"line 6.*expected x, y"),
         (lambda lines: [*lines[:5], "1, \0, 5, 5", *lines[5:]], r"line 6.*expected x, y"),
+        (lambda lines: ["100.0, oops, 5, 5", *lines], r"line 1.*expected x, y"),
+        (lambda lines: [f"5.2e6, {line.split(',', 1)[1]}" for line in lines], r"below 1e\+06; of larger coordinates"),
+        (lambda lines: rounded(1000), r"is 6.0 m from the centre line, which has a radius of 1.4 m there"),
     ],
-    ids=["open", "nan", "columns", "narrow", "short", "semicolons", "twice", "long", "far", "nul"],
+    ids=[
+        "open",
+        "nan",
+        "columns",
+        "narrow",
+        "short",
+        "semicolons",
+        "twice",
+        "long",
+        "far",
+        "nul",
+        "first",
+        "utm",
+        "kinks",
+    ],
 )
 def test_bad_files_are_refused(tmp_path, change, message):
     path = circle_file(tmp_path / "bad.csv", change(circle_lines()))
@@ -155,6 +178,9 @@ def test_quasi_steady_state_laps(car, expected):
     track = load_track("lakeside")
     line = minimum_curvature_line(track)
     assert (np.abs(line) <= 6.0 - 1.2 + 1e-9).all()
+    points = track.table[:, :2].numpy() + line[:, None] * np.stack([-track.table[:, 3], track.table[:, 2]], axis=1)
+    bend = points - 0.5 * (np.roll(points, 1, axis=0) + np.roll(points, -1, axis=0))
+    assert (bend**2).sum() < 1.0005 * 2.25763  # with ten times the iterations
     times = []
     for offsets in (None, line):
         curvature, spacing = line_geometry(track, offsets)

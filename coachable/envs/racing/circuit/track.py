@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,11 +75,14 @@ class Track:
             try:
                 values = [float(value) for value in line.split(",")[:4]]
             except ValueError:
-                if not rows:  # a header
+                if not rows and not re.search(r"(^|,)\s*[-+.\d]", line):  # a header
                     continue
                 values = []
             if len(values) != 4 or not all(abs(v) < _FAR for v in values):
-                raise ValueError(f"{path}, line {number}: got {line[:80]!r}, expected x, y, w_right, w_left in metres")
+                raise ValueError(
+                    f"{path}, line {number}: got {line[:80]!r}, expected x, y, w_right, w_left in metres, separated by "
+                    f"commas, each below {_FAR:g}; of larger coordinates subtract those of one point"
+                )
             rows.append(values)
         if len(rows) < 8:
             raise ValueError(
@@ -270,10 +274,12 @@ def _check(track: Track) -> None:
     if narrow < WIDTH_MIN:
         raise ValueError(f"track {name!r} is {narrow:.2f} m wide on one side: expected at least {WIDTH_MIN} m")
     inner = torch.where(curvature > 0, left, right) + margin
-    tight = float((inner * curvature.abs()).max())
-    if tight > 0.95:
+    node = int((inner * curvature.abs()).argmax())
+    if inner[node] * curvature[node].abs() > 0.95:
         raise ValueError(
-            f"track {name!r}: a wall lies beyond the centre of a turn (ratio {tight:.2f}): reduce width or margin"
+            f"track {name!r}: the inner wall of the turn at x {table[node, 0]:.1f}, y {table[node, 1]:.1f} is "
+            f"{inner[node]:.1f} m from the centre line, which has a radius of {1 / curvature[node].abs():.1f} m there: "
+            "reduce width or margin, or smooth points that are rounded"
         )
     gap = table[0, :2] - (table[-1, :2] + track.spacing * table[-1, 2:4])
     if float(gap.norm()) > track.spacing:

@@ -10,7 +10,7 @@ from torch import Tensor
 from coachable.envs.racing.circuit.profile import Envelope, speed_profiles
 from coachable.envs.racing.circuit.track import Track
 from coachable.envs.racing.physics.cars import Car
-from coachable.envs.racing.physics.dynamics import total_mass
+from coachable.envs.racing.physics.dynamics import AIR_DENSITY, GRAVITY, total_mass
 from coachable.envs.racing.physics.state import CarState
 from coachable.envs.racing.physics.tyres import tangent
 from coachable.envs.racing.race.run import Field, Run, TyreView, look_around, tyre_view
@@ -137,7 +137,10 @@ class LineFollower:
         car = self.car
         node = field.course.node(run.s + _REACTION * speed)
         expected = car.grip + car.grip_per_load * 1e-3 * (tyres.load.mean(0) - car.reference_load)
-        grip = share * (tyres.grip.mean(0) / expected).clamp(max=1.0)  # of cold, worn or hard tyres
+        # The car of the plan may press harder on its tyres than that of the field.
+        planned = GRAVITY + 0.5 * AIR_DENSITY * car.lift_area * speed**2 / total_mass(car, state.fuel)
+        pressed = tyres.load.sum(0) / total_mass(field.car, state.fuel) / planned
+        grip = share * (pressed * tyres.grip.mean(0) / expected).clamp(max=1.0)  # of cold, worn or hard tyres
         wanted = self.speeds[node] * torch.sqrt(grip)
         wanted = torch.where((run.off > 0.5) | (run.along < 0.7), wanted.clamp(max=_LOST_SPEED), wanted)
         if field.cars > 1:

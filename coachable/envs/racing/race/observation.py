@@ -139,7 +139,7 @@ def own_car(
     spins = packed[SPINS]
     mean_speed = share * 0.5 * (spins[0] + spins[1]) + (1.0 - share) * 0.5 * (spins[2] + spins[3])
     rpm = engine_speed(car, gear_ratio(car, s.gear), mean_speed)
-    torque = s.throttle * full_torque(car, rpm * (2.0 * math.pi / 60.0)) * (rpm <= car.rpm_max)
+    torque = s.throttle * full_torque(car, rpm * (2.0 * math.pi / 60.0)) * (rpm <= car.rpm_max) * (s.fuel > 0.0)
     phase = None if length is None else run.s * (2.0 * math.pi / length)
     place = [torch.zeros_like(run.s)] * 2 if phase is None else [phase.sin(), phase.cos()]
     half = 0.5 * (run.left + run.right)

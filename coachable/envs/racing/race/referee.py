@@ -54,6 +54,7 @@ TELEMETRY = (
     "heading",  # relative to the track [rad]
     "curvature",  # of the track [1/m]
     "stranded",  # flag: the car gives up, or waits to be put back
+    "off_time",  # with three wheels off the track in this step [s]; "off" tells whether it is more than half of it
 )
 
 
@@ -65,7 +66,7 @@ class Verdict(NamedTuple):
     observation: Tensor  # (N, D)
     reward: Tensor  # (N,) of the task
     features: Tensor  # (N, F)
-    telemetry: Tensor  # (N, 14)
+    telemetry: Tensor  # (N, 15)
     terminated: Tensor  # (N,) bool
 
 
@@ -310,6 +311,7 @@ class Referee:
                 torch.atan2(run.across, run.along),
                 run.curvature,
                 stranded.to(progress.dtype),
+                s.off_time,
             ],
             dim=-1,
         )
