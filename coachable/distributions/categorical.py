@@ -71,11 +71,12 @@ class HeadLayout:
                 back += range(head * self.width, head * self.width + size)
                 epsilon += [EPSILON / size] * size + [0.0] * padding
                 first += size
-            self._constants[key] = (
-                torch.tensor(into, device=like.device),
-                torch.tensor(back, device=like.device),
-                torch.tensor(epsilon, device=like.device, dtype=like.dtype).view(len(self), self.width),
-            )
+            with torch.inference_mode(False):  # a later training uses them, too
+                self._constants[key] = (
+                    torch.tensor(into, device=like.device),
+                    torch.tensor(back, device=like.device),
+                    torch.tensor(epsilon, device=like.device, dtype=like.dtype).view(len(self), self.width),
+                )
         return self._constants[key]
 
     def pad(self, values: Tensor) -> Tensor:

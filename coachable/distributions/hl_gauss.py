@@ -61,10 +61,11 @@ class HLGauss:
         # Computed in float64 and rounded once; cached to save kernel launches.
         key = (like.device, like.dtype)
         if key not in self._constants:
-            index = torch.arange(self.num_atoms + 1, dtype=torch.float64, device=like.device)
-            edges = self.v_min + self.bin_width * index
-            centres = 0.5 * (edges[1:] + edges[:-1])
-            self._constants[key] = (edges.to(like.dtype), centres.to(like.dtype))
+            with torch.inference_mode(False):  # a later training uses them, too
+                index = torch.arange(self.num_atoms + 1, dtype=torch.float64, device=like.device)
+                edges = self.v_min + self.bin_width * index
+                centres = 0.5 * (edges[1:] + edges[:-1])
+                self._constants[key] = (edges.to(like.dtype), centres.to(like.dtype))
         return self._constants[key]
 
     def edges(self, like: Tensor) -> Tensor:

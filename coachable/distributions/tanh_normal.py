@@ -8,7 +8,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-from torch.distributions import Distribution, Normal
+from torch.distributions import Distribution, Independent, Normal, TanhTransform, Transform
 from torchrl.modules import TanhNormal
 
 from coachable.distributions.tanh_gaussian import at_least_float32, sample_tanh_gaussian, tanh_gaussian_log_prob
@@ -70,6 +70,16 @@ class TanhGaussian(TanhNormal):
     def deterministic_sample(self) -> Tensor:
         """Median `tanh(loc)`, `(..., A)`."""
         return torch.tanh(self.loc)
+
+    @property
+    def base_dist(self) -> Independent:
+        """Distribution of u, whose last dimension is one event."""
+        return Independent(self.root_dist, 1)
+
+    @property
+    def transforms(self) -> list[Transform]:
+        """The function from u to the action."""
+        return [TanhTransform(cache_size=1)]
 
     @property
     def root_dist(self) -> Normal:

@@ -186,7 +186,7 @@ class ActorCriticLoss(SACLoss):
     @property
     def out_keys(self) -> list[str]:
         """Keys of the result of `forward`."""
-        return ["loss_actor", "loss_qvalue", "alpha", "entropy"]
+        return list(self._out_keys or ["loss_actor", "loss_qvalue", "alpha", "entropy"])
 
     @out_keys.setter
     def out_keys(self, values: list[str]) -> None:
@@ -211,7 +211,7 @@ class ActorCriticLoss(SACLoss):
                 f"{value_type}, {sorted(hyperparams)}; for n-step targets store n-step rewards with steps_to_next_obs"
             )
         if "gamma" in hyperparams:
-            SHARE.check("gamma", hyperparams["gamma"])
+            SHARE.check("gamma", float(hyperparams["gamma"]))
         super().make_value_estimator(ValueEstimators.TD0, **hyperparams)
         if "gamma" in hyperparams:
             exact = torch.as_tensor(hyperparams["gamma"], dtype=torch.float64)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -118,6 +118,15 @@ class EventTableBuffer(TensorDictReplayBuffer):
             writer=TableWriter(regions, route, events, horizon, n_step, num_envs),
             **kwargs,
         )
+
+    def share(self, shared: bool = True) -> Self:
+        """Refuse to be shared with the workers of a collector, which would write to copies."""
+        if shared:
+            raise RuntimeError(
+                "EventTableBuffer cannot be written by other processes: leave out replay_buffer= of the collector, and "
+                "extend the buffer with what the collector yields"
+            )
+        return super().share(shared)
 
     @classmethod
     def for_events(

@@ -3,7 +3,7 @@
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, is_non_tensor
 from torch import Tensor
 from torchrl.data import LazyTensorStorage
 
@@ -31,6 +31,8 @@ class RowStorage(LazyTensorStorage):
     def _has_rows(self, indices: Any) -> bool:
         """Return whether `indices` are numbers of records in one dimension, none of them negative."""
         if not isinstance(self._storage, TensorDictBase) or not isinstance(indices, Tensor):
+            return False
+        if any(map(is_non_tensor, self._storage.values(True))):  # which `apply` leaves out
             return False
         if indices.dtype != torch.long or indices.ndim != 1 or not indices.numel():
             return False

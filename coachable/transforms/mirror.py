@@ -130,6 +130,12 @@ class MirrorSymmetry(Transform):
             result.set(key, torch.where(chosen.to(value.device), image, value))
         return result
 
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        raise RuntimeError(
+            "MirrorSymmetry mirrors replay samples: give it to a replay buffer (transform= or append_transform), "
+            "not to an environment"
+        )
+
     def get_extra_state(self) -> Tensor:
         """Return the state of the generator, `(bytes,)` uint8, for `state_dict`."""
         return self.generator.get_state()

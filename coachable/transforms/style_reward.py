@@ -77,7 +77,12 @@ class StyleRewardTransform(Transform):
                 f"the specs of the environment declare {STYLE_FEATURES} with the entries {_listed(features.keys())}: "
                 "expected one tensor (..., F); concatenate them (torchrl.envs.CatTensors)."
             )
-        return super().transform_output_spec(output_spec)
+        out = super().transform_output_spec(output_spec)
+        reward = out["full_reward_spec"]["reward"]
+        # Style rewards are float32.
+        dtype = torch.promote_types(declared[TASK_REWARD].dtype, torch.float32)
+        out["full_reward_spec"]["reward"] = reward.to(dtype)
+        return out
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the style reward if the task reward is declared as an observation."""

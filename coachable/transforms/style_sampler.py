@@ -94,8 +94,14 @@ class StyleSampler(Transform):
         return given.to(torch.float32, copy=True)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        style = tensordict.get(STYLE, None)
+        if style is None:
+            raise KeyError(
+                f"step got no {STYLE!r}: call reset first, and keep the key in the tensordict (CatTensors removes what "
+                "it joins unless del_keys=False)"
+            )
         # A copy, so that changing the next style in place does not change this transition's.
-        return next_tensordict.set(STYLE, tensordict.get(STYLE).clone())
+        return next_tensordict.set(STYLE, style.clone())
 
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase

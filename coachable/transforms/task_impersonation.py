@@ -22,8 +22,9 @@ class TaskImpersonation(Transform):
     weighted or written back (paper). Other entries are expanded without a copy, so do not write to them in place. With
     n = 0 the sample is returned unchanged, and no random number is drawn.
 
-    TorchRL expands `index`, `table` and `priority_weight` of a sample over the columns. A priority update uses the
-    largest priority of a transition's columns (`EventTableBuffer`, or the default reduction of TorchRL's buffers).
+    TorchRL expands `index`, `table` and `priority_weight` of a sample over the columns if it has one dimension: not
+    with `SliceSampler` or storages of several dimensions. A priority update uses the largest priority of a transition's
+    columns (`EventTableBuffer`, or the default reduction of TorchRL's buffers).
 
     Transitions of several steps can be relabelled only if the style reward is linear in the features; others raise. The
     buffer must then sum the features as well (`discounted_keys` of `EventTableBuffer`).
@@ -67,6 +68,7 @@ class TaskImpersonation(Transform):
                     f"{self.space.dim} ({', '.join(self.space.names)})"
                 )
         self.generator = torch.Generator().manual_seed(seed)
+        self._checked = False
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Relabel a sample.
@@ -79,13 +81,16 @@ class TaskImpersonation(Transform):
 
         Raises:
             KeyError: If an entry is missing.
-            ValueError: If the stored style has another size than the space, or transitions sum several steps and the
-                style reward is not linear in the features.
+            ValueError: If the stored style has another size than the space, transitions sum several steps and the style
+                reward is not linear in the features, or stored rewards are not the sum of task and style reward.
         """
         if not self.n:
             return tensordict
         self._refuse_sums(tensordict)
         stored, features, task_reward, reward = self._entries(tensordict)
+        if not self._checked and reward.numel():
+            self._checked = True
+            self._check_reward(task_reward + self.style_reward(features, stored), reward)
         shape = tensordict.batch_size
         # Batches of one, because `Shared` gives several rows of a batch the same style.
         drawn = self.space.sampler.sample((*shape, self.n, 1), self.generator, stored.device).squeeze(-2)
@@ -101,10 +106,7 @@ class TaskImpersonation(Transform):
         style_reward = self.style_reward(features.unsqueeze(dim).expand(*shape, self.n, -1), drawn)
 
         columns = self.n + 1
-        out = tensordict.apply(
-            lambda x: x.unsqueeze(dim).expand(*shape, columns, *x.shape[dim:]), batch_size=[*shape, columns]
-        )
-        assert out is not None  # only an in-place apply returns nothing
+        out = tensordict.unsqueeze(dim).expand(*shape, columns)
         out.set(STYLE, torch.cat([stored.unsqueeze(dim), drawn], dim))
         following = tensordict.get(("next", STYLE), None)
         following = stored if following is None else following
@@ -148,6 +150,16 @@ class TaskImpersonation(Transform):
                 f"({', '.join(self.space.names)}). Give TaskImpersonation the space that the data was collected with."
             )
         return stored, features, task_reward, reward
+
+    def _check_reward(self, expected: Tensor, reward: Tensor) -> None:
+        """Refuse rewards that something else has changed, since new labels would have rewards of another scale."""
+        if not torch.allclose(expected, reward.to(expected.dtype), rtol=1e-3, atol=1e-3):
+            worst = int((expected - reward).abs().argmax())
+            raise ValueError(
+                f"a stored reward is {reward.flatten()[worst]:g}, but task_reward + style_reward is "
+                f"{expected.flatten()[worst]:g}. TaskImpersonation needs the environment's style reward, and no "
+                "transform after StyleRewardTransform that changes rewards, such as RewardScaling or VecNorm"
+            )
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         raise RuntimeError(

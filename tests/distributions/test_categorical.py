@@ -250,3 +250,12 @@ def test_layout_copies() -> None:
     assert copy.deepcopy(GAMEPAD) == pickle.loads(pickle.dumps(GAMEPAD)) == GAMEPAD
     assert hash(GAMEPAD) == hash(HeadLayout([4, 6, 3, 3, 2, 2]))
     assert len(GAMEPAD) == 6 and EPSILON == 1e-8
+
+
+def test_constants_first_used_in_inference_mode_still_differentiate():
+    layout = HeadLayout((2, 3))
+    with torch.inference_mode():
+        layout.constants(torch.zeros(1))
+    values = torch.zeros(4, 2, 3, requires_grad=True)
+    (values * layout.constants(values)[2]).sum().backward()
+    assert values.grad is not None

@@ -168,3 +168,12 @@ def test_bad_initial_value() -> None:
 def test_copies() -> None:
     PAPER.centres(torch.zeros(1))
     assert repr(copy.deepcopy(PAPER)) == repr(PAPER)
+
+
+def test_constants_first_used_in_inference_mode_still_differentiate():
+    gauss = HLGauss(-1.0, 1.0, 8)
+    with torch.inference_mode():
+        gauss.centres(torch.zeros(1))
+    logits = torch.zeros(3, 8, requires_grad=True)
+    (logits.softmax(-1) * gauss.centres(logits)).sum().backward()
+    assert logits.grad is not None and logits.grad.isfinite().all()

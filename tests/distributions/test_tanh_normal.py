@@ -1,5 +1,6 @@
 import pytest
 import torch
+from torch.distributions import kl_divergence
 from torchrl.modules import TanhNormal
 
 from coachable.distributions.tanh_gaussian import sample_tanh_gaussian
@@ -70,3 +71,9 @@ def test_samples_stay_in_the_box_and_sampling_needs_no_gradient():
     assert not sample.requires_grad
     assert sample.abs().max() <= 1
     assert TanhGaussian(loc, scale).rsample().requires_grad
+
+
+def test_divergences_are_those_of_torchrls_distribution():
+    first, second = parameters(5, 4), [p.detach() + 0.1 for p in parameters(5, 4)]
+    ours = kl_divergence(TanhGaussian(*first), TanhGaussian(*second))
+    torch.testing.assert_close(ours, kl_divergence(TanhNormal(*first), TanhNormal(*second)))

@@ -308,3 +308,12 @@ def test_bfloat16_autocast(case: Case, heads: Any) -> None:
     torch.testing.assert_close(out["loss_qvalue"], exact["loss_qvalue"], rtol=0.1, atol=0.1)
     (out["loss_actor"] + out["loss_qvalue"]).backward()
     assert all(g.isfinite().all() for g in gradients(loss, ""))
+
+
+@OWN
+def test_outputs_are_selected(case):
+    loss, batch = constant_loss(case), make_batch(AXES, (6,), F64)
+    loss.select_out_keys("loss_actor", "loss_qvalue")
+    assert set(loss(batch).keys()) == {"loss_actor", "loss_qvalue"}
+    loss.reset_out_keys()
+    assert {"alpha", "entropy"} < set(loss(batch).keys())

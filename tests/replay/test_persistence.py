@@ -37,7 +37,8 @@ def make(n_steps: int = 1, prioritized: bool = False, relabel: bool = False, **k
 def batch(seed: int, time: int = 5) -> TensorDict:
     g = torch.Generator().manual_seed(seed)
     n = 3 * time
-    style, task, features = torch.rand(n, 1, generator=g), torch.rand(n, 1, generator=g), torch.rand(n, 1, generator=g)
+    style = torch.tensor([0.2, 0.5, 0.8]).repeat(time).unsqueeze(-1)  # of each environment
+    task, features = torch.rand(n, 1, generator=g), torch.rand(n, 1, generator=g)
     terminated = torch.rand(n, 1, generator=g) < 0.05
     return TensorDict(
         {

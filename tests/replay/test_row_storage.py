@@ -1,6 +1,6 @@
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import NonTensorStack, TensorDict
 from torchrl.data import LazyTensorStorage
 
 from coachable.replay.row_storage import RowStorage
@@ -40,3 +40,11 @@ def test_rows_that_were_never_written_are_refused(storages):
     for storage in storages:
         with pytest.raises(IndexError):
             storage.get(torch.tensor([6]))
+
+
+def test_entries_that_are_no_tensors_are_read():
+    names = [f"row {i}" for i in range(6)]
+    storage = RowStorage(6)
+    storage.set(torch.arange(6), TensorDict({"x": torch.arange(6), "name": NonTensorStack(*names)}, [6]))
+    found = storage.get(torch.tensor([4, 1]))
+    assert found["x"].tolist() == [4, 1] and list(found["name"]) == ["row 4", "row 1"]

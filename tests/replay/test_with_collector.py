@@ -2,6 +2,7 @@
 
 import warnings
 
+import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Binary, Composite, Unbounded
@@ -115,3 +116,11 @@ def test_a_collector_that_fills_the_buffer_itself():
         pass
     assert buffer.write_count == 180
     check(buffer)
+
+
+def test_workers_of_a_collector_cannot_fill_it():
+    with pytest.raises(RuntimeError, match="cannot be written by other processes: leave out replay_buffer="):
+        make_buffer().share()
+    buffer = make_buffer()
+    buffer.share(False)
+    assert not buffer.shared

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs import TransformedEnv
 
 from coachable.transforms.mirror import MirrorMap, MirrorSymmetry
 
@@ -65,3 +66,9 @@ def test_the_state_continues():
     other = MirrorSymmetry({"action": SWAP})
     other.load_state_dict(first.state_dict())
     assert torch.equal(other(data)["action"], first(data)["action"])
+
+
+def test_in_an_environment_it_is_refused(make_base_env):
+    env = TransformedEnv(make_base_env(), MirrorSymmetry({"action": MirrorMap((0,), (-1.0,))}))
+    with pytest.raises(RuntimeError, match="give it to a replay buffer"):
+        env.reset()

@@ -90,6 +90,13 @@ def test_collected_batches(make_env, space, make_style_reward):
     collector.shutdown()
 
 
+def test_rewards_of_an_environment_in_float64_have_the_declared_dtype(make_base_env, space, make_style_reward):
+    base = make_base_env()
+    base.reward_spec = base.reward_spec.to(torch.float64)  # the task reward is float32
+    env = coachable_env(base, space, make_style_reward(space), seed=0)
+    assert env.reward_spec.dtype == env.rollout(3)["next", "reward"].dtype == torch.float32
+
+
 def test_inside_serial_env(make_env, space, make_style_reward):
     env = SerialEnv(2, make_env)
     check_env_specs(env)

@@ -6,7 +6,7 @@ from typing import get_args
 
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import NonTensorStack, TensorDict
 from torchrl.data import LazyTensorStorage, MultiStep, TensorDictReplayBuffer
 from torchrl.envs import MultiStepTransform
 
@@ -113,7 +113,7 @@ def test_styles_come_from_the_training_distribution():
     space = StyleSpace([Weight("a", 0.0, 1.0)], sampler=Uniform([0.2], [0.4]))
     reward = StyleReward(space, {"a": WeightedFeature("a", 0)})
     one = torch.ones(4000, 1)
-    td = TensorDict({"style": one, "next": {"reward": one, "task_reward": one, "style_features": one}}, [4000])
+    td = TensorDict({"style": one, "next": {"reward": 2 * one, "task_reward": one, "style_features": one}}, [4000])
     style = TaskImpersonation(reward, n=2)(td)["style"][:, 1:]
     assert style.min() >= 0.2 and style.max() <= 0.4
     assert abs(style.mean().item() - 0.3) < 5 * (0.2 / 12**0.5) / 8000**0.5
@@ -146,7 +146,7 @@ def test_labels_are_independent_over_transitions_and_copies(space, sampler):
     size = 300
     one = torch.ones(size, 1)
     td = TensorDict(
-        {"style": space.sample((size,)), "next": {"reward": one, "task_reward": one, "style_features": one}}, [size]
+        {"style": space.sample((size,)), "next": {"reward": 2 * one, "task_reward": one, "style_features": one}}, [size]
     )
     draws = sampler.sample((20_000, 1), torch.Generator().manual_seed(1)).squeeze(-2)
     alike = (draws[::2] == draws[1::2]).all(-1).double().mean().item()
@@ -231,7 +231,8 @@ def test_sums_are_relabelled_where_the_style_reward_is_linear():
     space = StyleSpace([Weight("a", 0.0, 1.0)])
     reward = StyleReward(space, {"a": WeightedFeature("a", 0)})
     td = steps(60)
-    td["style"] = td["style"][:, :1].abs()
+    td["style"] = torch.full((60, 1), 0.7)
+    td["next", "reward"] = td["next", "task_reward"] + 0.7 * td["next", "style_features"][:, :1]
     relabel = TaskImpersonation(reward, n=2)
     features = [("next", "style_features")]
     buffer = EventTableBuffer({"default": 100}, n_steps=3, gamma=0.9, num_envs=1, discounted_keys=features)
@@ -239,12 +240,27 @@ def test_sums_are_relabelled_where_the_style_reward_is_linear():
     buffer.extend(td)
     sample = buffer.sample(8)
     expected = sample["next", "task_reward"] + sample["style"] * sample["next", "style_features"][..., :1]
-    torch.testing.assert_close(sample["next", "reward"][:, 1:], expected[:, 1:])
+    torch.testing.assert_close(sample["next", "reward"], expected)
 
 
 def test_single_steps_of_a_buffer_that_counts_them_are_relabelled():
     td = transitions(16).set("steps_to_next_obs", torch.ones(16, 1, dtype=torch.long))
     assert TaskImpersonation(REWARD, n=2)(td).shape == (16, 3)
+
+
+def test_rewards_that_something_has_changed_are_refused():
+    changed = transitions(16)
+    changed["next", "reward"] = 0.1 * changed["next", "reward"]
+    for data in (changed, transitions(16).set("style", SPACE.sample((16,)))):
+        with pytest.raises(ValueError, match=r"but task_reward \+ style_reward is .* no transform after StyleReward"):
+            TaskImpersonation(REWARD, n=2)(data)
+
+
+def test_entries_that_are_no_tensors_are_kept():
+    names = [f"row {i}" for i in range(16)]
+    data = transitions(16).set("name", NonTensorStack(*names))
+    found = TaskImpersonation(REWARD, n=2)(data)
+    assert [row["name"] for row in found[:, 2].unbind(0)] == names
 
 
 def test_n_zero_changes_nothing():
