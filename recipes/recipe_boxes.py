@@ -69,6 +69,8 @@ def start_run(config: dict[str, Any]) -> Run:
     settings = typed_settings(config)
     if settings.replay.get("events", {}) is None:
         raise ValueError(f"replay=event_tables: {settings.domain} names no events; expected replay=uniform")
+    if settings.init_new_observations and not (settings.init_from or settings.resume):
+        raise ValueError(f"init_new_observations={settings.init_new_observations}: expected init_from=PATH beside it")
     threads = share_threads(settings.threads.simulator, settings.threads.learner)
     # Rounding depends on the learner's number of threads, so that a resumed training has to use the same number.
     settings.threads.learner = threads.learner
@@ -266,6 +268,7 @@ def open_run_dir(run: Run, env: EnvBase, replay: ReplayBuffer) -> None:
         check_unused(run_dir)
     check_writable(run_dir)
     claim_folder(run_dir)
+    check_writable(run_dir / "checkpoints")
     if settings.checkpoint.replay:  # two at a time: the old one is removed when the new one is complete
         size = replay_bytes(replay, env, stored_keys(run, env, replay))
         kept = sum(file.stat().st_size for file in run_dir.glob("checkpoints/*/replay/*"))

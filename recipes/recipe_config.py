@@ -21,6 +21,7 @@ from hydra.errors import HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from recipe_checks import check_added, check_domain, checked_values, mistake_in, typed_settings
+from recipe_overrides import PATHS, quoted_paths, removed_keys, said_keys
 from recipe_saved import CONFIGS, check_saved_config
 from recipe_stages import composed_stages
 from recipe_target import choices
@@ -63,7 +64,6 @@ _FIXED = (
     "family",
 )
 
-_PATHS = ("run_dir", "resume", "init_from")
 
 register_schema()
 
@@ -100,12 +100,12 @@ def run_recipe(config_name: str, build: Callable[[dict[str, Any]], Trainer]) -> 
         try:
             config = plain_config(cfg, overrides, config_name)
             train = start_training(build, config)
-        except (CheckpointError, WorkerError, ValueError, ImportError) as error:
+        except (CheckpointError, WorkerError, ValueError, ImportError, OSError) as error:
             if "HYDRA_FULL_ERROR" in os.environ:
                 raise
             # You can fix these errors without a traceback, including the one that TorchRL appends from a worker.
             message = f"error: {error}".split("\n\nWorker traceback:\n")[0]
-            changed = [key for key in _said(overrides) if key != "resume"]
+            changed = [key for key in said_keys(overrides) if key != "resume"]
             if cfg.resume and changed:  # checkpoint and command line make one configuration
                 message += f"\nGiven beside resume=, which may be the reason: {', '.join(changed)}"
             raise SystemExit(message) from None
@@ -113,6 +113,11 @@ def run_recipe(config_name: str, build: Callable[[dict[str, Any]], Trainer]) -> 
             train.run()
         except (NonFiniteError, CheckpointError, WorkerError) as error:
             raise SystemExit(f"error: {error}") from None
+        last = train.train if isinstance(train, Curriculum) else train
+        if not last.saved:
+            raise SystemExit(
+                f"error: the training ended at env-step {last.frames:,}, which could not be saved, see above"
+            )
 
     try:
         main()
@@ -156,13 +161,13 @@ def checked_arguments(config_name: str, arguments: list[str]) -> list[str]:
     folder = [f"hydra.searchpath=[file://{Path(options.config_dir).absolute()}]"] if options.config_dir else []
     if not options.config_path:
         _composed(options.config_name or config_name, [*given, *folder])
-    flags = [argument for argument in _quoted_paths(arguments) if argument not in options.overrides]
+    flags = [argument for argument in quoted_paths(arguments) if argument not in options.overrides]
     return [*given, *flags]  # Hydra's parser does not accept overrides both before and after its options
 
 
 def _hydra_arguments(config_name: str, arguments: list[str]) -> tuple[Namespace, list[str]]:
     """Return Hydra's options, and the overrides with the preset that was given or that fits this machine."""
-    options = get_args_parser().parse_intermixed_args(_quoted_paths(arguments))
+    options = get_args_parser().parse_intermixed_args(quoted_paths(arguments))
     try:
         overrides = OverridesParser.create().parse_overrides(options.overrides)
     except HydraException as error:
@@ -173,7 +178,7 @@ def _hydra_arguments(config_name: str, arguments: list[str]) -> tuple[Namespace,
             f"error: {sweeps[0]} asks for several trainings: expected coachable train {config_name} seeds=0,1,2 for "
             "several seeds, one command for each other training, and KEY=[VALUE,VALUE] for a list"
         )
-    empty = [o.key_or_group for o in overrides if o.key_or_group in _PATHS and o.value() == ""]
+    empty = [o.key_or_group for o in overrides if o.key_or_group in PATHS and o.value() == ""]
     if empty:  # for instance of a variable of the shell that is not set
         raise SystemExit(f"error: {empty[0]}= is empty: expected {empty[0]}=PATH, or none at all")
     chosen = [o for o in overrides if o.key_or_group == "preset"]
@@ -245,11 +250,11 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
         CheckpointError: If the configuration in a checkpoint names other functions, or is not plain.
         ValueError: If a number lies outside its range.
     """
-    keys = _said(overrides)
+    keys = said_keys(overrides)
     check_added(cfg, keys)
     check_domain(cfg, keys)
     if cfg.resume:
-        if removed := _removed(overrides):
+        if removed := removed_keys(overrides):
             raise ValueError(f"~{removed[0]} cannot be removed from a resumed run: start a new one with init_from=PATH")
         checkpoint = find_checkpoint(cfg.resume)
         saved = read_state(checkpoint).get("config")
@@ -257,6 +262,10 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
         check_saved_config(saved, checkpoint, config_name, said, OmegaConf.to_container(cfg, resolve=True))
         with refusing(checkpoint, "a configuration"):
             before = OmegaConf.create(saved)
+            # A group's choice that is the run's own keeps the run's numbers.
+            for key in said.keys() & config_groups(config_name).keys() & set(_FIXED):
+                if _targets(said[key]) == _targets(OmegaConf.select(before, key)):
+                    del said[key]
             fixed = [key for key in said if key.split(".")[0] in _FIXED and said[key] != OmegaConf.select(before, key)]
         if fixed:
             raise SystemExit(
@@ -276,7 +285,7 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
                         OmegaConf.update(stage, key, value, merge=False)
             cfg = OmegaConf.create(OmegaConf.to_container(before, resolve=True, throw_on_missing=True))
     elif cfg.get("stages") or cfg.stage is not None:
-        stages = composed_stages(cfg, keys, _removed(overrides))
+        stages = composed_stages(cfg, keys, removed_keys(overrides))
         cfg = _chosen_stage(cfg, stages, keys)
     try:
         config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)  # pyright: ignore
@@ -336,41 +345,19 @@ def announce(config: dict[str, Any], trainer: Trainer) -> None:
     print(estimate)
     if bf16 and not hardware.bf16:
         print("warning: this machine has no bf16 in hardware, so that updates take much longer than with fp32 or auto")
-    if remaining and settings.train.warmup_frames >= settings.train.total_frames:
-        print(
-            f"warning: no update will be made, because train.warmup_frames={settings.train.warmup_frames:,} is not "
-            f"below train.total_frames={settings.train.total_frames:,}"
-        )
+    for name in ("warmup_frames", "batch_size"):
+        if remaining and (needed := getattr(settings.train, name)) >= settings.train.total_frames:
+            total = f"train.total_frames={settings.train.total_frames:,}"
+            print(f"warning: no update will be made, because train.{name}={needed:,} is not below {total}")
     print(f"Writing to {settings.run_dir}; Ctrl-C saves a checkpoint and stops")
 
 
-def _quoted_paths(arguments: list[str]) -> list[str]:
-    """Quote paths, so that Hydra does not parse them: a folder may be called `a=b` or `a, b`."""
-    quoted = []
-    for argument in arguments:
-        key, equals, value = argument.partition("=")
-        if equals and key in _PATHS and value not in ("", "null") and value[0] not in "'\"":
-            escaped = value.replace("'", "\\'")
-            argument = f"{key}='{escaped}'"
-        quoted.append(argument)
-    return quoted
-
-
-def _said(overrides: list[str]) -> list[str]:
-    """Return the keys that a command line sets: of `train={batch_size: 8}` the key `train.batch_size`."""
-    parsed = [o for o in OverridesParser.create().parse_overrides(overrides) if not o.is_delete()]
-    keys = [key for o in parsed for key in _entries(o.key_or_group, o.value())]
-    return [key for key in keys if key != "preset" and not key.startswith("hydra")]
-
-
-def _entries(key: str, value: Any) -> list[str]:
-    if not isinstance(value, dict) or not value:
-        return [key]
-    return [entry for name, inner in value.items() for entry in _entries(f"{key}.{name}", inner)]
-
-
-def _removed(overrides: list[str]) -> list[str]:
-    return [o.key_or_group for o in OverridesParser.create().parse_overrides(overrides) if o.is_delete()]
+def _targets(group: Any) -> dict[Any, Any]:
+    """Return the functions and classes that a group names."""
+    if not isinstance(group, DictConfig):
+        return {}
+    named = {key: value if key == "_target_" else _targets(value) for key, value in group.items()}
+    return {key: value for key, value in named.items() if value}
 
 
 def _run_of(checkpoint: Path, *, staged: bool) -> str | None:

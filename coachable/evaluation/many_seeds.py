@@ -13,6 +13,7 @@ from pathlib import Path
 
 from coachable.evaluation.curves import metrics_files, read_metric
 from coachable.evaluation.many_agents import side_by_side, table_of
+from coachable.outputs import complete_file
 from coachable.training.checkpoint import CheckpointError, find_checkpoint, read_state
 from coachable.training.hardware import detect, share_threads
 
@@ -63,7 +64,9 @@ def train_seeds(script: Path, arguments: Sequence[str], seeds: Sequence[int], fo
             "expected the same settings, or another folder with run_dir=PATH"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    record.write_text(json.dumps(said), encoding="utf-8")
+    if not record.exists():
+        with complete_file(record) as unfinished:
+            unfinished.write_text(json.dumps(said), encoding="utf-8")
     hardware = detect()
     at_once = min(len(seeds), hardware.free)
     share = share_threads(hardware=replace(hardware, cores=hardware.free // at_once, busy=0.0))

@@ -95,15 +95,19 @@ class CheckpointStore:
                     write_replay(replay, partial / "replay")
                 sync_folder(partial)
                 os.rename(partial, self.directory / name)
-                pointer = self.directory / f".{_LATEST}.partial"
-                write_text(pointer, name + "\n")
-                os.replace(pointer, self.directory / _LATEST)
-                sync_folder(self.directory)
+                self.point_to(name)
         except BaseException:
             shutil.rmtree(partial, ignore_errors=True)
             raise
         self._prune(name)
         return self.directory / name
+
+    def point_to(self, name: str) -> None:
+        """Make a complete checkpoint the one from which the run is resumed."""
+        pointer = self.directory / f".{_LATEST}.partial"
+        write_text(pointer, name + "\n")
+        os.replace(pointer, self.directory / _LATEST)
+        sync_folder(self.directory)
 
     def try_save(self, state: Mapping[str, Any], metadata: Mapping[str, Any], replay: Any | None = None) -> Path | None:
         """Call `save`, but warn and return None if writing fails, because a full disk should not end a long training.
@@ -115,8 +119,7 @@ class CheckpointStore:
             return self.save(state, metadata, replay)
         except OSError as error:
             warnings.warn(
-                f"checkpoint at {metadata['frames']} frames was not written: {error}. Training goes on; the previous "
-                "checkpoint is intact.",
+                f"checkpoint at {metadata['frames']} frames was not written: {error}. A previous one is intact.",
                 stacklevel=2,
             )
             return None
@@ -237,16 +240,26 @@ def check_fits(saved: Mapping[str, Tensor], present: Mapping[str, Tensor], what:
 
 
 def check_unused(directory: Path | str) -> None:
-    """Check that the folder of a new run contains no checkpoints.
+    """Check that the folder of a new run contains no checkpoints, and no settings of something else.
 
     Raises:
-        CheckpointError: If it contains checkpoints.
+        CheckpointError: If it contains checkpoints, or a `config.json` that is not a run's.
     """
+    config = Path(directory) / "config.json"
+    if config.exists() and not _is_config(config):
+        raise CheckpointError(f"{config} is not the configuration of a run: choose another folder with run_dir=PATH")
     if _complete(_checkpoint_folder(Path(directory))):
         raise CheckpointError(
             f"{directory} holds a run already. Continue it with resume={directory}, or choose another folder with "
             "run_dir=PATH"
         )
+
+
+def _is_config(file: Path) -> bool:
+    try:
+        return "domain" in json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, TypeError):
+        return False
 
 
 def check_writable(directory: Path | str, required_bytes: int = 0) -> None:

@@ -1,5 +1,6 @@
 """Logging of metrics to a CSV file and, on request, to Weights & Biases, and a progress display."""
 
+import contextlib
 import csv
 import io
 import json
@@ -12,6 +13,8 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from tqdm import tqdm
+
+from coachable.files import CheckpointError
 
 _MOVE = "Move it away to go on with a new one"
 
@@ -48,13 +51,13 @@ class MetricsLog:
         """Drop the rows after `frames` env-steps, which a resumed training writes again.
 
         Raises:
-            ValueError: If an entry of the column `frames` is not a number, or the file is not a table.
+            CheckpointError: If an entry of the column `frames` is not a number, or the file is not a table.
         """
         rows = self._read()
         try:
             kept = [row for row in rows if float(row.get("frames") or 0) <= frames]
         except ValueError as error:
-            raise ValueError(f"{self.path} is damaged: {error} in 'frames'. {_MOVE}") from error
+            raise CheckpointError(f"{self.path} is damaged: {error} in 'frames'. {_MOVE}") from error
         if len(kept) < len(rows):
             self._rewrite(kept)
 
@@ -99,7 +102,7 @@ class MetricsLog:
                 self.columns = list(reader.fieldnames or [])
                 return list(reader)
         except (UnicodeDecodeError, csv.Error) as error:
-            raise ValueError(f"{self.path} is not a table of metrics: {error}. {_MOVE}") from error
+            raise CheckpointError(f"{self.path} is not a table of metrics: {error}. {_MOVE}") from error
 
     def _rewrite(self, rows: list[dict[str, Any]], columns: list[str] | None = None) -> None:
         columns = self.columns if columns is None else columns
@@ -172,8 +175,9 @@ class Progress:
             self._last = now
             line = {"frames": frames, "updates": updates, **self._rate(now, frames, updates)}
             line |= {k: _short(v) for k, v in metrics.items()}
-            self.stream.write(json.dumps(line) + "\n")
-            self.stream.flush()
+            with contextlib.suppress(OSError):  # a full disk or a closed pipe must not end a training
+                self.stream.write(json.dumps(line) + "\n")
+                self.stream.flush()
 
     def close(self) -> None:
         """Close the bar."""

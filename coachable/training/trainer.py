@@ -117,6 +117,7 @@ class Trainer:
         self.replay_keys = replay_keys
         self.frames = 0
         self.stopped = False  # whether a signal asked the last run to end
+        self.saved = True  # whether the latest checkpoint could be written
         self.pending_updates = 0.0  # updates that utd_ratio asks for and that have not been made yet
         parts = ("collect", "store", "update", "evaluate", "log", "checkpoint", "wait")
         self.seconds: dict[str, float] = dict.fromkeys(parts, 0.0)
@@ -295,7 +296,8 @@ class Trainer:
         if self.checkpoints is not None:
             with self._timed("checkpoint"):
                 self.learner.check_finite()
-                self.checkpoints.try_save({**self.describe(), **self.state_dict()}, self._position(), self.replay)
+                state = {**self.describe(), **self.state_dict()}
+                self.saved = self.checkpoints.try_save(state, self._position(), self.replay) is not None
                 self._saved = time.monotonic()
 
     def _finish(self, *, interrupted: bool) -> None:
@@ -339,6 +341,7 @@ class Trainer:
             self._restore(state, path / "replay")
         if self.checkpoints and path.parent.resolve() == self.checkpoints.directory.resolve():
             self._saved_frames = self.frames
+            self.checkpoints.point_to(path.name)  # before the rows after it are dropped
         self.log.rewind(self.frames)
         return path
 

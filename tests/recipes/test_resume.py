@@ -84,3 +84,60 @@ def test_settings_given_beside_resume_are_named_if_the_training_cannot_be_made(t
     )
     with pytest.raises(SystemExit, match=r"nonsense(.|\n)*beside resume=.*: train.total_frames, env.nonsense$"):
         run_recipe("rare_targets", build)
+
+
+def trained(run, *arguments):
+    """A short training of the recipe rare_targets."""
+    train = import_module("rare_targets").build(compose_config("rare_targets", [*TINY, *arguments, f"run_dir={run}"]))
+    train.run()
+    return train
+
+
+@pytest.mark.filterwarnings("ignore:the checkpoint has no replay buffer")
+def test_a_run_that_continues_from_an_older_checkpoint_forgets_the_newer_one(tmp_path):
+    trained(tmp_path, "train.total_frames=24", "train.checkpoint_interval=0")
+    oldest, *_, newest = sorted((tmp_path / "checkpoints").glob("frames_*"))
+    assert find_checkpoint(tmp_path) == newest
+    import_module("rare_targets").build(compose_config("rare_targets", [f"resume={oldest}"]))  # and is killed
+    assert find_checkpoint(tmp_path) == oldest
+    again = import_module("rare_targets").build(compose_config("rare_targets", [f"resume={tmp_path}"]))
+    again.run()
+    frames = [float(line.split(",")[0]) for line in (tmp_path / "metrics.csv").read_text().splitlines()[1:]]
+    assert frames == sorted(frames) and frames[-1] == again.frames == 24
+
+
+def test_the_same_choice_of_a_group_may_be_given_again(tmp_path):
+    trained(tmp_path, "train.total_frames=4")
+    for same in ("replay=event_tables", "network=residual"):
+        config = compose_config("rare_targets", [f"resume={tmp_path}", same])
+        assert config["replay_capacity"] == 60 and config["network"]["actor"]["widths"] != [0]
+    with pytest.raises(SystemExit, match="replay cannot change in a resumed run"):
+        compose_config("rare_targets", [f"resume={tmp_path}", "replay=uniform"])
+
+
+@pytest.mark.filterwarnings("ignore:.*was not written")
+def test_a_training_whose_end_is_not_saved_fails(tmp_path, monkeypatch):
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("coachable.training.checkpoint.save_state", fail)
+    monkeypatch.setattr(sys, "argv", ["rare_targets.py", *TINY, "train.total_frames=4", f"run_dir={tmp_path}"])
+    with pytest.raises(SystemExit, match="error: the training ended at env-step 4, which could not be saved"):
+        run_recipe("rare_targets", import_module("rare_targets").build)
+
+
+def test_files_that_are_not_a_runs_end_with_a_sentence(tmp_path, monkeypatch):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "config.json").write_text('{"mine": 1}')
+    (tmp_path / "odd" / "metrics.csv").mkdir(parents=True)
+    for folder, message in (("mine", "config.json is not the configuration of a run"), ("odd", "Is a directory")):
+        monkeypatch.setattr(sys, "argv", ["rare_targets.py", *TINY, f"run_dir={tmp_path / folder}"])
+        with pytest.raises(SystemExit, match=f"^error: .*{message}"):
+            run_recipe("rare_targets", import_module("rare_targets").build)
+    assert (tmp_path / "mine" / "config.json").read_text() == '{"mine": 1}'
+
+
+def test_further_observations_need_an_agent(tmp_path):
+    arguments = [*TINY, "init_new_observations=5", f"run_dir={tmp_path}"]
+    with pytest.raises(ValueError, match="init_new_observations=5: expected init_from=PATH beside it"):
+        import_module("rare_targets").build(compose_config("rare_targets", arguments))

@@ -71,6 +71,17 @@ def test_progress_writes_json_lines_without_a_terminal():
     assert line["steps_per_s"] > 0 and line["updates_per_s"] > 0 and line["eta_min"] >= 0
 
 
+def test_a_stream_that_cannot_be_written_ends_no_training():
+    class Full(io.StringIO):
+        def write(self, text):
+            raise OSError(28, "No space left on device")
+
+    progress = Progress(100, Full(), every=0.0)
+    progress.start(0, 0)
+    progress.update(50, 5, {})
+    progress.close()
+
+
 def test_progress_draws_a_bar_on_a_terminal():
     class Terminal(io.StringIO):
         def isatty(self):
