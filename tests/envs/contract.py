@@ -16,7 +16,7 @@ def roll(env: EnvBase, actions: Iterable[torch.Tensor]) -> TensorDictBase:
     return torch.stack(seen)
 
 
-def assert_set_seed_restarts_the_stream(make_env: Callable[[], EnvBase]) -> None:
+def assert_set_seed_restarts_the_stream(make_env: Callable[..., EnvBase]) -> None:
     """Check that the episodes after `set_seed` are those of the seed, and that later ones differ from them."""
     env = make_env()
     env.set_seed(5)
@@ -24,3 +24,4 @@ def assert_set_seed_restarts_the_stream(make_env: Callable[[], EnvBase]) -> None
     env.set_seed(5)
     assert torch.equal(env.reset()["observation"], first)
     assert not torch.equal(env.reset()["observation"], first)
+    assert torch.equal(make_env(seed=5).reset()["observation"], first)

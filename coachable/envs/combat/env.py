@@ -118,10 +118,10 @@ class CombatEnv(EnvBase):
         self._assigned: tuple[Tensor, Tensor] | None = None
         self._load_tables(reward_scale)
         self._random = torch.Generator(self._on)
-        self._set_seed(seed)
         self._make_specs()
         self.state = self._fresh()
         self._look_up()
+        self._set_seed(seed)  # after the draws of the state that `reset` replaces
 
     def assign(self, machines: Sequence[str | Sequence[str]], sites: Sequence[str]) -> None:
         """Assign machines and sites to the fights from their next reset on, instead of drawing them.
