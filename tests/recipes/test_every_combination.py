@@ -276,7 +276,7 @@ def test_runs_with_tables_resume_bit_for_bit(loss, replay, tmp_path):
         (
             "humanoid_sac",
             ["loss=cat_rac", "critic_support.v_min=100"],
-            r"initial_value must lie in \[100.0, 650.0\], got 0.0",
+            r"initial_value must lie in \[100.0, 800.0\], got 0.0",
         ),
         ("humanoid_sac", ["init_from=nowhere"], r"nowhere"),
         ("humanoid_sac", ["loss=qr_sac", "network.critic.num_outputs=5"], r"5 outputs: QRSACLoss expects 32"),
