@@ -22,7 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from recipe_checks import check_added, check_domain, checked_values, mistake_in, typed_settings
 from recipe_overrides import PATHS, quoted_paths, removed_keys, said_keys
-from recipe_saved import CONFIGS, check_saved_config
+from recipe_saved import CONFIGS, check_saved_config, same_targets
 from recipe_stages import composed_stages
 from recipe_target import choices
 
@@ -258,14 +258,13 @@ def plain_config(cfg: DictConfig, overrides: list[str], config_name: str) -> dic
             raise ValueError(f"~{removed[0]} cannot be removed from a resumed run: start a new one with init_from=PATH")
         checkpoint = find_checkpoint(cfg.resume)
         saved = read_state(checkpoint).get("config")
-        said = {key: OmegaConf.select(cfg, key) for key in keys}
-        check_saved_config(saved, checkpoint, config_name, said, OmegaConf.to_container(cfg, resolve=True))
+        composed: Any = OmegaConf.to_container(cfg, resolve=True)
+        # A group's choice that is the run's own keeps the run's numbers, which are checked like all others.
+        own = {key for key in config_groups(config_name) if key in _FIXED and same_targets(saved, composed, key)}
+        said = {key: OmegaConf.select(cfg, key) for key in keys if key not in own}
+        check_saved_config(saved, checkpoint, config_name, said, composed)
         with refusing(checkpoint, "a configuration"):
             before = OmegaConf.create(saved)
-            # A group's choice that is the run's own keeps the run's numbers.
-            for key in said.keys() & config_groups(config_name).keys() & set(_FIXED):
-                if _targets(said[key]) == _targets(OmegaConf.select(before, key)):
-                    del said[key]
             fixed = [key for key in said if key.split(".")[0] in _FIXED and said[key] != OmegaConf.select(before, key)]
         if fixed:
             raise SystemExit(
@@ -350,14 +349,6 @@ def announce(config: dict[str, Any], trainer: Trainer) -> None:
             total = f"train.total_frames={settings.train.total_frames:,}"
             print(f"warning: no update will be made, because train.{name}={needed:,} is not below {total}")
     print(f"Writing to {settings.run_dir}; Ctrl-C saves a checkpoint and stops")
-
-
-def _targets(group: Any) -> dict[Any, Any]:
-    """Return the functions and classes that a group names."""
-    if not isinstance(group, DictConfig):
-        return {}
-    named = {key: value if key == "_target_" else _targets(value) for key, value in group.items()}
-    return {key: value for key, value in named.items() if value}
 
 
 def _run_of(checkpoint: Path, *, staged: bool) -> str | None:

@@ -69,6 +69,14 @@ def known_targets(config_name: str) -> set[tuple[tuple[str, ...], str]]:
     return known
 
 
+def same_targets(saved: Any, composed: Any, group: str) -> bool:
+    """Return whether two configurations name the same functions and classes in a group."""
+    one, other = (
+        _targets(_leaves(config.get(group))) if isinstance(config, dict) else None for config in (saved, composed)
+    )
+    return one == other
+
+
 def _targets(leaves: Iterable[tuple[tuple[str, ...], Any]]) -> set[tuple[tuple[str, ...], str]]:
     return {(place, value) for place, value in leaves if place and place[-1] == "_target_"}
 

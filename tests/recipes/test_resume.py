@@ -110,9 +110,21 @@ def test_the_same_choice_of_a_group_may_be_given_again(tmp_path):
     trained(tmp_path, "train.total_frames=4")
     for same in ("replay=event_tables", "network=residual"):
         config = compose_config("rare_targets", [f"resume={tmp_path}", same])
-        assert config["replay_capacity"] == 60 and config["network"]["actor"]["widths"] != [0]
+        assert config["replay_capacity"] == 60 and config["network"]["actor"]["widths"] == [32, 32]
     with pytest.raises(SystemExit, match="replay cannot change in a resumed run"):
         compose_config("rare_targets", [f"resume={tmp_path}", "replay=uniform"])
+
+
+def test_what_a_checkpoint_names_is_checked_even_if_the_choice_is_given_again(tmp_path, monkeypatch):
+    trained(tmp_path, "train.total_frames=4")
+    state = read_state(find_checkpoint(tmp_path))
+    state["config"]["replay"]["hidden"] = [{"_target_": "os.system", "command": "true"}]
+    monkeypatch.setattr("recipe_config.read_state", lambda checkpoint: state)
+    with pytest.raises((CheckpointError, SystemExit), match=r"os\.system|replay cannot change"):
+        compose_config("rare_targets", [f"resume={tmp_path}", "replay=event_tables"])
+    state["config"]["replay"]["hidden"] = "${oc.env:HOME}"
+    with pytest.raises(CheckpointError, match="expected a plain value"):
+        compose_config("rare_targets", [f"resume={tmp_path}", "replay=event_tables"])
 
 
 @pytest.mark.filterwarnings("ignore:.*was not written")
