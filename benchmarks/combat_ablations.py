@@ -91,11 +91,9 @@ def train(variant: str, seed: int, run_dir: Path, args: argparse.Namespace) -> N
         overrides = [f"preset={args.preset}", f"seed={seed}", f"run_dir={run_dir}", *VARIANTS[variant], *common]
         overrides += [] if args.frames is None else [f"train.total_frames={args.frames}"]
         config = compose_config("combat_cat_rac", overrides)
-        if config["stages"]:
-            raise SystemExit(
-                f"preset {args.preset} has stages: expected one without, such as small or middle"
-            ) from None
         config["train"]["eval_interval"] = max(1, config["train"]["total_frames"] // EVALUATIONS)
+    if config["stages"]:
+        raise SystemExit(f"preset {args.preset} has stages: expected one without, such as small or middle")
     training = build(config)
     training.evaluate = evaluation(training, config, args.episodes)
     training.run()

@@ -57,16 +57,15 @@ def train_seeds(script: Path, arguments: Sequence[str], seeds: Sequence[int], fo
         ValueError: If the folder holds trainings with other arguments.
     """
     record = folder / "arguments.json"
-    said = json.loads(record.read_text(encoding="utf-8")) if record.exists() else [*arguments]
+    if not record.exists():
+        with complete_file(record) as unfinished:
+            unfinished.write_text(json.dumps([*arguments]), encoding="utf-8")
+    said = json.loads(record.read_text(encoding="utf-8"))
     if sorted(said) != sorted(arguments):
         raise ValueError(
             f"{folder} holds trainings with {' '.join(map(str, said)) or 'no settings'}: "
             "expected the same settings, or another folder with run_dir=PATH"
         )
-    folder.mkdir(parents=True, exist_ok=True)
-    if not record.exists():
-        with complete_file(record) as unfinished:
-            unfinished.write_text(json.dumps(said), encoding="utf-8")
     hardware = detect()
     at_once = min(len(seeds), hardware.free)
     share = share_threads(hardware=replace(hardware, cores=hardware.free // at_once, busy=0.0))

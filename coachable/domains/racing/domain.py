@@ -14,7 +14,7 @@ from coachable.domains.racing.words import WORDS
 from coachable.envs.racing.circuit.track import Track
 from coachable.envs.racing.env import EPISODE_STEPS
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
-from coachable.envs.racing.race.garage import GT3_POOL, POOL
+from coachable.envs.racing.race.garage import GT3_POOL, POOLS
 from coachable.envs.racing.race.observation import ACTION_GROUPS, COURSE_POINTS, observation_groups
 from coachable.envs.racing.race.scenarios import SOLO, rolling_start
 from coachable.scene.renderer import SceneRenderer
@@ -61,7 +61,7 @@ def racing_domain(
         coached = {}
         if cars == 1 and (met := chosen.pop("cars", 1)) > 1:  # agents trained in traffic are measured alone, too
             coached = {"cars": met, "scenarios": rolling_start(met)}
-        pool, points = chosen.get("car") in (POOL, GT3_POOL), chosen.get("course_points", COURSE_POINTS)
+        pool, points = chosen.get("car") in POOLS, chosen.get("course_points", COURSE_POINTS)
         chosen |= {"car": GT3_POOL} if pool else {}
         shown = partial(make_env, **chosen)
         return replace(

@@ -10,7 +10,7 @@ from coachable.envs.racing.circuit.track import Track
 from coachable.envs.racing.env import RacingEnv
 from coachable.envs.racing.physics.cars import Resources, load_car
 from coachable.envs.racing.race.driver import LineFollower
-from coachable.envs.racing.race.garage import GT3_POOL, POOL
+from coachable.envs.racing.race.garage import POOLS
 from coachable.envs.racing.race.rivals import Rivals
 from coachable.envs.racing.race.scenarios import Conditions, drift_scenarios, race_scenarios
 from coachable.envs.racing.race.task import TaskWeights
@@ -167,4 +167,4 @@ def typical_car(family: str, settings: Mapping[str, Any]) -> str:
         settings: Options of the environment that the agent was trained in.
     """
     car = settings.get("car", CAR[family])
-    return "gt3" if car in (POOL, GT3_POOL) else car
+    return "gt3" if car in POOLS else car

@@ -22,7 +22,7 @@ from coachable.domains.racing.metrics import TelemetryMeasures, nearest_gaps
 from coachable.envs.racing.physics.cars import POOL_GT3
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
 from coachable.envs.racing.race.features import anyone_beside, anyone_in_line
-from coachable.envs.racing.race.garage import GT3_POOL, POOL
+from coachable.envs.racing.race.garage import POOLS
 from coachable.envs.racing.race.run import Run
 from coachable.envs.racing.race.scenarios import rolling_start
 from coachable.evaluation.episode_records import record_episodes
@@ -315,7 +315,7 @@ def draw_radar(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 def _report(agent: LoadedPolicy, rows: Sequence[Mapping[str, Any]], summary: Mapping[str, Any]) -> str:
     text = "# racing, aggressiveness: requested margin and measured behaviour\n\n"
     text += f"{policy_sentence(agent)} in all five cars; {summary['races_per_row']} races per row, {LAPS} laps, "
-    if agent.config.get("env", {}).get("car") in (POOL, GT3_POOL):
+    if agent.config.get("env", {}).get("car") in POOLS:
         text += f"the {POOL_GT3} GT3-like cars of the pool in turn, one model per race, "
     text += f"rolling start, seed {summary['seed']}. Two cars, which start last (pursuer) or first (leader), keep the "
     text += f"requested margin; their lateral margin is {FIXED['lateral']:g} m and their longitudinal one "

@@ -8,7 +8,8 @@ from torch import Tensor
 from coachable.envs.racing.physics.cars import POOL_GT3, Car, car_pool, load_car
 from coachable.envs.racing.race.counter_rng import uniforms
 
-POOL, GT3_POOL = "pool", "gt3_pool"
+GT3_POOL = "gt3_pool"
+POOLS = ("pool", GT3_POOL)
 _BASE, _RATE = 0.1, 0.05  # of the adaptive sampling: p in proportion to 0.1 + mean spins
 
 
@@ -31,7 +32,7 @@ class Garage:
     """
 
     def __init__(self, name: str, cars: int, races: int, device: torch.device, *, adaptive: bool = True) -> None:
-        self.pooled, self.adaptive, self.in_turn = name in (POOL, GT3_POOL), adaptive, name == GT3_POOL
+        self.pooled, self.adaptive, self.in_turn = name in POOLS, adaptive, name == GT3_POOL
         self.typical = load_car("gt3" if self.pooled else name)
         self.cars, self.device = cars, device
         self.car: Car = self.typical
