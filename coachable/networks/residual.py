@@ -131,8 +131,8 @@ class ResidualMLP(nn.Module):
     def forward(self, *inputs: Tensor) -> Tensor:
         """Map inputs `(..., d_i)`, concatenated to `in_features`, to `(..., out_features)`.
 
-        The head runs in float32, also under autocast, because values and log-probabilities need more precision than
-        bfloat16.
+        Float64 inputs are cast to the parameters' dtype. The head runs in float32, also under autocast, because values
+        and log-probabilities need more precision than bfloat16.
 
         Raises:
             ValueError: If the inputs have another width.
@@ -144,6 +144,8 @@ class ResidualMLP(nn.Module):
                 f"the network has {self.in_features} inputs, but got {widths} = {x.shape[-1]} (observation, style and, "
                 "for a critic, action): expected the widths with which it was made"
             )
+        if x.dtype == torch.float64:  # observations of dm_control
+            x = x.to(self.head.weight.dtype)
         hidden = self.blocks(x)
         with torch.autocast(x.device.type, enabled=False):
             return self.head(hidden.to(self.head.weight.dtype))

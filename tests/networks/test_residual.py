@@ -84,6 +84,18 @@ def test_bad_options_raise(options):
         ResidualMLP(3, 1, **{"widths": (4, 4), **options})
 
 
+@pytest.mark.parametrize("autocast", [False, True])
+def test_float64_inputs_are_cast_to_the_parameters_dtype(autocast):
+    network, observation, style = (
+        ResidualMLP(7, 2, widths=(8, 8)),
+        torch.randn(5, 4, dtype=torch.float64),
+        torch.randn(5, 3),
+    )
+    with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+        torch.testing.assert_close(network(observation, style), network(observation.float(), style), rtol=0, atol=0)
+    assert network.double()(observation, style).dtype == torch.float64
+
+
 def test_inputs_of_another_width_are_refused():
     with pytest.raises(ValueError, match=r"has 5 inputs, but got 4 \+ 2 = 6"):
         ResidualMLP(5, 1, (8,))(torch.zeros(3, 4), torch.zeros(3, 2))
