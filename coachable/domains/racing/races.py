@@ -21,7 +21,6 @@ from coachable.domains.racing.laps import circuits_report, circuits_summary, dri
 from coachable.domains.racing.metrics import TelemetryMeasures, nearest_gaps
 from coachable.envs.racing.physics.cars import POOL_GT3
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
-from coachable.envs.racing.race.features import anyone_beside, anyone_in_line
 from coachable.envs.racing.race.garage import POOLS
 from coachable.envs.racing.race.run import Run
 from coachable.envs.racing.race.scenarios import rolling_start
@@ -63,9 +62,8 @@ class _RaceMeasures(TelemetryMeasures):
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
         features = transition.get(("next", STYLE_FEATURES))
-        beside = anyone_beside(features, within=MARGINS["lateral"][-1])
-        in_line = anyone_in_line(features, within=MARGINS["longitudinal"][-1])
         ahead, aside = nearest_gaps(features)
+        beside, in_line = aside < MARGINS["lateral"][-1], ahead < MARGINS["longitudinal"][-1]  # False for NaN
         found = {"beside": beside.float(), "in_line": in_line.float(), "gap_beside": aside, "gap_in_line": ahead}
         return super().step(transition) | found
 

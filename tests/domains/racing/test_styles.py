@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from coachable.domains.racing import styles
-from coachable.envs.racing.race.features import GAPS, anyone_beside, anyone_in_line, cornering, inward_angle
+from coachable.domains.racing.metrics import nearest_gaps
+from coachable.envs.racing.race.features import GAPS, cornering, inward_angle
 from coachable.styles import Shared, StyleSpace
 
 N = 40000
@@ -136,11 +137,11 @@ def test_margin_reward_by_hand():
         styles.aggressiveness_style_reward(space, apart=2)
 
 
-def test_beside_and_in_line_are_within_so_many_metres():
-    """Two opponents each: one 0.6 m beside; one 0.5 m ahead; one beside but not near."""
-    far = [3.0, 2.0, 0.0]
-    features = torch.tensor([[0.0] * GAPS + far + gaps for gaps in ([0.0, 0.6, 1.0], [0.5, 0.0, 1.0], [0.0, 0.6, 0.0])])
-    assert anyone_beside(features, within=1.0).tolist() == [True, False, False]
-    assert not anyone_beside(features, within=0.5).any()
-    assert anyone_in_line(features, within=2.0).tolist() == [False, True, False]
-    assert not anyone_in_line(features, within=0.4).any()
+def test_gaps_to_the_nearest_cars_in_line_and_beside():
+    """Two opponents each: one 0.6 m beside; one 0.5 m ahead; one beside but not near; two beside."""
+    far, beside = (3.0, 2.0, 0.0), (0.0, 0.6, 1.0)
+    pairs = (far, beside), (far, (0.5, 0.0, 1.0)), (far, (0.0, 0.6, 0.0)), ((0.0, 0.8, 1.0), beside)
+    ahead, aside = nearest_gaps(torch.tensor([[0.0] * GAPS + [*one, *other] for one, other in pairs]))
+    nan = float("nan")
+    assert ahead.tolist() == pytest.approx([nan, 0.5, nan, nan], nan_ok=True)
+    assert aside.tolist() == pytest.approx([0.6, nan, nan, 0.6], nan_ok=True)

@@ -32,34 +32,6 @@ def anyone_near(features: Tensor) -> Tensor:
     return gap_columns(features)[2].any(-1)
 
 
-def anyone_beside(features: Tensor, *, within: float) -> Tensor:
-    """Return whether an opponent overlaps lengthwise and is less than `within` metres away sideways, (...) bool.
-
-    Args:
-        features: Style features (..., F).
-        within: Lateral distance [m].
-
-    Returns:
-        (...,) bool.
-    """
-    long, lat, near = gap_columns(features)
-    return ((near > 0.0) & (long == 0.0) & (lat < within)).any(-1)
-
-
-def anyone_in_line(features: Tensor, *, within: float) -> Tensor:
-    """Return whether an opponent overlaps sideways and is less than `within` metres ahead or behind, (...) bool.
-
-    Args:
-        features: Style features (..., F).
-        within: Longitudinal distance [m].
-
-    Returns:
-        (...,) bool.
-    """
-    long, lat, near = gap_columns(features)
-    return ((near > 0.0) & (lat == 0.0) & (long < within)).any(-1)
-
-
 def gap_columns(features: Tensor) -> tuple[Tensor, ...]:
     """Return longitudinal gaps [m], lateral gaps [m] and near flags of all opponents, (..., A - 1) each."""
     return tuple(features[..., GAPS + column :: len(GAP_COLUMNS)] for column in range(len(GAP_COLUMNS)))
