@@ -1,7 +1,6 @@
 """Style features of racing, which are slip, metres gained, wear, fuel, and gaps to other cars."""
 
 import math
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -74,20 +73,3 @@ def inward_angle(angle: Tensor, curvature: Tensor) -> Tensor:
     """
     inwards = -angle * torch.sign(curvature)
     return torch.minimum(inwards, 0.5 * math.pi - inwards).clamp(min=0.0)
-
-
-def pack_style_features(
-    drift: Sequence[Tensor], resources: Sequence[Tensor], corner: Sequence[Tensor], gaps: Sequence[Tensor]
-) -> Tensor:
-    """Stack tensors (N,) to the columns of `style_features`, (N, F).
-
-    Args:
-        drift: Quantities of drifting, (N,) each.
-        resources: Quantities of tyres and fuel, (N,) each.
-        corner: Drift in corners, and how much the corner counts, (N,) each.
-        gaps: Distances to opponents, (N,) each [m].
-
-    Returns:
-        (N, F).
-    """
-    return torch.stack([*drift, *resources, *corner, *gaps], dim=-1)

@@ -9,14 +9,7 @@ from torch import Tensor
 from coachable.envs.racing.physics.contact import Bodies, body_gaps, partner
 from coachable.envs.racing.physics.simulation import CONTROL_STEP
 from coachable.envs.racing.physics.state import WEARS, CarState
-from coachable.envs.racing.race.features import (
-    DRIFT_SPEED_MIN,
-    NEAR_DISTANCE,
-    cornering,
-    inward_angle,
-    pack_style_features,
-    sideslip,
-)
+from coachable.envs.racing.race.features import DRIFT_SPEED_MIN, NEAR_DISTANCE, cornering, inward_angle, sideslip
 from coachable.envs.racing.race.run import Others, Run, TyreView
 
 BEHIND, AHEAD = 20.0, 40.0  # [m], window in which passing counts
@@ -183,4 +176,4 @@ def style_features(
             gaps += [long.reshape(-1), lat.reshape(-1), near.to(new.dtype).reshape(-1)]
     share = cornering(curvature, outcome.progress / CONTROL_STEP)
     corner = [share * inward_angle(sideslip(state.vx, state.vy), curvature), share]
-    return pack_style_features(drift, [outcome.overtake, outcome.defend, tire, burnt], corner, gaps)
+    return torch.stack([*drift, outcome.overtake, outcome.defend, tire, burnt, *corner, *gaps], dim=-1)
