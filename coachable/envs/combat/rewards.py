@@ -60,15 +60,6 @@ def pack_components(**parts: Tensor) -> Tensor:
     return torch.cat([parts[name].reshape(width, -1) for name, width in COMPONENTS.items()])
 
 
-def _selection(sources: dict[str, list[tuple[int, float]]]) -> Tensor:
-    """Return the matrix (rows, 44) of `{row name: [(component, weight), ...]}`."""
-    matrix = torch.zeros(len(sources), NUM_COMPONENTS)
-    for row, entries in enumerate(sources.values()):
-        for component, weight in entries:
-            matrix[row, component] = weight
-    return matrix
-
-
 def task_weights() -> Tensor:
     """Return the weight of each component in the task reward, (44,) (paper)."""
     table, weights = load_table("task_rewards"), torch.zeros(NUM_COMPONENTS)
@@ -96,8 +87,8 @@ def style_weights(reward_scale: str) -> Tensor:
     def at(name: str, offset: int = 0) -> int:
         return COMPONENT_SLICES[name].start + offset
 
-    sources: dict[str, list[tuple[int, float]]] = {}
-    for style in STYLES:
+    weights = torch.zeros(len(STYLES), NUM_COMPONENTS)
+    for row, style in zip(weights, STYLES, strict=True):
         if style == "melee":
             entries = [(at("melee_damage"), weight("melee damage"))]
         elif style == "traps":
@@ -119,8 +110,9 @@ def style_weights(reward_scale: str) -> Tensor:
         else:
             p = PART_TYPES.index(style.removeprefix("part_"))
             entries = [(at("part_damage", p), weight("part damage")), (at("removals", p), weight("part removal"))]
-        sources[style] = entries
-    return _selection(sources)
+        for component, value in entries:
+            row[component] = value
+    return weights
 
 
 def event_components() -> Tensor:
