@@ -48,15 +48,6 @@ class HeadLayout:
     def __len__(self) -> int:
         return len(self.sizes)
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, HeadLayout) and self.sizes == other.sizes
-
-    def __hash__(self) -> int:
-        return hash(self.sizes)
-
-    def __repr__(self) -> str:
-        return f"HeadLayout({self.sizes})"
-
     def __reduce__(self) -> tuple:  # copies and pickles leave out the cached constants
         return HeadLayout, (self.sizes,)
 
