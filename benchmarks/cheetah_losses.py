@@ -5,7 +5,6 @@ python benchmarks/cheetah_losses.py --losses sac qr_sac --seeds 0 1
 """
 
 import argparse
-import csv
 import json
 import sys
 from pathlib import Path
@@ -23,6 +22,7 @@ from cheetah_speed import cheetah_env, cheetah_space, cheetah_style_reward
 
 from coachable.evaluation.curves import draw_learning_curves
 from coachable.evaluation.statistics import bootstrap_interval
+from coachable.evaluation.style_grid import write_csv
 from coachable.keys import STYLE, STYLE_FEATURES
 from coachable.training.weights import load_policy
 from coachable.transforms import coachable_env
@@ -81,10 +81,7 @@ def main() -> None:
     axes.set(xlabel="requested speed [m/s]", ylabel="realised speed [m/s]")
     axes.legend(frameon=False)
     figure.savefig(args.out / "response.png", dpi=120, bbox_inches="tight")
-    with (args.out / "response.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv(rows, args.out / "response.csv")
     (args.out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
     for loss, values in summary.items():
         print(f"{loss}: mean error {np.mean(values['mean_error']):.2f} m/s, slope {np.mean(values['slope']):.2f}")

@@ -8,24 +8,17 @@ and losses.csv.
 """
 
 import argparse
-import csv
 from pathlib import Path
 
 import numpy as np
 from trainings import train
 
-from coachable.evaluation.curves import draw_learning_curves
+from coachable.evaluation.curves import draw_learning_curves, read_metric
 from coachable.evaluation.statistics import interquartile_mean, stratified_interval
 from coachable.evaluation.style_grid import write_csv
 
 METRIC = "eval/task_return"
 EVALUATIONS = 7
-
-
-def values_of(run: Path) -> list[float]:
-    """The metric, in the order of the evaluations."""
-    with (run / "metrics.csv").open(newline="") as file:
-        return [float(row[METRIC]) for row in csv.DictReader(file) if row.get(METRIC)]
 
 
 def main() -> None:
@@ -47,7 +40,7 @@ def main() -> None:
     draw_learning_curves(runs, args.out / "losses.png", x="updates", y=METRIC, smooth=1)
     rows = []
     for loss, folders in runs.items():
-        final = np.array([[values_of(folder)[-1]] for folder in folders])
+        final = np.array([[read_metric(folder, "frames", METRIC)[1][-1]] for folder in folders])
         low, high = stratified_interval(final)
         row = {"loss": loss, "seeds": len(folders), "iqm": float(interquartile_mean(final[:, 0]))}
         each = {f"seed_{seed}": float(value) for seed, value in zip(args.seeds, final[:, 0], strict=True)}

@@ -155,7 +155,8 @@ class CombatEnv(EnvBase):
         weights = torch.cat([task_weights().unsqueeze(0), style_weights(reward_scale)[chosen]])
         self._weights, self._fires = weights.to(on), event_components()[chosen].to(on)
         self._machine_pool, self._site_pool = self._machine_pool.to(on), self._site_pool.to(on)
-        self._scenarios = torch.tensor([_position(name, self.scenario_names) for name in MACHINE_NAMES], device=on)
+        position = {name: index for index, name in enumerate(self.scenario_names)}
+        self._scenarios = torch.tensor([position.get(name, -1) for name in MACHINE_NAMES], device=on)
         self._place_pillars(self._site_pool)
 
     def _place_pillars(self, sites: Tensor) -> None:
@@ -284,8 +285,3 @@ def _numbers(what: str, names: Sequence[str], known: Sequence[str]) -> Tensor:
     if unknown or isinstance(names, str) or not names:
         raise ValueError(f"{what} are {names!r}: expected a list of at least one of {list(known)}")
     return torch.tensor([known.index(name) for name in names])
-
-
-def _position(name: str, names: Sequence[str]) -> int:
-    """Return the index of a name, or -1 if it is not among the names."""
-    return names.index(name) if name in names else -1
