@@ -65,25 +65,20 @@ def evaluate_styles(
     """
     episodes, switch_episodes = settings.episodes, settings.switch_episodes
     grid = evaluate_grid(domain, agent.actor, agent.space, episodes=episodes, **settings.rollout)
-    trials = evaluate_trials(domain, agent, settings)
+    trials = _evaluate_trials(domain, agent, settings)
     switching = None
     if switch_episodes:
         switching = evaluate_switching(domain, agent.actor, agent.space, episodes=switch_episodes, **settings.rollout)
     tables = {"grid": grid.rows(), "response": grid.response(agent.space)}
-    tables |= {"medians": median_rows(domain, grid), "trials": trials}
+    tables |= {"medians": _median_rows(domain, grid), "trials": trials}
     title = f"{domain.name}: {counted(episodes, 'episode')} of {grid.steps} steps per style, 95 % intervals"
     draw_style_grid(grid, domain, agent.space, out / "grid.png", title)
     report = _report(domain, agent, grid, tables, switching, switch_episodes)
     return write_results(out, report, _summary(grid, tables, switching), tables), grid
 
 
-def evaluate_trials(domain: Domain, agent: LoadedPolicy, settings: EvaluationSettings) -> list[dict[str, Any]]:
-    """Count the episodes that survive in each of a domain's trials, in the agent's default style.
-
-    Returns:
-        One row per trial with its label, the number of episodes, how many of them survived, and the 95 % Wilson
-        interval of their share.
-    """
+def _evaluate_trials(domain: Domain, agent: LoadedPolicy, settings: EvaluationSettings) -> list[dict[str, Any]]:
+    """Return a row per trial of the domain: how many episodes in the default style survive, with Wilson intervals."""
     rows = []
     count = max(1, round(1.8 * settings.episodes))  # 36 for 20 episodes per style
     style = agent.space.describe(agent.space.default)
@@ -97,13 +92,8 @@ def evaluate_trials(domain: Domain, agent: LoadedPolicy, settings: EvaluationSet
     return rows
 
 
-def median_rows(domain: Domain, grid: StyleGrid) -> list[dict[str, Any]]:
-    """Return the median, the lowest and the highest style of each published metric of a domain that has targets.
-
-    Returns:
-        Rows with the metric, its unit, the three values, its target and whether the median meets it; the last two are
-        empty without a target.
-    """
+def _median_rows(domain: Domain, grid: StyleGrid) -> list[dict[str, Any]]:
+    """Return a row per published metric of a domain with targets: median, lowest and highest style, and its target."""
     rows = []
     for name in [name for name in domain.columns if name in grid.episodes and domain.targets]:
         means = np.array([mean_of(values) for values in grid.episodes[name]])

@@ -165,7 +165,7 @@ class GuardedConnection(server.ServerConnection):
             if self.subprotocol == PROTOCOL:
                 return message
             try:
-                wanted = is_wanted(message)
+                wanted = _is_wanted(message)
             except Exception as error:  # random bytes can raise anything
                 _log.info("a message was refused: %s", error)
                 await self.close(1007, "this is not a message of the page")
@@ -185,15 +185,8 @@ class GuardedConnection(server.ServerConnection):
             await asyncio.sleep(self._free_at - now)
 
 
-def is_wanted(raw: bytes | str) -> str:
-    """Return the type of a browser's message if the page needs it, otherwise an empty text.
-
-    Args:
-        raw: The message as received.
-
-    Raises:
-        ValueError: If it is not a message of the page.
-    """
+def _is_wanted(raw: bytes | str) -> str:
+    """Return the type of a browser's message if the page needs it, otherwise ""; raise if it is none of the page."""
     if isinstance(raw, str):
         raise ValueError("got a text: expected bytes")
     message = msgspec.msgpack.decode(raw)

@@ -173,7 +173,7 @@ class StyleGrammar:
         return word.isalpha() and len(word) > 1 and word not in RESERVED and word not in self._ignored
 
     def _mention(self, meaning: str) -> Mention:
-        signed, sign, value = read_meaning(meaning)
+        signed, sign, value = _read_meaning(meaning)
         unknown = [name for name in signed if name not in self.parameters]
         if unknown or not signed:
             given = " ".join(unknown or signed)
@@ -329,15 +329,8 @@ class StyleGrammar:
             reading.failed.append(f"{', '.join(repr(word) for word in segment.unknown)} in '{segment.text}'")
 
 
-def read_meaning(meaning: str) -> tuple[tuple[str, ...], int, str]:
-    """Split a meaning of the vocabulary, such as "-gap_ahead -gap_beside" or "pose=arms_up".
-
-    Returns:
-        The names of the parameters, their sign (+1, -1, or 0 for none), and the value ("" for none).
-
-    Raises:
-        ValueError: If the names have different signs.
-    """
+def _read_meaning(meaning: str) -> tuple[tuple[str, ...], int, str]:
+    """Split a meaning such as "-gap_ahead -gap_beside" or "pose=arms_up" into names, sign (0 for none) and value."""
     names, _, value = meaning.partition("=")
     signs = {_SIGNS.get(name[0], 0) for name in names.split()} or {0}
     if len(signs) > 1:
@@ -353,7 +346,7 @@ def fitting(words: Words, parameters: Sequence[Parameter]) -> Words:
         return name in options and (not options[name] or value in ("", *options[name]))
 
     def means(meaning: str) -> bool:
-        named, _, value = read_meaning(meaning)
+        named, _, value = _read_meaning(meaning)
         return all(known(name, value) for name in named)
 
     vocabulary = {meaning: phrases for meaning, phrases in words.vocabulary.items() if means(meaning)}

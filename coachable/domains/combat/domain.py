@@ -19,17 +19,10 @@ from coachable.envs.combat.tables import SITES, STYLES
 from coachable.scene.renderer import SceneRenderer
 
 
-def make_combat_env(
+def _make_combat_env(
     num_envs: int = 128, seed: int | None = None, num_threads: int | None = None, **options: Any
 ) -> CombatEnv:
-    """Make a `CombatEnv` that emits `components` for the measures.
-
-    Args:
-        num_envs: Number of fights.
-        seed: Seed of scenarios and fights.
-        num_threads: Ignored; torch's own threads are used.
-        **options: Options of `CombatEnv`.
-    """
+    """Make a `CombatEnv` that emits `components` for the measures; torch's own threads are used, not `num_threads`."""
     return CombatEnv(num_envs, seed=seed, components=True, **options)
 
 
@@ -43,7 +36,7 @@ def _as_trained(settings: Mapping[str, Any]) -> Domain:
     return replace(
         DOMAIN,
         recorded=replace(DOMAIN.recorded, alike=lambda _: {"machines": machines[-1:], "sites": SITES[-1:]}),
-        make_env=partial(make_combat_env, **options),
+        make_env=partial(_make_combat_env, **options),
         make_space=make_space,
         measures=CombatMeasures(styles, scale),
         grid=single_styles(make_space()),
@@ -54,7 +47,7 @@ def _as_trained(settings: Mapping[str, Any]) -> Domain:
 
 DOMAIN = Domain(
     name="combat",
-    make_env=make_combat_env,
+    make_env=_make_combat_env,
     make_space=combat_style_space,
     make_reward=combat_style_reward,
     measures=CombatMeasures(),

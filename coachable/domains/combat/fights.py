@@ -95,8 +95,8 @@ def evaluate_fights(domain: Domain, agent: LoadedPolicy, out: Path, settings: Ev
         timeline = coached.timeline()
         tables |= {"switches": coached.switches(), "timeline": timeline}
         draw_timeline(timeline, out / "timeline.png")
-    draw_damage(damage, out / "damage.png")
-    draw_sweep(sweep, out / "sweep.png")
+    _draw_damage(damage, out / "damage.png")
+    _draw_sweep(sweep, out / "sweep.png")
     scores = {row["style"]: row["style_score"] for row in damage if row["style_score"] is not None}
     summary = {
         "style_score": scores,
@@ -210,13 +210,8 @@ def _correlations(sweep: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     return found
 
 
-def draw_damage(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw the damage matrix with a column per requested style and a row per kind of damage (paper).
-
-    Args:
-        rows: Rows of `damage_rows`.
-        path: Image file to write.
-    """
+def _draw_damage(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Draw the damage matrix with a column per requested style and a row per kind of damage (paper)."""
     kinds = [*SOURCES, *STATES]
     shares = np.array([[row[kind] for row in rows] for kind in kinds])
     labels = [f"{readable(row['style'])}\n{row['won']:.0%} won" for row in rows]
@@ -224,13 +219,8 @@ def draw_damage(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     draw_heat_map(path, shares, list(map(readable, kinds)), labels, ".2f", title, row_line=len(SOURCES), high=1.0)
 
 
-def draw_sweep(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw the style score over the weight, with a panel per style.
-
-    Args:
-        rows: Rows with `style`, `weight`, `style_score` and `won`.
-        path: Image file to write.
-    """
+def _draw_sweep(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Draw the style score over the weight, with a panel per style."""
     names = list(dict.fromkeys(row["style"] for row in rows))
     columns = min(len(names), 5)
     count = -(-len(names) // columns)

@@ -41,7 +41,7 @@ def evaluate_gait(domain: Domain, agent: LoadedPolicy, out: Path, settings: Eval
     report, grid = evaluate_styles(domain, agent, out, settings)
     rows = plane_rows(grid)
     write_csv(rows, out / "plane.csv")
-    draw_plane(rows, out / "plane.png")
+    _draw_plane(rows, out / "plane.png")
     report += _section(rows)
     (out / "report.md").write_text(report)
     return report
@@ -67,13 +67,8 @@ def plane_rows(grid: StyleGrid) -> list[dict[str, Any]]:
     return rows
 
 
-def draw_plane(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw survival, speed and step length over the plane of requests, one column per pose; walked styles are framed.
-
-    Args:
-        rows: From `plane_rows`.
-        path: PNG file to write.
-    """
+def _draw_plane(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Draw survival, speed and step length over the plane of requests, a column per pose; walked styles are framed."""
     poses = list(dict.fromkeys(row["pose"] for row in rows))
     speeds, lengths = (sorted({row[name] for row in rows}) for name in ("speed", "step_length"))
     with drawing(path, len(_PANELS), len(poses), size=(3.6 * len(poses), 3.2 * len(_PANELS)), grid=False) as panels:

@@ -85,7 +85,7 @@ def evaluate_drift(domain: Domain, agent: LoadedPolicy, out: Path, settings: Eva
             "most_turns": max(row["most_turns"] for row in own),
         }
     summary |= {"episodes_per_weight": settings.episodes, "seed": settings.seed}
-    draw_drift(rows, out / "drift.png")
+    _draw_drift(rows, out / "drift.png")
     circuits = drive_circuits(domain, agent, settings)
     home = home_track("drift", agent.config.get("env", {}))
     bounds = drift_bounds(rows_where(rows, sweep=JUDGED), _MIDDLE) + lap_bounds(circuits, home)
@@ -109,13 +109,8 @@ def _rows(sweep: str, episodes: Mapping[str, np.ndarray]) -> list[dict[str, Any]
     return rows
 
 
-def draw_drift(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw the mean sideslip in corners with its 95 % interval, and the pace, over the weight; one line per sweep.
-
-    Args:
-        rows: One row per sweep and weight, with the measured angles in degrees.
-        path: Image file to write.
-    """
+def _draw_drift(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Draw the mean sideslip in corners with its 95 % interval, and the pace, over the weight; one line per sweep."""
     with drawing(path, 1, 2, size=(9.0, 3.8)) as ((left, right),):
         for sweep, marker in zip(SWEEPS, "ovs", strict=True):
             own = rows_where(rows, sweep=sweep)

@@ -23,34 +23,22 @@ CAR = {"drift": "street", "resources": "x2019", "aggressiveness": "gt3"}  # of e
 HOME = {"drift": "ridge", "resources": "lakeside", "aggressiveness": "endurance"}  # circuit of each family
 
 
-def drift_env(num_envs: int = 64, **options: Any) -> RacingEnv:
-    """Make the environment of drifting: a street car on Ridge, launched anywhere in any direction.
-
-    The car may slide backwards for ten seconds.
-
-    Args:
-        num_envs: Number of cars that the agent drives.
-        **options: Options of `RacingEnv`.
-    """
+def _drift_env(num_envs: int = 64, **options: Any) -> RacingEnv:
+    """Make the environment of drifting: a street car on Ridge, launched anywhere in any direction."""
     options = {
         "track": HOME["drift"],
         "car": CAR["drift"],
         "scenarios": drift_scenarios(),
-        "wrong_way_time": 10.0,
+        "wrong_way_time": 10.0,  # [s], for which the car may slide backwards
     } | options
     return RacingEnv(num_envs, **options)
 
 
-def resource_env(num_envs: int = 64, **options: Any) -> RacingEnv:
+def _resource_env(num_envs: int = 64, **options: Any) -> RacingEnv:
     """Make the environment of saving: an X2019 on Lakeside with random tyres and fuel, for stints of about ten laps.
 
-    Args:
-        num_envs: Number of cars that the agent drives. If it is not a multiple of `cars`, the agent drives one car of
-            each race. Cars that it does not drive are scripted.
-        **options: Options of `RacingEnv`.
-
-    Raises:
-        ValueError: If there are no calibrated rates of the car, so that its savings could not be evaluated.
+    The agent drives all cars, or one of each race if `num_envs` is not a multiple of `cars`; the others are scripted.
+    A `ValueError` is raised for a car without calibrated rates, because its savings could not be evaluated.
     """
     rates = Resources.calibrated(typical_car("resources", options))
     cars = options.get("cars", 1)
@@ -68,13 +56,11 @@ def resource_env(num_envs: int = 64, **options: Any) -> RacingEnv:
     return RacingEnv(num_envs, **(defaults | options))
 
 
-def rival_env(num_envs: int = AGENTS * 21, **options: Any) -> RacingEnv:
+def _rival_env(num_envs: int = AGENTS * 21, **options: Any) -> RacingEnv:
     """Make races of GT3 cars against rivals, which are scripted or copies of the policy, from all kinds of starts.
 
-    Args:
-        num_envs: Number of cars that the agent drives: three of the five cars of each race, or one if it is no multiple
-            of three or `cars` is less.
-        **options: Options of `RacingEnv`.
+    The agent drives three of the five cars of each race, or one if `num_envs` is no multiple of three or `cars` is
+    less.
     """
     tracks, driver = _line_follower(options, "aggressiveness")
     space = styles.aggressiveness_style_space()
@@ -104,10 +90,10 @@ class Family(NamedTuple):
 
 
 _FAMILIES = {
-    "drift": Family(drift_env, styles.drift_style_space, styles.drift_style_reward),
-    "resources": Family(resource_env, styles.resource_style_space, styles.resource_style_reward),
+    "drift": Family(_drift_env, styles.drift_style_space, styles.drift_style_reward),
+    "resources": Family(_resource_env, styles.resource_style_space, styles.resource_style_reward),
     "aggressiveness": Family(
-        rival_env, partial(styles.aggressiveness_style_space, AGENTS), styles.aggressiveness_style_reward
+        _rival_env, partial(styles.aggressiveness_style_space, AGENTS), styles.aggressiveness_style_reward
     ),
 }
 

@@ -101,7 +101,7 @@ def evaluate_aggressiveness(domain: Domain, agent: LoadedPolicy, out: Path, sett
         ranks = {name: rank_correlation(gained["requested"], gained[name]) for name in _RANKED}
         summary.setdefault(margin, {})[setting] = ranks
     summary |= {"races_per_row": len(OTHERS) * episodes, "seed": seed}
-    draw_radar(rows, out / "radar.png")
+    _draw_radar(rows, out / "radar.png")
     circuits = drive_circuits(domain, agent, settings)
     bounds = _bounds(cells, values) + lap_bounds(circuits, home_track("aggressiveness", agent.config.get("env", {})))
     summary |= {"circuits": circuits_summary(circuits), "bounds": bounds_summary(bounds)}
@@ -279,15 +279,8 @@ def _rows(cells: Sequence[tuple[str, str, float]], found: Mapping[str, np.ndarra
     return rows
 
 
-def draw_radar(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw a radar per margin and setting, with a polygon per requested value.
-
-    Every axis spans the lowest to the highest value of the setting.
-
-    Args:
-        rows: One row per margin, setting and requested value [m], with the means over races.
-        path: Image file to write.
-    """
+def _draw_radar(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Draw a radar per margin and setting, with a polygon per requested value; axes span the values of the setting."""
     angles = np.linspace(0.0, 2.0 * np.pi, len(_METRICS), endpoint=False) + np.pi / 2
     shape = (len(MARGINS), len(SETTINGS))
     with drawing(path, *shape, size=(9.5, 9.2), grid=False, subplot_kw={"projection": "polar"}) as panels:

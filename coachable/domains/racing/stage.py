@@ -61,7 +61,7 @@ class RacingStage:
         """Return what is visible now; see `Stage.frame`."""
         env = cast(RacingEnv, simulation_env(env))
         state = env.state.cpu().numpy()
-        columns, track = mates(env, row), _track(env, row)
+        columns, track = _mates(env, row), _track(env, row)
         key = (int(env.episode[row % env.races]), tuple(columns))
         if key != self._key:
             self._begin()
@@ -113,13 +113,8 @@ class RacingStage:
         return slip
 
 
-def mates(env: RacingEnv, row: int) -> list[int]:
-    """Return the columns of the cars that meet the car of a row, itself first.
-
-    Args:
-        env: The base environment.
-        row: Row of the car.
-    """
+def _mates(env: RacingEnv, row: int) -> list[int]:
+    """Return the columns of the cars that meet the car of a row, itself first."""
     car, race = divmod(row, env.races)
     group = env.group[:, race].cpu()
     others = [k for k in range(env.cars) if k != car and group[k] == group[car]]

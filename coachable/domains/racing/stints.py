@@ -123,8 +123,8 @@ def evaluate_resources(domain: Domain, agent: LoadedPolicy, out: Path, settings:
         summary["traffic"] = response
         report += traffic_report(traffic, response)
         draw_traffic(traffic, out / "traffic.png")
-    draw_stints(rows_where(every, circuit=home), out / "stints.png")
-    draw_tradeoff(rows, frontiers, out / "tradeoff.png")
+    _draw_stints(rows_where(every, circuit=home), out / "stints.png")
+    _draw_tradeoff(rows, frontiers, out / "tradeoff.png")
     tables = {"bounds": bounds, "stints": rows, "laps": every, "traffic": traffic, "circuits": circuits}
     return write_results(out, report + bounds_report(bounds), summary, tables)
 
@@ -248,13 +248,8 @@ def _summary(rows: Sequence[Mapping[str, Any]], episodes: int, seed: int) -> dic
     return summary | {"stints_per_weight": episodes, "seed": seed}
 
 
-def draw_stints(laps: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw the mean resource left and lap times over laps, with one column per resource and one line per weight.
-
-    Args:
-        laps: One row per lap, with `resource`, `weight`, `lap`, `time` [s] and `left`.
-        path: Image file to write.
-    """
+def _draw_stints(laps: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Draw the mean resource left and lap times over laps, with one column per resource and one line per weight."""
     labels = {"fuel": "fuel left [l]", "tyre": "mean tyre wear"}
     with drawing(path, 2, len(WEIGHTS), size=(9.5, 6.4)) as axes:
         for column, (resource, name) in enumerate(WEIGHTS.items()):
@@ -276,16 +271,10 @@ def draw_stints(laps: Sequence[Mapping[str, Any]], path: Path) -> None:
             axes[0, column].legend(fontsize=8)
 
 
-def draw_tradeoff(
+def _draw_tradeoff(
     rows: Sequence[Mapping[str, Any]], frontiers: Mapping[tuple[str, str], Sequence[Mapping[str, float]]], path: Path
 ) -> None:
-    """Draw the range over the lap time, for the agent and the frontier.
-
-    Args:
-        rows: One row per circuit, resource and weight, with `lap_time` [s] and `range_km` [km].
-        frontiers: Points of the bound, by circuit and resource.
-        path: Image file to write.
-    """
+    """Draw the range over the lap time, for the agent and the frontier."""
     tracks = list(dict.fromkeys(track for track, _ in frontiers))
     with drawing(path, len(tracks), len(WEIGHTS), size=(9.5, 4.0 * len(tracks))) as panels:
         for axes, ((track, resource), bound) in zip(panels.flat, frontiers.items(), strict=True):

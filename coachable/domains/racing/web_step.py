@@ -125,17 +125,10 @@ class _Judge(nn.Module):
         )
 
 
-def racing_steps(env: RacingEnv, family: str, style: Tensor) -> Steps:
-    """Return a control step of a car that is alone.
-
-    The functions are those of the environment and of the domain's scene. The whole state is one row: state of the
-    physics, state of the task, compound, and what the picture remembers.
-
-    Args:
-        env: Environment of one car, after a reset.
-        family: Name of the family, "drift" or "resources".
-        style: Example of a style (1, d).
-    """
+def _racing_steps(env: RacingEnv, family: str, style: Tensor) -> Steps:
+    """Return a control step of a car that is alone, from its environment after a reset and a style (1, d)."""
+    # The functions are those of the environment and of the domain's scene. The whole state is one row: state of the
+    # physics, state of the task, compound, and what the picture remembers.
     names = [measure.name for measure in MEASURES[family]]
     return Steps(
         command=_Command(env),
@@ -192,7 +185,7 @@ def racing_web(
         idle_note=IDLE_NOTES.get(family, ""),
         picture="The car on its circuit, seen from behind",
         window=10.0,
-        steps=racing_steps(env, family, space.default[None]),
+        steps=_racing_steps(env, family, space.default[None]),
         figures=[body(size.kind, size.length, size.width, CARS[0]), *[wheel(size.radius)] * 4],
         backdrop=circuit(track),
         viewpoint=RacingStage.viewpoint,

@@ -113,13 +113,8 @@ def encode_position(offset: Tensor) -> Tensor:
     return torch.cat([offset / distance, distance.sin(), (0.1 * distance).sin(), (0.01 * distance).sin()])
 
 
-def to_camera(vector: Tensor, axes: Tensor) -> Tensor:
-    """Rotate world vectors (2, ..., N) to the forward and left directions of the camera, ignoring its pitch.
-
-    Args:
-        vector: Vectors (2, ..., N).
-        axes: Forward direction of the camera (2, N).
-    """
+def _to_camera(vector: Tensor, axes: Tensor) -> Tensor:
+    """Rotate world vectors (2, ..., N) to the camera's forward and left directions, from its forward one (2, N)."""
     x, y = vector
     fx, fy = axes
     return torch.stack((fx * x + fy * y, fx * y - fy * x))
@@ -128,7 +123,7 @@ def to_camera(vector: Tensor, axes: Tensor) -> Tensor:
 def _ground(position: Tensor, s: State, axes: Tensor) -> Tensor:
     """Encode positions on the ground (2, k, N) or (2, N) relative to the eye."""
     own = s.position.view(2, *[1] * (position.ndim - 2), -1)
-    flat = to_camera(position - own, axes)
+    flat = _to_camera(position - own, axes)
     return encode_position(torch.cat([flat, torch.full_like(flat[:1], -c.EYE_HEIGHT)]))
 
 
@@ -147,7 +142,7 @@ def one_hot_rows(index: Tensor, size: int) -> Tensor:
 
 def _body(s: State, traits: Traits, axes: Tensor) -> Tensor:
     """Return the centres of the machines relative to the eye (3, E, N), aligned with the camera [m]."""
-    flat = to_camera(s.enemy_position - s.position.unsqueeze(1), axes)
+    flat = _to_camera(s.enemy_position - s.position.unsqueeze(1), axes)
     return torch.cat([flat, (s.enemy_z + traits.radius - c.EYE_HEIGHT).unsqueeze(0)])
 
 
@@ -218,7 +213,7 @@ def _player_rows(s: State, ammo: Tensor, axes: Tensor, episode_steps: int) -> Te
         s.weapon_stamina / c.WEAPON_STAMINA,
         s.technique,
         s.stamina / c.STAMINA,
-        *(to_camera(s.velocity, axes) * _SPEED_SCALE),
+        *(_to_camera(s.velocity, axes) * _SPEED_SCALE),
         s.pitch.sin(),
         s.pitch.cos(),
         timers[AIR],
@@ -268,8 +263,8 @@ def _enemy_rows(s: State, traits: Traits, axes: Tensor, small: bool) -> Tensor:
     rows = [
         encode_position(body),
         torch.stack((bearing, pitch_error)) / torch.pi,
-        to_camera(facing(s.enemy_yaw), axes),
-        to_camera(s.enemy_velocity, axes) * _SPEED_SCALE,
+        _to_camera(facing(s.enemy_yaw), axes),
+        _to_camera(s.enemy_velocity, axes) * _SPEED_SCALE,
         traits.radius.unsqueeze(0) / 2.6,
         torch.stack((s.enemy_hp / traits.hp, (s.enemy_hp / _HP_MAX).sqrt())),
         *([] if small else [one_hot_rows(s.machine, len(MACHINE_NAMES))]),
@@ -279,14 +274,14 @@ def _enemy_rows(s: State, traits: Traits, axes: Tensor, small: bool) -> Tensor:
         one_hot_rows(s.phase, NUM_PHASES) * living,
         (s.phase_timer.clamp(0.0, 2.0 * c.FPS) * (s.phase > IDLE) * _TIMER_SCALE).unsqueeze(0),
         _attack_id(s, traits),
-        to_camera(s.lock, axes) * (s.phase == ACTIVE),
+        _to_camera(s.lock, axes) * (s.phase == ACTIVE),
         torch.stack((1.0 * (s.phase == STAGGERED), 1.0 * (3.0 * s.enemy_hp < traits.hp), living)),
     ]
     return torch.cat([*rows, *_part_rows(s, traits, body, axes, small)])
 
 
 def _part_rows(s: State, traits: Traits, body: Tensor, axes: Tensor, small: bool) -> list[Tensor]:
-    heading = to_camera(facing(s.enemy_yaw), axes)  # (2, E, N)
+    heading = _to_camera(facing(s.enemy_yaw), axes)  # (2, E, N)
     x, y, z = traits.offset
     place = torch.stack(
         (

@@ -270,7 +270,12 @@ def move_player(s: State, intent: Intent, traits: Traits, site: Tensor) -> None:
     evading = torch.where(s.timers[DODGE] > 0, c.DODGE_SPEED, c.SLIDE_SPEED) * s.dodge
     in_motion = (s.timers[DODGE] > 0) | (s.timers[SLIDE] > 0)
     s.velocity = torch.where(in_motion, evading, velocity)
-    s.position = keep_out(inside_wall(s.position + c.DT * s.velocity, site), s, traits)
+    position = inside_wall(s.position + c.DT * s.velocity, site)
+    second = nearest(s)  # the player is moved out of its body
+    offset = position - pick(s.enemy_position, second)
+    distance, space = offset.square().sum(0).sqrt().clamp(min=1e-3), pick(traits.radius, second) + c.BODY_RADIUS
+    solid = pick(s.enemy_hp, second) > 0
+    s.position = position + offset * torch.where(solid, (space / distance - 1.0).clamp(min=0.0), 0.0)
 
 
 def inside_wall(position: Tensor, site: Tensor) -> Tensor:
@@ -284,26 +289,6 @@ def inside_wall(position: Tensor, site: Tensor) -> Tensor:
         (2, ..., N) [m].
     """
     return position * (site[3] / position.square().sum(0).sqrt().clamp(min=1.0)).clamp(max=1.0)
-
-
-def keep_out(position: Tensor, s: State, traits: Traits) -> Tensor:
-    """Return player positions (2, N) moved out of the body of the nearest living enemy.
-
-    Args:
-        position: (2, N) [m].
-        s: The state.
-        traits: Traits of the machines.
-
-    Returns:
-        (2, N) [m].
-    """
-    second = nearest(s)
-    centre, space = pick(s.enemy_position, second), pick(traits.radius, second) + c.BODY_RADIUS
-    solid = pick(s.enemy_hp, second) > 0
-    offset = position - centre
-    distance = offset.square().sum(0).sqrt().clamp(min=1e-3)
-    push = torch.where(solid, (space / distance - 1.0).clamp(min=0.0), 0.0)
-    return position + offset * push
 
 
 def turn_camera(s: State, intent: Intent, cone: float, share: float, bearing: Tensor, elevation: Tensor) -> None:

@@ -111,24 +111,14 @@ def run_frames(s: State, intent: Intent, rules: Rules, noise: Noise) -> Totals:
     totals = Totals.zeros(s.enemy_hp, PART_SLOTS)
     strength = ranged_strength(s, rules.traits)
     for frame in range(c.FRAMES_PER_STEP):
-        run_frame(s, intent, rules, totals, strength, noise, frame)
+        _run_frame(s, intent, rules, totals, strength, noise, frame)
     return totals
 
 
-def run_frame(
+def _run_frame(
     s: State, intent: Intent, rules: Rules, totals: Totals, strength: Tensor, noise: Noise, frame: int
 ) -> None:
-    """Advance the fights by one frame: the player, its attacks, the machines, and theirs.
-
-    Args:
-        s: State, changed in place.
-        intent: What the players want; `loaded` changes in place.
-        rules: Rules of the fights.
-        totals: Record of the step, changed in place.
-        strength: Share of weapon parts left at the beginning of the step (E, N).
-        noise: Random numbers of the step.
-        frame: Number of the frame in the step.
-    """
+    """Advance the fights by one frame: the player, its attacks, the machines, and theirs."""
     traits, site = rules.traits, rules.site
     run_timers(s, intent)
     move_player(s, intent, traits, site)

@@ -54,16 +54,8 @@ def rotate_to_course(vectors: np.ndarray, course: np.ndarray) -> np.ndarray:
     return np.stack([cosine * x + sine * y, cosine * y - sine * x], axis=-1)
 
 
-def orientation_to_course(quaternion: np.ndarray, course: np.ndarray) -> np.ndarray:
-    """Return orientations relative to the course.
-
-    Args:
-        quaternion: (N, 4) unit quaternions in the world's frame.
-        course: (N,) direction of the course [rad].
-
-    Returns:
-        (N, 4) unit quaternions with w >= 0, which makes them unique.
-    """
+def _orientation_to_course(quaternion: np.ndarray, course: np.ndarray) -> np.ndarray:
+    """Return unit quaternions (N, 4) relative to the course (N,) [rad], with w >= 0, which makes them unique."""
     half = 0.5 * course
     cosine, sine = np.cos(half), np.sin(half)
     w, x, y, z = quaternion.T
@@ -83,7 +75,7 @@ def cosine_to_course(quaternion: np.ndarray, course: np.ndarray) -> np.ndarray:
     Returns:
         (N,) in [-1, 1].
     """
-    _, _, y, z = orientation_to_course(quaternion, course).T
+    _, _, y, z = _orientation_to_course(quaternion, course).T
     return 1.0 - 2.0 * (y * y + z * z)
 
 
@@ -135,6 +127,6 @@ def observe(
         gait: (N, 11) from `GaitTracker.observe`.
     """
     suite = suite_observation(positions, velocities, kinematics, course)
-    pelvis = orientation_to_course(kinematics.pelvis_quaternion, course)
+    pelvis = _orientation_to_course(kinematics.pelvis_quaternion, course)
     values = np.concatenate([suite, pelvis, gait], axis=1) * OBSERVATION_SCALE
     return values.astype(np.float32)
