@@ -199,7 +199,7 @@ class EventTableBuffer(TensorDictReplayBuffer):
         with self._replay_lock:
             return self._storage.get(slots.to(self._storage.device))  # type: ignore[arg-type]
 
-    def statistics(self) -> dict[str, dict[str, int | float]]:
+    def statistics(self) -> dict[str, dict[str, int]]:
         """Return numbers per table, see `TableWriter.statistics`."""
         return self._writer.statistics()
 

@@ -156,20 +156,11 @@ class TableWriter(Writer):
     def _index(self, rows: np.ndarray) -> Tensor:
         return torch.from_numpy(rows).to(self._device or "cpu")
 
-    def statistics(self) -> dict[str, dict[str, int | float]]:
-        """Return for each table `size`, `capacity`, `fill`, `written`, `evicted`, `events`, and `lost` copies."""
-        sizes = self.regions.sizes
+    def statistics(self) -> dict[str, dict[str, int]]:
+        """Return for each table its `size`, the number of `events` so far, and of `lost` copies."""
+        counts = zip(self.regions.names, self.regions.sizes, self._fired, self._lost, strict=True)
         return {
-            name: {
-                "size": int(sizes[i]),
-                "capacity": int(self.regions.capacities[i]),
-                "fill": float(sizes[i] / self.regions.capacities[i]),
-                "written": int(self.regions.written[i]),
-                "evicted": int(self.regions.written[i] - sizes[i]),
-                "events": int(self._fired[i]),
-                "lost": int(self._lost[i]),
-            }
-            for i, name in enumerate(self.regions.names)
+            name: {"size": int(size), "events": int(fired), "lost": int(lost)} for name, size, fired, lost in counts
         }
 
     def _empty(self, empty_write_count: bool = True) -> None:

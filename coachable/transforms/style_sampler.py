@@ -196,7 +196,6 @@ def coachable_env(
     style_reward: StyleReward,
     *transforms: Transform,
     seed: int | None = None,
-    **kwargs: Any,
 ) -> CoachableEnv:
     """Add `StyleSampler`, `StyleRewardTransform` and any further transforms to an environment, in this order.
 
@@ -206,14 +205,13 @@ def coachable_env(
         style_reward: Style reward.
         *transforms: Further transforms, such as `StepCounter` or `RewardSum`.
         seed: Seed of the environment and its transforms; None does not seed them.
-        **kwargs: Further arguments of `TransformedEnv`.
 
     Returns:
         The environment, ready for a collector.
     """
     styles = StyleSampler(space, seed=seed)
     chain = Compose(styles, StyleRewardTransform(style_reward), *transforms)  # pyright: ignore[reportCallIssue]
-    env = CoachableEnv(base_env=base_env, transform=chain, **kwargs)
+    env = CoachableEnv(base_env=base_env, transform=chain)
     if seed is not None:
         env.set_seed(seed)
     return env

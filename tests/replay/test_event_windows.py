@@ -177,12 +177,10 @@ def test_predicates_of_other_domains():
 def test_statistics():
     buffer = one_event_buffer(2, base=4, fed=3)
     buffer.extend(steps(range(6), [i in (1, 4) for i in range(6)]))
-    assert buffer.statistics()["default"] == {
-        "size": 4, "capacity": 4, "fill": 1.0, "written": 6, "evicted": 2, "events": 0, "lost": 0,
-    }  # fmt: skip
-    assert buffer.statistics()["hit"] == {
-        "size": 3, "capacity": 3, "fill": 1.0, "written": 4, "evicted": 1, "events": 2, "lost": 0,
-    }  # fmt: skip
+    assert buffer.statistics() == {
+        "default": {"size": 4, "events": 0, "lost": 0},
+        "hit": {"size": 3, "events": 2, "lost": 0},
+    }
     assert len(buffer) == 7 and buffer.write_count == 6
 
 

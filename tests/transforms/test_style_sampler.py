@@ -24,9 +24,9 @@ from coachable.transforms import CoachableEnv, StyleSampler, coachable_env
 
 @pytest.fixture
 def make_env(space, make_style_reward, make_base_env):
-    def make(num_envs=4, seed=None, p_done=0.2, **settings):
+    def make(num_envs=4, seed=None, p_done=0.2):
         reward = make_style_reward(space)
-        return coachable_env(make_base_env(num_envs, p_done), space, reward, StepCounter(10), seed=seed, **settings)
+        return coachable_env(make_base_env(num_envs, p_done), space, reward, StepCounter(10), seed=seed)
 
     return make
 

@@ -26,26 +26,26 @@ class LiveLoop:
     Args:
         session: The session, which no other thread may step.
         on_step: Called in the loop's thread after each step and after each submitted change.
-        pause_at_end: How long an ended episode is shown before the next one begins [s].
         on_stop: Called in the loop's thread when it ends.
         on_wait: Called in the loop's thread about 30 times per second while it waits for the next step.
 
     Attributes:
+        pause_at_end: How long an ended episode is shown before the next one begins [s].
         speed: Simulated seconds per second, a finite number above 0.
         paused: Whether the loop only makes single steps.
         problem: Text of the last exception, empty if there was none since the last change.
     """
 
+    pause_at_end = 1.0
+
     def __init__(
         self,
         session: CoachSession,
         on_step: Callable[[], None] = lambda: None,
-        pause_at_end: float = 1.0,
         on_stop: Callable[[], None] = lambda: None,
         on_wait: Callable[[], None] = lambda: None,
     ) -> None:
-        self.session, self.on_step, self.pause_at_end = session, on_step, pause_at_end
-        self.on_stop, self.on_wait = on_stop, on_wait
+        self.session, self.on_step, self.on_stop, self.on_wait = session, on_step, on_stop, on_wait
         self._stepped = 0.0
         self._speed = 1.0
         self.paused = False

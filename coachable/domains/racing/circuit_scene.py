@@ -52,15 +52,10 @@ def circuit(track: Track) -> Backdrop:
     return Backdrop(surfaces, _start_line(table).figure(_trees(table, track.spacing), (0.0, 0.0, 0.0)))
 
 
-def outline(track: Track, points: int = 120) -> np.ndarray:
-    """Return points (n, 2) along the centre line for a map [m].
-
-    Args:
-        track: The circuit.
-        points: Number of points, at most.
-    """
+def outline(track: Track) -> np.ndarray:
+    """Return points (n, 2) along the centre line for a map [m], fewer than 240."""
     table = track.table.numpy()
-    return table[:: max(1, len(table) // points), :2]
+    return table[:: max(1, len(table) // 120), :2]
 
 
 def _side(table: np.ndarray, offset: np.ndarray) -> np.ndarray:

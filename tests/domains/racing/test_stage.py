@@ -157,7 +157,7 @@ def test_the_circuit_has_kerbs_in_bends_and_none_on_straights():
         assert surface.faces.max() < len(surface.vertices)
     straight = circuit(load_track("ring")).surfaces
     assert len(straight) == 7  # a ring of 200 m bends everywhere
-    assert len(outline(track)) <= 2 * 120
+    assert len(outline(track)) < 240
 
 
 def test_no_tree_stands_on_the_track():
