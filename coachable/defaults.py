@@ -181,10 +181,6 @@ class EnvPictures:
 def simulation_of(env: EnvBase, row: int = 0) -> tuple[Any, int]:
     """Return the simulation of one row without TorchRL's transforms and wrappers, and how often it is stepped.
 
-    Args:
-        env: Environment of any batch size.
-        row: Row of the batch.
-
     Returns:
         The innermost environment that can be reached in this process, and its number of steps per step of `env`.
     """

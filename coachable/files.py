@@ -80,10 +80,6 @@ def save_state(state: Mapping[str, Any], file: Path) -> None:
 
     The file is a zip archive, which has a checksum of every member.
 
-    Args:
-        state: The containers.
-        file: File to write.
-
     Raises:
         CheckpointError: If `state` contains anything else, which could not be read back.
         OSError: If writing fails.
@@ -101,10 +97,6 @@ def save_state(state: Mapping[str, Any], file: Path) -> None:
 
 def load_state(file: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
     """Read a file of `save_state`, without executing code from it.
-
-    Args:
-        file: The file.
-        device: Device of the tensors.
 
     Raises:
         CheckpointError: If the file is missing, damaged, of another kind, or contains pickled objects.

@@ -121,12 +121,7 @@ class Workers:
         self._reason = "none has started"
 
     def offer(self, version: int, weights: list[Tensor]) -> None:
-        """Offer new weights, which workers get when they are asked for their next batch.
-
-        Args:
-            version: Number of the weights, which rises.
-            weights: Weights from `weights_of`. They are copied.
-        """
+        """Offer a copy of weights from `weights_of`, which workers get with their next request; `version` rises."""
         with self._weights_lock:
             self._flat = flat_weights(weights, self._flat)
             self._version = version

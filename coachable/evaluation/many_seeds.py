@@ -39,16 +39,10 @@ def parse_seeds(text: str) -> list[int]:
 
 
 def train_seeds(script: Path, arguments: Sequence[str], seeds: Sequence[int], folder: Path) -> dict[int, str]:
-    """Train a recipe with several seeds, as many side by side as there are free cores.
+    """Train a recipe with several seeds and arguments KEY=VALUE, as many side by side as there are free cores.
 
     The training with seed S writes to `folder/seed_S`, and what it prints to `folder/seed_S.log`. One that has ended is
     not trained again, and one that was interrupted is continued with the settings that it had.
-
-    Args:
-        script: The recipe.
-        arguments: KEY=VALUE for all trainings.
-        seeds: The seeds.
-        folder: Folder of the trainings.
 
     Returns:
         What is wrong with the trainings that did not end, by seed.

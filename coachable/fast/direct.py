@@ -82,12 +82,7 @@ class Share:
 
 
 def has_direct_gradients(loss_module: LossModule, *plans: Plan) -> bool:
-    """Return whether :class:`DirectGradients` computes a loss, given the plans of its networks.
-
-    Args:
-        loss_module: The loss.
-        *plans: Plans of its networks.
-    """
+    """Return whether :class:`DirectGradients` computes a loss, given the plans of its networks."""
     loss: Any = loss_module
     if type(loss) not in (SACLoss, QRSACLoss) or len(loss.actor_network) != 2:
         return False
@@ -170,12 +165,7 @@ class DirectGradients:
         return loss.detach()
 
     def _gradients(self, batch: TensorDictBase, critic: bool = False, actor: bool = False) -> dict[str, Tensor]:
-        """Set gradients and return the results per transition: `loss`, `td_error`, `log_prob`, `value`, each `(rows,)`.
-
-        Args:
-            batch: The batch.
-            critic: Whether to set the critics' gradients.
-            actor: Whether to set the policy's gradients.
+        """Set the gradients of critics, policy or both; return `loss`, `td_error`, `log_prob`, `value`, each `(rows,)`.
 
         Raises:
             ValueError: If an entry of the batch does not have the width of the networks, which `sac.c` cannot notice.

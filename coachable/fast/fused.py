@@ -60,13 +60,7 @@ class Plan:
                     grad.zero_()
 
     def acquire(self, widths: Sequence[int], rows: int, keep: bool) -> Workspace | TorchPasses:
-        """Return what evaluates the plan once: prepared memory for the compiled kernels, or torch's operations.
-
-        Args:
-            widths: Widths of the inputs.
-            rows: Number of rows.
-            keep: Whether a backward pass will follow.
-        """
+        """Return what evaluates the plan, and back if `keep`: memory for compiled kernels, or torch's operations."""
         kernels = load_kernels().get(self.members[0].products[0].dtype)
         if kernels is None or torch.get_num_threads() > self._kernel_threads:
             return TorchPasses(self.layers, self.members, keep)

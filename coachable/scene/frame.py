@@ -163,12 +163,7 @@ class Stage(Protocol):
         ...
 
     def backdrop(self, env: EnvBase, row: int = 0) -> Backdrop:
-        """Return what does not move, for the place of the last frame.
-
-        Args:
-            env: The base environment.
-            row: Row of the batch.
-        """
+        """Return what does not move, for the place of the last frame."""
         ...
 
     def frame(self, env: EnvBase, row: int = 0, asked: Mapping[str, float | str] | None = None) -> Frame:

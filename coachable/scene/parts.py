@@ -103,12 +103,7 @@ class Parts:
         return self.cylinder((first + last) / 2, (2 * radius, 2 * radius, length), colour, towards(last - first))
 
     def batch(self, shape: str, batch: Batch) -> Parts:
-        """Add primitives of one shape and return this collection.
-
-        Args:
-            shape: Name of the shape.
-            batch: The primitives.
-        """
+        """Add primitives of one shape and return this collection."""
         self._rows[shape].append(batch)
         return self
 

@@ -55,11 +55,7 @@ class SceneRenderer:
         self._build(Backdrop(()))  # raises here if there is no OpenGL
 
     def draw(self, env: EnvBase, row: int = 0) -> np.ndarray:
-        """Draw the present state of one row.
-
-        Args:
-            env: The base environment.
-            row: Row of the batch.
+        """Draw the present state of one row of a base environment.
 
         Returns:
             Image (height, width, 3) uint8.

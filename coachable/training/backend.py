@@ -46,12 +46,7 @@ class Backend:
         return torch.autocast(self._device_type, dtype=torch.bfloat16)
 
     def both(self, losses: LossFunctions, batch: TensorDictBase, trained: Sequence[str]) -> Any:
-        """Evaluate all losses and set their gradients.
-
-        Args:
-            losses: The functions of the loss.
-            batch: Transitions, into which `td_error` is written.
-            trained: Names of the losses to differentiate.
+        """Evaluate all losses, set the gradients of those in `trained`, and write `td_error` into the batch.
 
         Returns:
             The losses and further results by name.

@@ -34,11 +34,7 @@ OBSERVATION, ACTION = mirror_map(OBSERVATION_GROUPS, _TURNED), mirror_map(ACTION
 
 
 def humanoid_mirror_maps(styled_speed: bool = False) -> dict[str | tuple[str, ...], MirrorMap]:
-    """Return the mirror maps of a stored transition by key, for `MirrorSymmetry`.
-
-    Args:
-        styled_speed: Option of the `HumanoidEnv`.
-    """
+    """Return the mirror maps of a stored transition of `HumanoidEnv` by key, for `MirrorSymmetry`."""
     size = STYLED_SPEED_SIZE if styled_speed else STYLE_FEATURES_SIZE
     features = (Signal("arms", NUM_ARM_JOINTS, "", ARM_JOINTS), Signal("gait", size - NUM_ARM_JOINTS))
     return {

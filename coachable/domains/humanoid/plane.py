@@ -48,13 +48,10 @@ def evaluate_gait(domain: Domain, agent: LoadedPolicy, out: Path, settings: Eval
 
 
 def plane_rows(grid: StyleGrid) -> list[dict[str, Any]]:
-    """Return the requests and measurements of each style, and whether the agent walks it.
+    """Return the requests and measurements of each style of humanoid_gait, and whether the agent walks it.
 
     A style is walked if at least 90 % of the episodes end without a fall, the mean speed differs from the request by at
     most 0.15 m/s, and the mean step length by at most 0.06 m.
-
-    Args:
-        grid: Measurements of the domain humanoid_gait.
     """
     rows = []
     for index, cell in enumerate(grid.cells):

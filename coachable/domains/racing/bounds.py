@@ -55,11 +55,7 @@ def bound(
 
 
 def bounds_report(rows: Sequence[Row]) -> str:
-    """Return the section on bounds of a report, as Markdown.
-
-    Args:
-        rows: Rows of `bound`.
-    """
+    """Return the section on bounds of a report as Markdown, from rows of `bound`."""
     shown = [
         {"quantity": row["quantity"], "asked": row["asked"], "measured": f"{row['measured']:.4g}"}
         | {"interval": "" if math.isnan(row["low"]) else f"[{row['low']:.4g}, {row['high']:.4g}]"}
@@ -72,11 +68,7 @@ def bounds_report(rows: Sequence[Row]) -> str:
 
 
 def bounds_summary(rows: Sequence[Row]) -> dict[str, float]:
-    """Return the measured values by quantity, for `summary.json`.
-
-    Args:
-        rows: Rows of `bound`.
-    """
+    """Return the measured values of rows of `bound` by quantity, for `summary.json`."""
     return {row["quantity"]: row["measured"] for row in rows}
 
 
@@ -125,11 +117,7 @@ def saving_bounds(stints: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def traffic_bounds(response: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return the bounds of overtaking and defending: the worst of all starts and savers.
-
-    Args:
-        response: Rows of `traffic_response`.
-    """
+    """Return the bounds of overtaking and defending from `traffic_response`: the worst of all starts and savers."""
     rows = []
     for sweep in dict.fromkeys(row["sweep"] for row in response):
         own = rows_where(response, sweep=sweep)

@@ -23,11 +23,7 @@ _TRUNK, _CROWNS = (96, 78, 60), ((74, 112, 72), (88, 126, 80), (64, 100, 70))
 
 
 def circuit(track: Track) -> Backdrop:
-    """Return the scenery of a circuit, at its place in the world.
-
-    Args:
-        track: The circuit.
-    """
+    """Return the scenery of a circuit, at its place in the world."""
     table = track.table.numpy()
     left, right, margin, curvature = table[:, 5], table[:, 6], table[:, 7], table[:, 4]
     low, high = table[:, :2].min(0) - _AROUND, table[:, :2].max(0) + _AROUND

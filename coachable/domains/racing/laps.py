@@ -119,11 +119,7 @@ def drive_circuits(domain: Domain, agent: LoadedPolicy, settings: EvaluationSett
 
 
 def circuits_report(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the section on circuits of a report, as Markdown.
-
-    Args:
-        rows: Result of `drive_circuits`.
-    """
+    """Return the section on circuits of a report as Markdown, from `drive_circuits`."""
     text = "\n## Circuits\n\nAlone, in the default style.\n\n" + markdown_table(rows, _SHOWN, _UNITS)
     text += "\nTrained: whether the agent was trained on the circuit. Fuel: at the start; only the family `resources` "
     text += "uses fuel up, and its bound is on half a tank. Laps: completed ones; clean if three wheels were never off "
@@ -133,13 +129,10 @@ def circuits_report(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def circuits_summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
-    """Return the means over the circuits that the agent was trained on, and over the others.
+    """Return the means of `drive_circuits` over the circuits that the agent was trained on, and over the others.
 
     "circuits" is their number, and "circuits_timed" that of circuits with a lap after the first one, over which "over"
     is the mean.
-
-    Args:
-        rows: Result of `drive_circuits`.
     """
     summary = {}
     for label, trained in (("trained", "yes"), ("unseen", "no")):

@@ -103,10 +103,7 @@ def _race_from(
 
 
 def traffic_response(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return how metres and places gained follow the weight that asks for them.
-
-    Args:
-        rows: Rows of `race_in_traffic`.
+    """Return how metres and places gained in `race_in_traffic` follow the weight that asks for them.
 
     Returns:
         A row per weight that rises, start and group of savers: metres gained on cars ahead (overtake) or behind
@@ -133,12 +130,7 @@ def traffic_response(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def traffic_report(rows: Sequence[dict[str, Any]], response: Sequence[dict[str, Any]]) -> str:
-    """Return the section on traffic of the report, as Markdown.
-
-    Args:
-        rows: Result of `race_in_traffic`.
-        response: Result of `traffic_response`.
-    """
+    """Return the section on traffic of the report as Markdown, from `race_in_traffic` and `traffic_response`."""
     text = f"\n## Among others\n\n{CARS} copies, on tyres and fuel of any state, for a minute; "
     text += f"{rows[0]['races']} races per weight, the same starts for each. The weight of overtaking of the last car "
     text += f"rises, or that of defending of the first; all others are {OTHERS_WEIGHT:g}. Starts: close together on a "
@@ -158,12 +150,7 @@ def traffic_report(rows: Sequence[dict[str, Any]], response: Sequence[dict[str, 
 
 
 def draw_traffic(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Draw the metres and places gained over the weight that asks for them, with 95 % intervals.
-
-    Args:
-        rows: Rows of `race_in_traffic`.
-        path: Image file to write.
-    """
+    """Draw the metres and places gained in `race_in_traffic` over the weight asking for them, with 95 % intervals."""
     titles = {"overtake": "on cars ahead, starting last", "defend": "on cars behind, starting first"}
     kinds = list(dict.fromkeys((row["start"], row["savers"]) for row in rows))
     with drawing(path, 2, len(SLOTS), size=(9.5, 6.4), sharex=True) as panels:

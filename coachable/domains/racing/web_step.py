@@ -142,11 +142,7 @@ def _racing_steps(env: RacingEnv, family: str, style: Tensor) -> Steps:
 
 
 def memory_of(env: RacingEnv) -> Tensor:
-    """Return the whole states (N, S) of cars that are alone, at the start of an episode.
-
-    Args:
-        env: Environment of single cars.
-    """
+    """Return the whole states (N, S) of cars that are alone, at the start of an episode."""
     rows, size = torch.cat([env.state.T, env.run.T, env.compound.T], dim=1), CarSize.of(env.garage.car)
     seen = [torch.from_numpy(_start(state, size)[-1]) for state in env.state.T.cpu().numpy()]
     return torch.cat([rows, torch.stack(seen)], dim=1)

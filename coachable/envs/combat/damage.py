@@ -190,12 +190,7 @@ def damage_parts(s: State, traits: Traits, damage: Tensor, totals: Totals) -> Te
 
 
 def swing(s: State, intent: Intent, traits: Traits) -> Tensor:
-    """Advance the spear by one frame; the player lunges and deals damage on the first frame of a swing.
-
-    Args:
-        s: State, changed in place.
-        intent: What the players want.
-        traits: Traits of the machines.
+    """Advance the spear of `s` by one frame in place; the player lunges and deals damage on the first frame of a swing.
 
     Returns:
         Damage (E, N) [HP].
@@ -275,10 +270,6 @@ def run_elements(
 
 def hit_factor(s: State, numbers: ElementNumbers) -> Tensor:
     """Return the factor of frost and acid on hits.
-
-    Args:
-        s: The state.
-        numbers: Numbers of the elements.
 
     Returns:
         (E, N).

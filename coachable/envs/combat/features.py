@@ -156,10 +156,6 @@ def _attack_id(s: State, traits: Traits) -> Tensor:
 def kept_features(s: State, traits: Traits) -> Tensor:
     """Return what the feature history keeps of a state: place of the nearest enemy, both healths and the attack.
 
-    Args:
-        s: The state.
-        traits: Traits of the machines.
-
     Returns:
         (12, N).
     """

@@ -41,10 +41,6 @@ _SHOCK_FRAMES = load_table("elements").number("shock", "seconds") * c.FPS
 def ranged_strength(s: State, traits: Traits) -> Tensor:
     """Return the share of weapon parts that are left.
 
-    Args:
-        s: The state.
-        traits: Traits of the machines.
-
     Returns:
         (E, N) in [0, 1]; 1 for machines without weapon parts.
     """

@@ -60,13 +60,7 @@ class Noise:
 
     @classmethod
     def draw(cls, enemies: int, n: int, generator: torch.Generator) -> Noise:
-        """Draw the numbers of a step; their count depends only on the numbers of enemies and of fights `n`.
-
-        Args:
-            enemies: E.
-            n: Number of fights N.
-            generator: Generator to draw from.
-        """
+        """Draw the numbers of a step; their count depends only on the numbers of enemies and of fights `n`."""
         frames, device = c.FRAMES_PER_STEP, generator.device
         normal = torch.randn((frames, 2 + 2 * enemies, n), generator=generator, device=device)
         uniform = torch.rand((2 * frames + ATTACK_SLOTS + 2, enemies, n), generator=generator, device=device)

@@ -32,20 +32,11 @@ class Table:
     rows: Mapping[str, Mapping[str, str]]
 
     def fail(self, row: str, problem: str) -> ValueError:
-        """Return an error that names file and row.
-
-        Args:
-            row: Name of the row.
-            problem: What is wrong.
-        """
+        """Return an error that names file and row."""
         return ValueError(f"coachable/envs/combat/data/{self.file}, row {row!r}: {problem}")
 
     def number(self, row: str, column: str) -> float:
         """Return a finite or infinite number of the table.
-
-        Args:
-            row: Name of the row.
-            column: Name of the column.
 
         Raises:
             ValueError: If the cell is not a number.
@@ -66,11 +57,6 @@ class Table:
     def words(self, row: str, column: str, allowed: tuple[str, ...]) -> tuple[str, ...]:
         """Return the space-separated names of a cell.
 
-        Args:
-            row: Name of the row.
-            column: Name of the column.
-            allowed: Names that may occur.
-
         Raises:
             ValueError: If one is not allowed.
         """
@@ -83,10 +69,6 @@ class Table:
 
 def parse_table(file: str, text: str) -> Table:
     """Parse the text of a data file: a line of column names, a line of origins, and a line per row.
-
-    Args:
-        file: Name of the file, for errors.
-        text: Contents of the file.
 
     Raises:
         ValueError: If a row is incomplete or repeated, or an origin is unknown.

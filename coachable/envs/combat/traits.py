@@ -119,12 +119,7 @@ def part_layout(machine: Machine) -> list[tuple[str, int]]:
 
 
 def unit_hp(machine: Machine, part: str) -> float:
-    """Return the health of one unit of a part [HP].
-
-    Args:
-        machine: The machine.
-        part: Type of the part.
-    """
+    """Return the health of one unit of a part [HP]."""
     return c.UNIT_HP[part] * 1.6 * machine.hp**0.85
 
 

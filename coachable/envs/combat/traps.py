@@ -45,12 +45,7 @@ class TrapNumbers:
 
 
 def spring_traps(s: State, traits: Traits, numbers: TrapNumbers) -> tuple[Tensor, Tensor, Tensor]:
-    """Advance the traps by one frame; an armed trap fires when a machine is near, and disappears.
-
-    Args:
-        s: State, changed in place.
-        traits: Traits of the machines.
-        numbers: Numbers of the traps.
+    """Advance the traps of `s` by one frame in place; an armed trap fires when a machine is near, and disappears.
 
     Returns:
         Damage to the machines (E, N) [HP], build-up (7, E, N), and damage to the player (N,) [HP].

@@ -33,13 +33,7 @@ def wheel_velocity(vx: Tensor, vy: Tensor, yaw_rate: Tensor, x: Any, y: Any) -> 
 
 
 def rotate(x: Tensor, y: Tensor, cos: Any, sin: Any) -> tuple[Tensor, Tensor]:
-    """Rotate a vector counter-clockwise by the angle whose cosine and sine are given.
-
-    Args:
-        x: First component, any shape.
-        y: Second component.
-        cos: Cosine of the angle.
-        sin: Sine of the angle.
+    """Rotate vectors of any shape counter-clockwise by the angle whose cosine and sine are given.
 
     Returns:
         Both components of the rotated vector, in the same unit.

@@ -105,10 +105,9 @@ def observation_groups(
 
 
 def own_columns(name: str) -> slice:
-    """Return the columns of a block; those of all blocks up to the compound are the same in every race.
+    """Return the columns of a block of `observation_groups`.
 
-    Args:
-        name: Name of a block in `observation_groups`.
+    Those of all blocks up to the compound are the same in every race.
 
     Raises:
         KeyError: If there is no such block.

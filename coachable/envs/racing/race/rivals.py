@@ -94,9 +94,6 @@ class Rivals:
     def load_state(self, state: dict[str, Any]) -> None:
         """Restore what `state` returned.
 
-        Args:
-            state: Result of `state`.
-
         Raises:
             ValueError: If there are copies, but no policy to follow.
         """

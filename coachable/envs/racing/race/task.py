@@ -119,15 +119,7 @@ def contacts(impact: Tensor, before: Others, cars: int) -> tuple[Tensor, Tensor]
 
 
 def task_reward(weights: TaskWeights, state: CarState, run: Run, tyres: TyreView, outcome: Outcome) -> Tensor:
-    """Return the task reward Σ weight · term of each car, (N,).
-
-    Args:
-        weights: Weights of the terms.
-        state: State after the step.
-        run: Task state after the step.
-        tyres: Slip after the step.
-        outcome: Events of the step.
-    """
+    """Return the task reward Σ weight · term of each car (N,), from states and slip after the step."""
     squared = (_KMH * _KMH) * (state.vx * state.vx + state.vy * state.vy)
     slip = (torch.clamp(tyres.ratio.abs(), max=1.0) * tyres.angle).unbind(0)
     reward = weights.progress * torch.where(run.off > 0.5, 0.0, outcome.progress)
