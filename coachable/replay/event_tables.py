@@ -150,9 +150,11 @@ class EventTableBuffer(TensorDictReplayBuffer):
             **kwargs: Further arguments of the class.
 
         Raises:
-            ValueError: If the share is not between 0 and 1.
+            ValueError: If the share is not between 0 and 1, or there are no events.
         """
         Range("(0, 1)").check("event_share", event_share)
+        if not events.names:
+            raise ValueError("the event predicate has no events: expected at least one, such as a weight of StyleEvents")
         capacities = {"default": capacity, **dict.fromkeys(events.names, event_capacity)}
         shares = {"default": 1.0 - event_share, **dict.fromkeys(events.names, event_share / len(events.names))}
         proportions = {"table_proportions": shares, **kwargs}
@@ -279,10 +281,12 @@ class EventTableBuffer(TensorDictReplayBuffer):
         """Restore what `state_dict` returned; the tables must be the same.
 
         Raises:
-            ValueError: If tables, horizon or prioritisation differ.
+            ValueError: If tables, horizon, n-step sums or prioritisation differ; nothing is changed then.
         """
         with self._replay_lock:
-            self._writer.load_state_dict(state_dict["_writer"])  # checks the tables before anything is overwritten
+            self._writer.check(state_dict["_writer"])  # before anything is overwritten
+            self._sampler.check(state_dict["_sampler"])
+            self._writer.load_state_dict(state_dict["_writer"])
             if state_dict["_storage"]["initialized"]:
                 self._storage.load_state_dict(state_dict["_storage"])
             self._storage._len = self.regions.used_prefix
@@ -303,8 +307,8 @@ class EventTableBuffer(TensorDictReplayBuffer):
         """Restore what `dumps` saved; see `read_replay`. The tables must be the same.
 
         Raises:
-            CheckpointError: If files are missing, damaged or of another kind, or tables, horizon or prioritisation
-                differ.
+            CheckpointError: If files are missing, damaged or of another kind, or tables, horizon, n-step sums or
+                prioritisation differ.
         """
         with self._replay_lock:
             read_replay(self, Path(path))

@@ -118,6 +118,8 @@ class NStep:
             value: Any = data.get(key, None)
             if value is None:
                 continue
+            if not value.is_floating_point():
+                value = value.to(torch.float32)
             total = value[first_row].clone()
             for lag in range(1, self.n_steps):
                 at = torch.from_numpy(order[np.minimum(start + lag, last)]).to(device)

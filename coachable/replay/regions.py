@@ -102,12 +102,8 @@ class Regions:
         """Return the names, capacities and write counts of the tables."""
         return {"names": list(self.names), "capacities": self.capacities.tolist(), "written": self.written.tolist()}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore the cursors.
-
-        Raises:
-            ValueError: If the tables differ from the saved ones.
-        """
+    def check(self, state: Mapping[str, Any]) -> None:
+        """Raise a `ValueError` if the tables differ from the saved ones."""
         saved = dict(zip(state["names"], state["capacities"], strict=True))
         present = dict(zip(self.names, self.capacities.tolist(), strict=True))
         if list(saved.items()) != list(present.items()):
@@ -115,5 +111,9 @@ class Regions:
                 f"the saved tables are {saved}, this buffer's are {present}: give the same table_capacities "
                 "in the same order"
             )
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore the cursors; see `check`."""
+        self.check(state)
         self.written[:] = state["written"]
         self.version += 1

@@ -205,17 +205,17 @@ class StratifiedSampler(Sampler):
         tree = self._tree if self._tree is not None else self._tree_on(torch.device("cpu"))
         return {"priorities": tree.leaves(), "largest": self._largest_priority(tree.device).clone(), "beta": self.beta}
 
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restore what `state_dict` returned.
-
-        Raises:
-            ValueError: If only one of the two samplers is prioritised.
-        """
+    def check(self, state_dict: Mapping[str, Any]) -> None:
+        """Raise a `ValueError` if only one of this sampler and the saved one is prioritised."""
         if bool(state_dict) != self.prioritized:
             raise ValueError(
                 f"the saved buffer was {'' if state_dict else 'not '}prioritised, this one is "
                 f"{'' if self.prioritized else 'not '}prioritised: give the same value of prioritized"
             )
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned; see `check`."""
+        self.check(state_dict)
         self._empty()
         if state_dict:
             self._pending_leaves = state_dict["priorities"].clone()

@@ -182,14 +182,31 @@ class TableWriter(Writer):
             "lost": self._lost.tolist(),
             "history": self.history.state_dict() if self.history is not None else {},
             "n_step": self.n_step.state_dict() if self.n_step is not None else {},
+            "sums": self._sums,
         }
 
-    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Restore what `state_dict` returned.
+    @property
+    def _sums(self) -> list[float | None]:
+        return [1, None] if self.n_step is None else [self.n_step.n_steps, self.n_step.gamma]
 
-        Raises:
-            ValueError: If the tables or the horizon differ from the saved ones.
+    def check(self, state_dict: Mapping[str, Any]) -> None:
+        """Raise a `ValueError` if the tables, the horizon, or steps and discount of n-step sums differ from saved ones.
+
+        Checkpoints of earlier versions do not contain steps and discount.
         """
+        self.regions.check(state_dict["regions"])
+        if self.history is not None:
+            self.history.check(state_dict["history"])
+        saved = list(state_dict.get("sums", self._sums))
+        if saved != self._sums:
+            raise ValueError(
+                "the saved buffer has n_steps={} and gamma={}, this one n_steps={} and gamma={}: make it like the saved "
+                "one".format(*saved, *self._sums)
+            )
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned; see `check`."""
+        self.check(state_dict)
         self.regions.load_state_dict(state_dict["regions"])
         self._arrived = state_dict["arrived"]
         self._fired[:] = state_dict["fired"]

@@ -190,19 +190,18 @@ class WindowHistory:
         names = ("key", "length", "arrival", "last_event", "slot", "serial")
         return {name: torch.from_numpy(getattr(self, name).copy()) for name in names}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned.
-
-        Raises:
-            ValueError: If the horizon or the number of event tables differs.
-        """
-        rows, events = state["last_event"].shape
-        horizon = state["slot"].shape[1] + 1
+    def check(self, state: dict[str, Any]) -> None:
+        """Raise a `ValueError` if the horizon or the number of event tables differs from the saved one."""
+        events, horizon = state["last_event"].shape[1], state["slot"].shape[1] + 1
         if (events, horizon) != (self.events, self.horizon):
             raise ValueError(
                 f"the saved history has {events} event tables and event_horizon {horizon}, this buffer "
                 f"{self.events} and {self.horizon}: make it like the saved one"
             )
-        self._allocate(rows)
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned; see `check`."""
+        self.check(state)
+        self._allocate(len(state["last_event"]))
         for name, value in state.items():
             getattr(self, name)[:] = value.cpu().numpy()

@@ -59,7 +59,7 @@ class StyleRewardTransform(Transform):
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         task_reward = tensordict_reset.get(TASK_REWARD, None)
         if task_reward is not None:  # then both are observations, and the style reward is 0 at reset
-            tensordict_reset.set(STYLE_REWARD, torch.zeros_like(task_reward))
+            tensordict_reset.set(STYLE_REWARD, torch.zeros_like(task_reward, dtype=torch.float32))
         return tensordict_reset
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:

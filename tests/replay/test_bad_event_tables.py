@@ -103,6 +103,11 @@ def test_wrong_event_columns_name_the_tables():
         buffer.extend(steps([0], [[True]], style=torch.ones(1, 2)))
 
 
+def test_a_predicate_without_events_is_refused():
+    with pytest.raises(ValueError, match="has no events"):
+        EventTableBuffer.for_events(KeyEvents([]), capacity=9, event_capacity=9, event_horizon=1, num_envs=1)
+
+
 def test_predicate_columns_must_match_the_steps():
     events = PredicateEvents({"hit": lambda td: td["next", "events"]})
     buffer = EventTableBuffer({"default": 9, "hit": 5}, events=events, event_horizon=1, num_envs=1)

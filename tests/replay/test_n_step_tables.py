@@ -54,6 +54,18 @@ def test_n_step_sums_features_only_on_request():
     assert kept["a"].squeeze(-1).tolist() == [2.0, 4.0] and kept["b"][0].tolist() == [1.5, 1.5]
 
 
+def test_sums_of_whole_numbers_and_flags_are_float32():
+    buffer = EventTableBuffer(
+        {"default": 9}, n_steps=2, gamma=0.5, num_envs=1, discounted_keys=[("next", "style_features")]
+    )
+    done = torch.tensor([[False], [False], [True]])
+    nxt = {"task_reward": torch.tensor([[1], [2], [4]]), "style_features": torch.tensor([[True], [False], [True]])}
+    buffer.extend(TensorDict({"id": torch.arange(3), "next": {**nxt, "done": done, "terminated": done}}, [3]))
+    sums = buffer.table("default")["next"]
+    assert sums["task_reward"].squeeze(-1).tolist() == [2.0, 4.0, 4.0]
+    assert sums["style_features"].squeeze(-1).tolist() == [1.0, 0.5, 1.0]
+
+
 def test_n_step_is_assembled_before_routing():
     """Neighbours in a table are not neighbours in time."""
     buffer = EventTableBuffer({"a": 9, "b": 9}, route=KeyRoute(["a", "b"]), n_steps=2, gamma=1.0, num_envs=1)

@@ -230,6 +230,34 @@ def test_other_tables_are_refused():
         longer.load_state_dict(saved.state_dict())
 
 
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"prioritized": True}, "the saved buffer was not prioritised"),
+        ({"n_steps": 1}, "n_steps=3 and gamma=0.9, this one n_steps=1 and gamma=None"),
+        ({"n_steps": 2}, "n_steps=3 and gamma=0.9, this one n_steps=2 and gamma=0.9"),
+    ],
+)
+def test_a_refused_state_changes_nothing(changed, message):
+    saved, other = make(n_steps=3), make(**{"n_steps": 3, **changed})
+    use(saved, 0, 2)
+    use(other, 2, 3)
+    before = {name: other.table(name) for name in other.names}
+    with pytest.raises(ValueError, match=message):
+        other.load_state_dict(saved.state_dict())
+    for name, records in before.items():
+        assert (other.table(name) == records).all()
+
+
+def test_a_state_of_an_earlier_version_names_no_sums():
+    saved, fresh = make(n_steps=3), make(n_steps=3)
+    use(saved, 0, 2)
+    state = saved.state_dict()
+    del state["_writer"]["sums"]
+    fresh.load_state_dict(state)
+    assert_same(saved, fresh)
+
+
 def test_memory_mapped_storage(tmp_path):
     saved = make(storage=LazyMemmapStorage)
     use(saved, 0, 4)

@@ -97,6 +97,24 @@ def test_rewards_of_an_environment_in_float64_have_the_declared_dtype(make_base_
     assert env.reward_spec.dtype == env.rollout(3)["next", "reward"].dtype == torch.float32
 
 
+def test_style_rewards_are_float32_beside_a_task_reward_in_float64(make_base_env, space, make_style_reward):
+    base = make_base_env()
+    spec = base.observation_spec.clone()
+    spec["task_reward"] = Unbounded((*base.batch_size, 1), dtype=torch.float64)
+    base.observation_spec = spec
+
+    def with_wide_task_reward(function):
+        def call(tensordict=None, **options):
+            out = function(tensordict, **options)
+            return out.set("task_reward", out["task_reward"].double())
+
+        return call
+
+    base._step, base._reset = with_wide_task_reward(base._step), with_wide_task_reward(base._reset)
+    env = coachable_env(base, space, make_style_reward(space), seed=0)
+    assert env.reset()["style_reward"].dtype == env.rollout(3)["next", "style_reward"].dtype == torch.float32
+
+
 def test_inside_serial_env(make_env, space, make_style_reward):
     env = SerialEnv(2, make_env)
     check_env_specs(env)
