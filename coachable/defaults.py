@@ -1,5 +1,6 @@
 """Defaults of a `Domain` that declares only an environment, a style space and a style reward."""
 
+import math
 from collections.abc import Callable, Mapping
 from itertools import product
 from typing import Any
@@ -60,8 +61,10 @@ class RewardMeasures:
     """Measured style from the terms of the style reward.
 
     - `SetpointTolerance`: the feature that it compares with the request, under the set-point's name, and the distance
-      from the request as `<name>_error`. Steps in which its gate is 0 have no value.
-    - `WeightedFeature`, `WeightedSum`: the feature that the weight scales, under the weight's name.
+      from the request as `<name>_error`. Steps in which its gate is 0 have no value. If several
+      features are compared with it, each has the name of its term instead.
+    - `WeightedFeature`, `WeightedSum`: the feature that the weight scales, under the weight's name, unless it scales
+      several features.
     - Any other term: its reward per step before scaling, as `<term>_reward`.
 
     The agent complies in a step if every such set-point differs from the request by at most 5 % of its range and every
@@ -76,6 +79,13 @@ class RewardMeasures:
 
     def __init__(self, reward: StyleReward) -> None:
         self._reward = reward
+        self._sources: dict[str, set[str]] = {}
+        """Features that are compared with a set-point or scaled by a weight, by the parameter's name."""
+        for term in reward.terms.values():
+            if isinstance(term, SetpointTolerance | WeightedFeature | WeightedSum):
+                for position, parameter in enumerate(term.parameters):
+                    source = f"{term.key} {position} {getattr(term, 'gate', None)}"
+                    self._sources.setdefault(parameter, set()).add(source)
 
     def step(self, transition: TensorDictBase) -> dict[str, Tensor]:
         """Return the measures (N,) of a step by name; see `StyleMeasures.step`."""
@@ -84,15 +94,16 @@ class RewardMeasures:
         found: dict[str, Tensor] = {}
         for name, term in self._reward.terms.items():
             if isinstance(term, SetpointTolerance):
-                target = style[term.parameter]
+                target, label = style[term.parameter], self._label(name, term)
                 value = feature(features, term.key)
                 if term.gate is not None:
                     value = torch.where(feature(features, term.gate) != 0, value, torch.nan)
-                found |= {term.parameter: value, f"{term.parameter}_error": (value - target).abs()}
-            elif isinstance(term, WeightedFeature):
-                found[term.parameter] = feature(features, term.key)
-            elif isinstance(term, WeightedSum):
-                found |= dict(zip(term.parameters, feature(features, term.key).unbind(-1), strict=True))
+                found |= {label: value, f"{label}_error": (value - target).abs()}
+            elif isinstance(term, WeightedFeature | WeightedSum):
+                scaled = feature(features, term.key)
+                columns = (scaled,) if isinstance(term, WeightedFeature) else scaled.unbind(-1)
+                pairs = zip(term.parameters, columns, strict=True)
+                found |= {parameter: column for parameter, column in pairs if len(self._sources[parameter]) == 1}
             else:
                 found[f"{name}_reward"] = paid[name]
         return found
@@ -113,6 +124,9 @@ class RewardMeasures:
         values = [~record[name].isnan() for name, _, _ in self._limits()]
         return torch.stack(values).all(0) if values else torch.zeros_like(next(iter(record.values())), dtype=torch.bool)
 
+    def _label(self, name: str, term: SetpointTolerance) -> str:
+        return term.parameter if len(self._sources[term.parameter]) == 1 else name
+
     def _limits(self) -> list[tuple[str, float, bool]]:
         """Return names of measures, their limits, and whether the limit is the largest complying value or the least."""
         limits: list[tuple[str, float, bool]] = []
@@ -120,7 +134,7 @@ class RewardMeasures:
             if isinstance(term, SetpointTolerance):
                 parameter = self._reward.space[term.parameter]
                 slack = _SLACK * (parameter.high - parameter.low)
-                limits.append((f"{term.parameter}_error", slack, True))
+                limits.append((f"{self._label(name, term)}_error", slack, True))
             elif isinstance(term, ChoiceTolerance):
                 limits.append((f"{name}_reward", _MET, False))
         return limits
@@ -261,8 +275,15 @@ def style_grid(space: StyleSpace) -> list[dict[str, Any]]:
     }
     if np.prod([len(options) for options in values.values()]) <= _LARGEST_GRID:
         return [dict(zip(values, cell, strict=True)) for cell in product(*values.values())]
-    default = space.describe(space.default)
-    return [default, *({**default, name: v} for name, options in values.items() for v in options if v != default[name])]
+    default = {p.name: p.default for p in space.parameters}  # as declared; theta is rounded to float32
+    others = ((name, v) for name, options in values.items() for v in options if not _alike(v, default[name]))
+    return [default, *({**default, name: v} for name, v in others)]
+
+
+def _alike(value: float | str, other: float | str) -> bool:
+    if isinstance(value, str) or isinstance(other, str):
+        return value == other
+    return math.isclose(value, other, rel_tol=1e-5)  # `_spread` rounds to six digits
 
 
 def _spread(low: float, high: float, count: int) -> list[float]:

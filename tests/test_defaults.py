@@ -46,6 +46,34 @@ def test_measures_are_what_the_terms_read_and_pay():
     )
 
 
+def test_a_parameter_of_several_features_is_measured_by_term_or_by_its_reward():
+    terms = {
+        "left": SetpointTolerance("speed", 0, margin=1.0),
+        "right": SetpointTolerance("speed", 1, margin=1.0),
+        "hat": Term(lambda features, style: features[..., 0] * style["hat"][..., 0], ("hat",)),
+        "fire": WeightedFeature("fire", 2),
+        "both": WeightedSum(["fire", "ice"], slice(3, 5)),
+    }
+    found = RewardMeasures(StyleReward(SPACE, terms))
+    record = step(found, [[1.5, 1.0, 7.0, 8.0, 9.0]], speed=1.0, hat="off")
+    assert {name: value.item() for name, value in record.items()} == {
+        **{"left": 1.5, "left_error": 0.5, "right": 1.0, "right_error": 0.0, "hat_reward": 0.0, "ice": 9.0}
+    }
+    assert not found.complies({name: value[None] for name, value in record.items()}).any()
+
+
+def test_a_guide_on_the_same_feature_keeps_the_name_of_the_set_point():
+    terms = {
+        "exact": SetpointTolerance("speed", 0, margin=0.1),
+        "guide": SetpointTolerance("speed", 0, margin=2.0),
+        "rest": Term(
+            lambda features, style: 0 * (style["fire"] + style["ice"] + style["hat"][..., 0]), ("fire", "ice", "hat")
+        ),
+    }
+    record = step(RewardMeasures(StyleReward(SPACE, terms)), [[1.5, 0, 0, 0, 0]], speed=1.0)
+    assert record["speed"].item() == 1.5 and record["speed_error"].item() == 0.5
+
+
 def test_it_complies_within_a_twentieth_of_the_range_and_with_the_choice():
     record = step(
         measures(), [[1.0, 1.0, 0, 0, 1], [1.09, 1.0, 0, 0, 1], [1.11, 1.0, 0, 0, 1], [1.0, 0.0, 0, 0, 1]], speed=1.0
@@ -72,6 +100,8 @@ def test_weights_alone_give_nothing_to_judge():
 def test_the_grid_combines_a_few_values_or_varies_one_parameter_at_a_time():
     cells = style_grid(StyleSpace([Choice("hat", ("on", "off")), Setpoint("speed", 1 / 3, 2.0)]))
     assert len(cells) == 10 and cells[0] == {"hat": "on", "speed": 1 / 3} and cells[-1]["speed"] == 2.0
+    unrounded = StyleSpace([Setpoint(f"s{i}", 0.1, 0.7) for i in range(4)])  # (0.1 + 0.7) / 2 is not quite 0.4
+    assert len(style_grid(unrounded)) == 1 + 4 * 2
     wide = StyleSpace([Weight(f"w{i}", 0.0, 2.0) for i in range(5)])
     cells = style_grid(wide)
     assert len(cells) == 1 + 5 * 2 and all(sum(v != 0 for v in cell.values()) <= 1 for cell in cells)

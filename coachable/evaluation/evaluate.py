@@ -1,6 +1,7 @@
 """`coachable evaluate`: the style grid, the trials and the switching test of an agent, as tables and a figure."""
 
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from coachable.evaluation.style_grid import (
     evaluate_grid,
     markdown_table,
     mean_of,
+    measured_column,
     policy_sentence,
     published,
     write_results,
@@ -92,10 +94,29 @@ def _evaluate_trials(domain: Domain, agent: LoadedPolicy, settings: EvaluationSe
     return rows
 
 
+def _median_formats(domain: Domain, grid: StyleGrid) -> dict[str, str]:
+    """Return the formats, by name, of the metrics whose medians are reported if the domain has targets.
+
+    These are the published metrics that no parameter requests, and all that have a target.
+    """
+    if not domain.targets:
+        return {}
+    names = {measured_column(name, grid.cells[0]): name for name in grid.episodes}
+    formats = {names[column]: form for column, form in published(domain, grid.episodes, grid.cells[0]).items()}
+    own = {name: form for name, form in formats.items() if name not in grid.cells[0]}
+    if unknown := domain.targets.keys() - grid.episodes.keys():
+        warnings.warn(
+            f"targets of the domain {domain.name} name {', '.join(sorted(unknown))}: expected some of "
+            f"{', '.join(grid.episodes)}",
+            stacklevel=2,
+        )
+    return own | {name: formats.get(name, ".3g") for name in domain.targets if name in grid.episodes}
+
+
 def _median_rows(domain: Domain, grid: StyleGrid) -> list[dict[str, Any]]:
-    """Return a row per published metric of a domain with targets: median, lowest and highest style, and its target."""
+    """Return a row per metric of `_median_formats`: its median, lowest and highest style, and its target."""
     rows = []
-    for name in [name for name in domain.columns if name in grid.episodes and domain.targets]:
+    for name in _median_formats(domain, grid):
         means = np.array([mean_of(values) for values in grid.episodes[name]])
         means = means[~np.isnan(means)]
         median, lowest, highest = np.percentile(means, [50, 0, 100]) if len(means) else [math.nan] * 3
@@ -150,7 +171,8 @@ def _report(
     if medians:
         text += f"\n## Median of the {len(rows)} styles, and its target\n\n"
         numbers = ("median", "lowest", "highest")
-        shown = [row | {n: format(row[n], domain.columns[row["measure"]]) for n in numbers} for row in medians]
+        formats = _median_formats(domain, grid)
+        shown = [row | {n: format(row[n], formats[row["measure"]]) for n in numbers} for row in medians]
         text += markdown_table(shown, dict.fromkeys(medians[0], ""))
     if response:
         text += "\n## Response to the request\n\n"

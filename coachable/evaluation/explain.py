@@ -63,7 +63,7 @@ def explain(
     table = _side_by_side(rankings)
     count = sum(len(trajectory) for trajectory in trajectories)
     title = f"{domain.name}: what moves the action ({len(trajectories)} trajectories, {count} states, seed {seed})"
-    (out / "explain.md").write_text(f"# {title}\n\n{table}")
+    (out / "explain.md").write_text(f"# {title}\n\n{table}", encoding="utf-8")
     _draw(rankings, out / "explain.png", title)
     return table
 

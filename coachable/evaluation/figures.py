@@ -25,6 +25,7 @@ RARE = 0.2  # shares below this have an axis of their own range
 MARKERS = "osD^vP*X"  # distinguishable without colour as well
 _LOOK = {
     "axes.prop_cycle": cycler(color=list(map(css, LINES))),
+    "text.parse_math": False,  # names and options may contain $
     "axes.spines.top": False,
     "axes.spines.right": False,
     **dict.fromkeys(("text.color", "axes.labelcolor", "axes.titlecolor"), css(LIGHT.ink)),

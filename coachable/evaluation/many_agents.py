@@ -42,7 +42,8 @@ def evaluate_agents(sources: Sequence[str | Path], out: Path, **settings: Any) -
         summary = json.loads((folder / "summary.json").read_text())
         summaries[folder.name] = _numbers(summary.get("bounds", summary))
     rows = side_by_side(summaries)
-    write_csv(rows, out / "agents.csv")
+    if rows:
+        write_csv(rows, out / "agents.csv")
     return table_of(rows, ".4g")
 
 

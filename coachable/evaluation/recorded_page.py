@@ -77,7 +77,7 @@ def export_recordings(agent: LoadedPolicy, domain: Domain, out: Path, assets: Pa
     steps = min(domain.episode_steps, max(1, round(domain.recorded.seconds / domain.control_step)))
     vendored = provide(assets, _NEEDED)
     recordings = record(agent, domain, requests, steps)
-    columns = domain.recorded.columns or published(domain, recordings[0].measured, requests[0])
+    columns = domain.recorded.columns or domain.columns or published(domain, recordings[0].measured, requests[0])
     shown = [_measure(domain, agent.space, *column) for column in columns.items()]
     if unknown := {measure["name"] for measure in shown} - recordings[0].measured.keys():
         raise ValueError(

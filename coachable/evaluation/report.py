@@ -1,6 +1,7 @@
 """`coachable report`: all measurements of an agent on one page, with intervals over seeds."""
 
 import csv
+import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -124,8 +125,8 @@ def write_report(
 
 def _formats(styles: StyleTable, domain: Domain) -> dict[str, str]:
     """Return the format of each metric to show: of the domain's published columns, or else of all metrics."""
-    names = {styles.column(name): name for name in styles.scores}
-    published = {names[column]: form for column, form in domain.columns.items() if column in names}
+    declared = {column.removeprefix("measured_"): form for column, form in domain.columns.items()}
+    published = {name: form for name, form in declared.items() if name in styles.scores}
     return published or {name: ".0%" if name == "survived" else ".3g" for name in styles.scores}
 
 
@@ -223,7 +224,8 @@ class _Sections:
         """Add task success over the amount of style along each weight, if there are weights."""
         if not self.runs[0].sweeps:
             return
-        success = next((name for name in self.formats if name in self.runs[0].sweeps[0].episodes), "survived")
+        measured = [name for name in self.formats if name in self.runs[0].sweeps[0].episodes]
+        success = next((name for name in measured if name not in self.agent.space), "survived")
         draw_tradeoffs(self.runs, success, self.formats.get(success, ""), self.out / "tradeoffs.png", self.titles)
         rows = [
             {"weight": sweeps[0].weight, "value": float(value), "style": sweep_estimate(sweeps, sweeps[0].score, i)}
@@ -257,7 +259,8 @@ class _Sections:
             figure = file.with_suffix(".png")
             parts = [*source, *([picture(figure, f"{readable(file.stem)}, a figure")] if figure.is_file() else [])]
             columns = {name: [value for row in rows if isinstance(value := row[name], float)] for name in rows[0]}
-            large = [name for name, values in columns.items() if values and max(values) >= 1000]
+            largest = {name: max(filter(math.isfinite, values), default=0.0) for name, values in columns.items()}
+            large = [name for name, value in largest.items() if value >= 1000]
             parts.append(
                 table(rows, dict.fromkeys(large, ".0f"))
                 if len(rows) <= _LONGEST_TABLE

@@ -144,7 +144,7 @@ def shown(value: Any, form: str) -> str:
     if isinstance(value, Estimate):
         if math.isnan(value.value):
             return _NOTHING
-        return f"{shown(value.value, form)} [{shown(value.low, form)}, {shown(value.high, form)}]"
+        return f"{shown(value.value, form)} {_interval(value, form)}".rstrip()
     if isinstance(value, float):
         return _NOTHING if math.isnan(value) else format(value, form)
     return readable(value)
@@ -152,9 +152,13 @@ def shown(value: Any, form: str) -> str:
 
 def _cell(value: Any, form: str) -> str:
     if isinstance(value, Estimate) and not math.isnan(value.value):
-        interval = f"[{shown(value.low, form)}, {shown(value.high, form)}]"
-        return f"{html.escape(shown(value.value, form))} <small>{html.escape(interval)}</small>"
+        interval = _interval(value, form)
+        return html.escape(shown(value.value, form)) + (f" <small>{html.escape(interval)}</small>" if interval else "")
     return html.escape(shown(value, form))
+
+
+def _interval(value: Estimate, form: str) -> str:
+    return "" if math.isnan(value.low) else f"[{shown(value.low, form)}, {shown(value.high, form)}]"
 
 
 def _class(numeric: bool) -> str:

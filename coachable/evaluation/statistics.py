@@ -38,9 +38,9 @@ def stratified_interval(scores: np.ndarray) -> tuple[float, float]:
         scores: Scores (runs, tasks); NaN are left out.
 
     Returns:
-        Lower and upper bound; NaN if there are no values.
+        Lower and upper bound; NaN if there are no values, or those of one run only.
     """
-    if np.isnan(scores).all():
+    if np.isnan(scores).all() or len(scores) < 2:
         return float("nan"), float("nan")
     runs, tasks = scores.shape
     draws = np.random.default_rng(0).integers(0, runs, (_RESAMPLES, runs, tasks))
@@ -60,12 +60,11 @@ def bootstrap_interval(
         resamples: Number of bootstrap samples.
 
     Returns:
-        Lower and upper bound; NaN if there are no values.
+        Lower and upper bound; NaN if there are fewer than two values, which tell nothing about their spread.
     """
     values = values[~np.isnan(values)]
-    if len(values) < 2:  # nothing to draw from
-        only = float(statistic(values, axis=-1)) if len(values) else float("nan")
-        return only, only
+    if len(values) < 2:
+        return float("nan"), float("nan")
     options = {"n_resamples": resamples, "confidence_level": 0.95, "method": "percentile", "vectorized": True}
     low, high = stats.bootstrap((values,), statistic, rng=np.random.default_rng(0), **options).confidence_interval
     return float(low), float(high)
@@ -82,10 +81,10 @@ def comparison_interval(
         compare: Function of both means, elementwise.
 
     Returns:
-        Lower and upper bound; NaN if there are no values.
+        Lower and upper bound; NaN if one of the two has fewer than two values.
     """
     kept = [numbers[~np.isnan(numbers)] for numbers in (values, others)]
-    if not all(map(len, kept)):
+    if min(map(len, kept)) < 2:
         return float("nan"), float("nan")
     generator = np.random.default_rng(0)
     means = (numbers[generator.integers(0, len(numbers), (_RESAMPLES, len(numbers)))].mean(1) for numbers in kept)

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,7 +102,8 @@ def evaluate_grid(
     if episodes < 1:
         raise ValueError(f"episodes per cell must be at least 1, got {episodes}")
     cells = domain.cells() if cells is None else [dict(cell) for cell in cells]
-    default, names = space.describe(space.default), dict.fromkeys(name for cell in cells for name in cell)
+    default = {p.name: p.default for p in space.parameters}  # as declared; theta is rounded to float32
+    names = dict.fromkeys(name for cell in cells for name in cell)
     cells = [{name: cell.get(name, default.get(name)) for name in names} for cell in cells]  # as many columns in each
     theta = space.make_all(cells).repeat_interleave(episodes, 0)
     label = f"{len(cells)} styles x {episodes} episodes"
@@ -146,7 +148,7 @@ def rows_where(rows: Sequence[Mapping[str, Any]], **values: Any) -> list[Mapping
 
 def write_csv(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Write rows with the same keys as CSV."""
-    with path.open("w", newline="") as file:
+    with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()} for row in rows)
@@ -166,8 +168,8 @@ def write_results(
     for name, rows in tables.items():
         if rows:
             write_csv(rows, out / f"{name}.csv")
-    (out / "summary.json").write_text(json.dumps(without_nan(summary), indent=2) + "\n")
-    (out / "report.md").write_text(report)
+    (out / "summary.json").write_text(json.dumps(without_nan(summary), indent=2) + "\n", encoding="utf-8")
+    (out / "report.md").write_text(report, encoding="utf-8")
     return report
 
 
@@ -199,7 +201,9 @@ def markdown_table(
     """
     headings = [with_unit(name, (units or {}).get(name, "")) for name in columns]
     lines = ["| " + " | ".join(headings) + " |", "|" + "--|" * len(columns)]
-    lines += ["| " + " | ".join(format(row[c], spec) for c, spec in columns.items()) + " |" for row in rows]
+    for row in rows:
+        cells = (format(row[column], spec).replace("|", "\\|") for column, spec in columns.items())
+        lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 
@@ -212,10 +216,20 @@ def training_counts(agent: LoadedPolicy) -> str:
 def published(domain: Domain, episodes: Mapping[str, Any], cell: Mapping[str, Any]) -> dict[str, str]:
     """Return the format of each column of a domain's table: of those that it declares, otherwise of every metric.
 
-    Metrics are given by name, as in `StyleGrid.episodes`, together with one style of the table.
+    Metrics are given by name, as in `StyleGrid.episodes`, together with one style of the table. Declared columns that
+    were not measured are left out, with a warning.
     """
-    everything = {measured_column(name, cell): ".3g" for name in episodes}
-    return dict(domain.columns) or everything | {"survived": ".0%"}
+    columns = {name: measured_column(name, cell) for name in episodes}
+    if not domain.columns:
+        return dict.fromkeys(columns.values(), ".3g") | {"survived": ".0%"}
+    declared = {column.removeprefix("measured_"): form for column, form in domain.columns.items()}
+    if unknown := declared.keys() - columns.keys():
+        warnings.warn(
+            f"columns of the domain {domain.name} name {', '.join(sorted(unknown))}: expected some of "
+            f"{', '.join(columns)}",
+            stacklevel=2,
+        )
+    return {columns[name]: form for name, form in declared.items() if name in columns}
 
 
 def policy_sentence(agent: LoadedPolicy) -> str:

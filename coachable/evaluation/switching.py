@@ -56,11 +56,13 @@ def evaluate_switching(
     label = f"{episodes} episodes, style switched every {period} steps"
     record = record_styles(domain, policy, space, lambda step: styles[step // period], label, **options)
     summary = {"survived": record.survived.float(), **domain.measures.summarise(record.measures, record.alive)}
+    summary.pop("complied", None)  # racing's share of the steps; below are the shares of the switches
     metrics = {name: value.nanmean().item() for name, value in summary.items()}
     complies = domain.measures.complies(record.measures) & record.alive
     is_known = bool((judged_steps(domain.measures, record.measures) & record.alive).any())
     waits, switches = [], 0
-    for start in range(period, len(complies) - period + 1 if is_known else 0, period):  # after each, a whole period
+    last = min(len(complies) - 1, steps - period) if is_known else 0  # a whole period may follow each switch
+    for start in range(period, last + 1, period):
         running = record.alive[start]
         done, first = complies[start : start + period].max(0)
         switches += int(running.sum())

@@ -191,6 +191,7 @@ def _film(
                 if transition["next", "done"].any():
                     failures += int(transition["next", "terminated"].sum())
                     rollout.begin(theta[None])
+                    recent = []
     finally:
         renderer.close()
         env.close()

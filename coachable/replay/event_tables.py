@@ -154,7 +154,7 @@ class EventTableBuffer(TensorDictReplayBuffer):
         """
         Range("(0, 1)").check("event_share", event_share)
         if not events.names:
-            raise ValueError("the event predicate has no events: expected at least one, such as a weight of StyleEvents")
+            raise ValueError("events has no names: expected at least one event (StyleEvents has one per weight)")
         capacities = {"default": capacity, **dict.fromkeys(events.names, event_capacity)}
         shares = {"default": 1.0 - event_share, **dict.fromkeys(events.names, event_share / len(events.names))}
         proportions = {"table_proportions": shares, **kwargs}

@@ -200,8 +200,8 @@ class TableWriter(Writer):
         saved = list(state_dict.get("sums", self._sums))
         if saved != self._sums:
             raise ValueError(
-                "the saved buffer has n_steps={} and gamma={}, this one n_steps={} and gamma={}: make it like the saved "
-                "one".format(*saved, *self._sums)
+                "the saved buffer has n_steps={} and gamma={}, this one n_steps={} and gamma={}: make it like the "
+                "saved one".format(*saved, *self._sums)
             )
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:

@@ -140,7 +140,7 @@ class StyleSpace:
             self._encoding[device] = (shift, scale)
         return shift, scale
 
-    def make(self, strict: bool = False, **values: float | str) -> Tensor:
+    def make(self, /, strict: bool = False, **values: float | str) -> Tensor:
         """Return one style from named values.
 
         Args:

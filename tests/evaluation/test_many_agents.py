@@ -50,6 +50,12 @@ def test_bounds_are_shown_alone(evaluated, tmp_path):
     assert text.splitlines()[2:] == ["| clean laps | 0.9 | 1 | 0.8 | 0.9 | 0.1 |"]
 
 
+def test_agents_without_a_common_number_have_no_table(evaluated, tmp_path):
+    evaluated["car_a"], evaluated["car_b"] = {"bounds": {"clean laps": None}}, {"bounds": {"clean laps": None}}
+    assert evaluate_agents(["car_a", "car_b"], tmp_path, episodes=3) == ""
+    assert not (tmp_path / "agents.csv").exists()
+
+
 def test_a_single_agent_has_its_own_report(evaluated, tmp_path):
     evaluated["car_a"] = {}
     assert evaluate_agents(["car_a"], tmp_path / "out", episodes=3) == "car_a"

@@ -144,7 +144,7 @@ def test_what_a_domain_measures_itself_is_on_the_page(tmp_path):
         assert replace(settings, sweeps=None) == EvaluationSettings(episodes=2, switch_episodes=4, progress=False)
         assert [sweep.weight for sweep in settings.sweeps] == ["bold"]
         (out / "every_step.csv").write_text("step\n" + "1\n" * 101)
-        (out / "wins.csv").write_text("style,easy_machine\nred,0.5\n")
+        (out / "wins.csv").write_text("style,easy_machine,wait,km\nred,0.5,inf,nan\nblue,0.25,2.63,12345.6\n")
         (out / "wins.png").write_bytes((out.parent / "styles.png").read_bytes())
         return "not used"
 
@@ -153,6 +153,17 @@ def test_what_a_domain_measures_itself_is_on_the_page(tmp_path):
     page = (tmp_path / "report.html").read_text()
     assert "101 rows: toy/every_step.csv" in page
     assert ">Wins</h2>" in page and "wins, a figure" in page and "easy machine" in page and "0.5" in page
+    assert "2.63" in page and ">12346<" in page
+
+
+def test_task_success_is_no_style(tmp_path):
+    class Bold(ToyMeasures):
+        def step(self, transition):
+            return super().step(transition) | {"bold": transition["style"][:, 3]}
+
+    domain = replace(DOMAIN, measures=Bold(), columns={"measured_bold": ".2f", "survived": ".0%"})
+    write_report(domain, {"toy.pt": AGENT}, tmp_path, **SMALL)
+    assert "success is survived" in (tmp_path / "report.html").read_text()
 
 
 def test_the_same_seed_gives_the_same_files(folder, tmp_path):
@@ -194,7 +205,9 @@ def test_of_many_parameters_only_what_is_asked_for_is_named():
     cells = [dict.fromkeys(space.names, 0.0), {**dict.fromkeys(space.names, 0.0), "fire": 5.0}]
     grid = StyleGrid(cells, {"survived": np.ones((2, 3))}, 0, 10)
     table = StyleTable([Run("seed 0", grid, SwitchReport(100, {}, torch.empty(0), 0.0, 0), [])], space)
-    assert table.rows(["survived"])[1] == {"style": "fire 5", "survived": (1.0, 1.0, 1.0)}
+    row = table.rows(["survived"])[1]
+    assert row["style"] == "fire 5" and row["survived"].value == 1.0
+    assert np.isnan([row["survived"].low, row["survived"].high]).all()  # of one run there is no interval
     assert table.labels[0] == "default"
 
 
@@ -227,6 +240,7 @@ def test_estimates():
 def test_how_numbers_are_written():
     assert shown(Estimate(0.5, 0.25, 0.75), ".0%") == "50% [25%, 75%]"
     assert shown(float("nan"), ".2f") == "n/a"
+    assert shown(Estimate(0.5, np.nan, np.nan), ".0%") == "50%"
     assert describe({"pose": "t_pose", "step_length": 0.5}) == "t pose, step length 0.5"
     text = table([{"style": "<b>", "score": Estimate(1.0, 0.5, 2.0)}], {"score": ".1f"}, colour=True)
     assert "&lt;b&gt;" in text and "1.0 <small>[0.5, 2.0]</small>" in text

@@ -3,6 +3,7 @@ import pytest
 
 from coachable.evaluation.statistics import (
     bootstrap_interval,
+    comparison_interval,
     interquartile_mean,
     rank_correlation,
     stratified_interval,
@@ -25,6 +26,13 @@ def test_bootstrap_interval_of_a_mean_matches_the_normal_one():
 def test_bootstrap_interval_leaves_nan_out():
     assert bootstrap_interval(np.array([1.0, np.nan, 1.0])) == (1.0, 1.0)
     assert np.isnan(bootstrap_interval(np.array([np.nan]))).all()
+
+
+def test_one_value_has_no_interval():
+    one, two = np.array([1.0, np.nan]), np.array([1.0, 2.0])
+    assert np.isnan(bootstrap_interval(one)).all() and np.isnan(stratified_interval(one[None])).all()
+    assert np.isnan(comparison_interval(one, two, np.subtract)).all()
+    assert np.isnan(comparison_interval(two, one, np.subtract)).all()
 
 
 def test_rank_correlation():

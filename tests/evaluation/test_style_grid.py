@@ -112,6 +112,21 @@ def test_a_switch_counts_if_a_whole_period_follows():
     assert report.period == 2 and 50 < report.switches <= 3 * 20  # before steps 2, 4 and 6, not 8; some have ended
 
 
+def test_a_switch_before_a_fall_counts_although_no_episode_lives_longer():
+    racer = TensorDictModule(lambda style: torch.full_like(style[:, 2:], 2.0), in_keys=["style"], out_keys=["action"])
+    report = evaluate_switching(DOMAIN, racer, SPACE, episodes=20, steps=8, progress=False)  # all fall in step 5
+    assert (report.period, report.switches) == (2, 2 * 20)
+
+
+def test_a_measure_of_steps_does_not_stand_for_the_share_of_the_switches():
+    class Racing(ToyMeasures):
+        def summarise(self, record, alive):
+            return super().summarise(record, alive) | {"complied": torch.full(alive.shape[1:], 0.1)}
+
+    report = evaluate_switching(replace(DOMAIN, measures=Racing()), POLICY, SPACE, episodes=20, steps=4, progress=False)
+    assert "complied" not in report.metrics and report.complied > 0.3
+
+
 def test_the_median_of_an_even_number_of_waits_is_between_the_middle_two():
     report = SwitchReport(100, {}, torch.tensor([0.4, 0.1, 0.2, 0.8]), complied=1.0, switches=4)
     assert report.median_seconds == pytest.approx(0.3)
@@ -139,6 +154,37 @@ def test_trials_and_medians_are_reported(tmp_path):
     assert "| survived |  | 100% | 0% | 100% |  |  |" in report
     assert "gale,9,7," in (tmp_path / "trials.csv").read_text()
     assert (tmp_path / "medians.csv").is_file()
+
+
+def test_targets_of_metrics_that_are_not_published_are_reported(tmp_path):
+    agent, settings = LoadedPolicy(POLICY, SPACE, {}, {}), EvaluationSettings(1, switch_episodes=0, progress=False)
+    domain = replace(DOMAIN, targets={"speed": 1.0})
+    report, _ = evaluate_styles(domain, agent, tmp_path, settings)
+    assert (
+        "| speed |  | 1 | 0 | 2 | 1 | yes |" in report and "\n| error |  | " in report
+    )  # all are published by default
+    report, _ = evaluate_styles(replace(domain, columns={"survived": ".0%"}), agent, tmp_path, settings)
+    assert "| speed |  | 1 | 0 | 2 | 1 | yes |" in report and "\n| error |  | " not in report
+    with pytest.warns(UserWarning, match="targets of the domain toy name pace: expected some of survived, steps"):
+        evaluate_styles(replace(domain, targets={"pace": 1.0}), agent, tmp_path, settings)
+
+
+def test_published_columns_that_a_grid_does_not_have(tmp_path):
+    agent, settings = LoadedPolicy(POLICY, SPACE, {}, {}), EvaluationSettings(1, switch_episodes=0, progress=False)
+    domain = replace(DOMAIN, grid={"hat": ("red", "blue")}, columns={"survived": ".0%", "measured_speed": ".2f"})
+    report, _ = evaluate_styles(domain, agent, tmp_path, settings)
+    assert "| hat | survived | speed [m/s] |" in report  # no speed is requested that it could be mistaken for
+    with pytest.warns(UserWarning, match="columns of the domain toy name pace: expected some of survived, steps"):
+        report, _ = evaluate_styles(replace(domain, columns={"pace": "", "survived": ".0%"}), agent, tmp_path, settings)
+    assert "| hat | survived |" in report
+
+
+def test_names_that_are_no_formula_are_drawn(tmp_path):
+    space = StyleSpace([Choice("hat", ("$x^$", "a|b")), Setpoint("speed", 0.0, 2.0)], name="toy")
+    domain = replace(DOMAIN, make_space=lambda: space, grid={"hat": ("$x^$", "a|b"), "speed": (0.0, 1.0, 2.0)})
+    agent, settings = LoadedPolicy(POLICY, space, {}, {}), EvaluationSettings(2, switch_episodes=0, progress=False)
+    report, _ = evaluate_styles(domain, agent, tmp_path, settings)
+    assert r"| a\|b | 0 |" in report and (tmp_path / "grid.png").stat().st_size > 1000
 
 
 def test_a_domain_without_trials_and_targets_reports_none(tmp_path):

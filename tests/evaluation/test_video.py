@@ -8,7 +8,9 @@ from functools import partial
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image, ImageSequence
+from tensordict.nn import TensorDictModule
 
 from coachable.domain import load_domain
 from coachable.domains.humanoid import humanoid_style_space
@@ -25,6 +27,7 @@ from coachable.evaluation.video import (
 )
 from coachable.styles import StyleRangeWarning, StyleSpace, Weight
 from coachable.training.weights import domain_of, load_policy
+from tests.evaluation.test_style_grid import DOMAIN, SPACE
 
 
 def frames(count=8):
@@ -191,6 +194,16 @@ class BlankRenderer:
 
     def close(self):
         pass
+
+
+def test_what_is_measured_begins_again_with_an_episode(monkeypatch):
+    lengths = []
+    monkeypatch.setattr(video, "caption", lambda frame, lines: None)
+    monkeypatch.setattr(video, "_summary", lambda domain, recent: lengths.append(len(recent)) or {})
+    racer = TensorDictModule(lambda style: torch.full_like(style[:, 2:], 2.0), in_keys=["style"], out_keys=["action"])
+    domain = replace(DOMAIN, make_renderer=BlankRenderer)
+    list(video._film(domain, racer, SPACE, [{}], 7, (64, 64), 0, 10.0))
+    assert lengths == [1, 2, 3, 4, 5, 1, 2]  # it falls in the fifth step
 
 
 def test_the_tour_of_weights_is_the_grid():

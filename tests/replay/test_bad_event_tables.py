@@ -104,7 +104,7 @@ def test_wrong_event_columns_name_the_tables():
 
 
 def test_a_predicate_without_events_is_refused():
-    with pytest.raises(ValueError, match="has no events"):
+    with pytest.raises(ValueError, match="events has no names"):
         EventTableBuffer.for_events(KeyEvents([]), capacity=9, event_capacity=9, event_horizon=1, num_envs=1)
 
 

@@ -141,7 +141,8 @@ def fight_matrix(
     space, shape = agent.space, (len(cells), len(opponents), episodes)
     theta = space.make_all(cells)
     theta = theta.repeat_interleave(len(opponents) * episodes, 0)
-    env = domain.styled_env(space, len(theta), seed=seed, num_enemies=len(opponents[0]))
+    longest = max(steps, domain.episode_steps)
+    env = domain.styled_env(space, len(theta), seed=seed, num_enemies=len(opponents[0]), episode_steps=longest)
     sites = np.random.default_rng(seed).choice(SITES, len(opponents) * episodes)
     names = [machines for machines in opponents for _ in range(episodes)] * len(cells)
     simulation: Any = env.base_env

@@ -43,7 +43,7 @@ def evaluate_gait(domain: Domain, agent: LoadedPolicy, out: Path, settings: Eval
     write_csv(rows, out / "plane.csv")
     _draw_plane(rows, out / "plane.png")
     report += _section(rows)
-    (out / "report.md").write_text(report)
+    (out / "report.md").write_text(report, encoding="utf-8")
     return report
 
 

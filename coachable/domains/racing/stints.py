@@ -94,7 +94,7 @@ def evaluate_resources(domain: Domain, agent: LoadedPolicy, out: Path, settings:
     rows: list[dict[str, Any]] = []
     every: list[dict[str, Any]] = []
     frontiers: dict[tuple[str, str], list[dict[str, float]]] = {}
-    for track, (resource, name) in product((home, UNSEEN), WEIGHTS.items()):
+    for track, (resource, name) in product(dict.fromkeys((home, UNSEEN)), WEIGHTS.items()):
         only = replace(rates, **{"wear" if resource == "fuel" else "fuel": 0.0})
         bound = frontiers[track, resource] = frontier(track, car, resource)
         high = dict(zip(agent.space.names, agent.space.high.tolist(), strict=True))[name]
