@@ -280,8 +280,8 @@ def style_grid(space: StyleSpace) -> list[dict[str, Any]]:
     return [default, *({**default, name: v} for name, v in others)]
 
 
-def _alike(value: float | str, other: float | str) -> bool:
-    if isinstance(value, str) or isinstance(other, str):
+def _alike(value: Any, other: Any) -> bool:
+    if isinstance(value, str):
         return value == other
     return math.isclose(value, other, rel_tol=1e-5)  # `_spread` rounds to six digits
 
