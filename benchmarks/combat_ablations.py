@@ -151,16 +151,33 @@ def last(run: Path, metric: str) -> float:
     return float(read_metric(run, "frames", metric)[1][-1])
 
 
-def pace(run: Path) -> float:
-    """Median time of an update [ms]: the machine may have been busy with something else, or suspended, in between."""
-    updates, seconds = read_metric(run, "updates", "seconds/update")
-    done = np.diff(updates)
-    return 1e3 * float(np.median(np.diff(seconds)[done > 0] / done[done > 0]))
+def pace(folders: Sequence[Path]) -> float:
+    """Minutes per million env-steps of a variant, without evaluations.
+
+    Of each training the tenth percentile over its log intervals counts, and of these the least, because the machine may
+    have been busy with something else.
+    """
+    found = []
+    for folder in folders:
+        frames, updating = read_metric(folder, "frames", "seconds/update")
+        seconds = updating + sum(read_metric(folder, "frames", f"seconds/{part}")[1] for part in ("collect", "store"))
+        trained = (np.diff(updating) > 0) & (np.diff(frames) > 0)
+        found.append(np.percentile(np.diff(seconds)[trained] / np.diff(frames)[trained], 10))
+    return min(found) * 1e6 / 60
+
+
+def at(run: Path, frames: float, metric: str) -> float:
+    """Return a metric after a number of env-steps, interpolated between evaluations."""
+    return float(np.interp(frames, *read_metric(run, "frames", metric)))
 
 
 def final_rows(runs: Mapping[str, Sequence[Path]]) -> list[dict[str, Any]]:
-    """Per variant: means and 95 % bootstrap intervals over seeds of the last evaluation, and what updates took."""
-    rows = []
+    """Per variant: means and 95 % bootstrap intervals over seeds of the last evaluation, and means at equal time.
+
+    Equal time is that in which the fastest variant finishes.
+    """
+    rows, paces = [], {variant: pace(folders) for variant, folders in runs.items()}
+    shortest = min(last(folder, "frames") * paces[variant] for variant, folders in runs.items() for folder in folders)
     for variant, folders in runs.items():
         row: dict[str, Any] = {"variant": variant, "changed": " ".join(VARIANTS[variant]), "seeds": len(folders)}
         for metric in METRICS:
@@ -168,15 +185,23 @@ def final_rows(runs: Mapping[str, Sequence[Path]]) -> list[dict[str, Any]]:
             low, high = bootstrap_interval(values)
             row |= {name: float(values.mean()), f"{name}_low": low, f"{name}_high": high}
             row[f"{name}_by_seed"] = " ".join(f"{value:.3f}" for value in values)
+            row[f"{name}_at_equal_time"] = float(np.mean([at(f, shortest / paces[variant], metric) for f in folders]))
         row["frames"] = int(np.mean([last(folder, "frames") for folder in folders]))
         row["updates"] = int(np.mean([last(folder, "updates") for folder in folders]))
-        row["update_ms"] = float(np.mean([pace(folder) for folder in folders]))
+        row["minutes"] = row["frames"] * paces[variant] / 1e6
+        row["equal_time_minutes"] = shortest / 1e6
         rows.append(row)
     return rows
 
 
-def draw(runs: Mapping[str, Sequence[Path]], path: Path) -> None:
-    """Style score and wins over env-steps: the base in every column, beside it what the column changes."""
+def draw(runs: Mapping[str, Sequence[Path]], path: Path, paces: Mapping[str, float] | None = None) -> None:
+    """Style score and wins over env-steps or minutes: the base in every column, beside it what the column changes.
+
+    Args:
+        runs: Trainings by variant.
+        path: Image file.
+        paces: Minutes per million env-steps by variant, if the horizontal axis shows minutes.
+    """
     panels = {title: [v for v in members if v in runs] for title, members in PANELS.items()}
     panels = {title: members for title, members in panels.items() if members} or {"base": []}
     size = (4.2 * len(panels), 6.0)
@@ -187,6 +212,7 @@ def draw(runs: Mapping[str, Sequence[Path]], path: Path) -> None:
             if variant not in runs:
                 continue
             x, mean, (low, high) = summarise_runs(runs[variant], "frames", metric, smooth=1)
+            x = x if paces is None else x * paces[variant] / 1e6
             colour = "black" if variant == "base" else f"C{number - 1}"
             label = f"{LABELS.get(variant, variant)} ({len(runs[variant])})"
             axes.plot(x, mean, color=colour, label=label)
@@ -196,7 +222,7 @@ def draw(runs: Mapping[str, Sequence[Path]], path: Path) -> None:
         if row == 0:
             axes.set_title(title, fontsize=10)
         else:
-            axes.set_xlabel("env-steps")
+            axes.set_xlabel("env-steps" if paces is None else "minutes")
             axes.legend(fontsize=7, title="(seeds)", title_fontsize=7)
         if column == 0:
             axes.set_ylabel(METRICS[metric])
@@ -226,10 +252,14 @@ def main() -> None:
     if not runs:
         raise SystemExit(f"{args.runs} has no finished training")
     draw(runs, args.out / "ablations.png")
+    draw(runs, args.out / "ablations_minutes.png", {variant: pace(folders) for variant, folders in runs.items()})
     rows = final_rows(runs)
     write_csv(rows, args.out / "ablations.csv")
     for row in rows:
-        print(f"{row['variant']:16} {row['seeds']} seeds: style score {row['style_score']:.2f}, won {row['won']:.0%}")
+        print(
+            f"{row['variant']:16} {row['seeds']} seeds: style score {row['style_score']:.2f}, won {row['won']:.0%}, "
+            f"{row['minutes']:.0f} minutes"
+        )
 
 
 if __name__ == "__main__":

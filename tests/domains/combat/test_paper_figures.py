@@ -216,6 +216,27 @@ def test_ablations_of_a_preset_with_stages_are_refused(tmp_path):
         combat_ablations.train("base", 0, tmp_path / "run", args)
 
 
+def test_ablations_are_compared_at_equal_updates_and_at_equal_time(tmp_path):
+    """The base takes 60 s per million env-steps, the other 30 s; half of the intervals were disturbed."""
+    runs = {}
+    for variant, slow, score in (("base", 60.0, 0.8), ("impersonation_0", 30.0, 0.4)):
+        folder = tmp_path / f"{variant}_0"
+        folder.mkdir()
+        with (folder / "metrics.csv").open("w") as file:
+            print("frames,updates,seconds/collect,seconds/store,seconds/update,eval/style_score,eval/won", file=file)
+            seconds = 0.0
+            for row in range(21):
+                print(f"{row * 1e5},{row},{seconds / 4},{seconds / 4},{seconds / 2},{row * score / 20},1", file=file)
+                seconds += slow * 0.1 * (1 + row % 2)
+        runs[variant] = [folder]
+    base, other = combat_ablations.final_rows(runs)
+    assert (base["minutes"], other["minutes"]) == pytest.approx((2.0, 1.0), rel=1e-3)
+    assert base["style_score"] == pytest.approx(0.8) and base["style_score_at_equal_time"] == pytest.approx(0.4)
+    assert other["style_score"] == other["style_score_at_equal_time"] == pytest.approx(0.4)
+    combat_ablations.draw(runs, tmp_path / "minutes.png", {"base": 1.0, "impersonation_0": 0.5})
+    assert (tmp_path / "minutes.png").stat().st_size > 1000
+
+
 def test_brittle_phases_are_counted_by_hand():
     steps, sun, sky = 8, SOURCES.index("sunscourge"), SOURCES.index("skykiller")
     row = {name: torch.zeros(1) for name in ("request", "counted", "player", "machine")}
