@@ -5,8 +5,8 @@ import math
 import os
 import signal
 import threading
-import time
 import warnings
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -15,6 +15,7 @@ from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 from coachable.networks import make_gaussian_actor
 from coachable.replay import EventTableBuffer
+from coachable.training import throttle
 from coachable.training.checkpoint import find_checkpoint, read_state
 from coachable.training.collection import evaluate_policy, make_collector, require_same_bounds
 from coachable.training.train_settings import TrainSettings
@@ -211,12 +212,20 @@ def test_without_settings_every_step_is_followed_by_an_update(make_train):
     assert train.learner.optimizers["actor"].param_groups[0]["lr"] == 1e-3  # and nothing is annealed
 
 
-def test_without_a_ratio_the_learner_fills_the_throttled_time(make_train):
+def test_without_a_ratio_the_learner_fills_the_throttled_time(make_train, monkeypatch):
+    """Of 1.5 s, half a second is the warm-up; the rest has room for 20 updates of 50 ms."""
+    now = [0.0]
+
+    def spend(seconds):
+        now[0] += seconds
+
+    monkeypatch.setattr(throttle, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=spend))
     train = make_train(total_frames=60, utd_ratio=None, throttle=40.0, warmup_frames=20)
-    start = time.monotonic()
+    update = train.learner.update
+    train.learner.update = lambda batch: spend(0.05) or update(batch)
     train.run()
-    assert time.monotonic() - start >= 60 / 40 - 0.2
-    assert train.learner.updates >= 5  # hundreds on an idle machine
+    assert now[0] == pytest.approx(60 / 40, abs=0.06)
+    assert train.learner.updates == pytest.approx(20, abs=3)
 
 
 def test_the_share_of_annealing_is_a_share():
