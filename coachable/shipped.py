@@ -32,11 +32,11 @@ def require_agent(source: str) -> None:
     Raises:
         ValueError: If it cannot; the message lists the agents that ship with weights.
     """
-    shipped = shipped_agents()
-    if source in shipped or (source and Path(source).is_dir()):
+    shipped, path = shipped_agents(), Path(source).expanduser()
+    if source in shipped or (source and path.is_dir()):
         return
     names = ", ".join(shipped)
-    if not source or not Path(source).exists():
+    if not source or not path.exists():
         raise ValueError(f"there is no agent {source!r}: expected {SOURCE_HELP} ({names})")
-    if not source.endswith(".onnx") and not zipfile.is_zipfile(source):
+    if not source.endswith(".onnx") and not zipfile.is_zipfile(path):
         raise ValueError(f"{source} is not a weights file: expected {SOURCE_HELP} ({names})")

@@ -30,6 +30,8 @@ class StyleEchoEnv(EnvBase):
     Episodes end (terminated) where |position| > 3, and after 20 steps (truncated).
     """
 
+    runs_past_time_limit = True
+
     def __init__(self, num_envs: int = 4, seed: int = 0, resumable: bool = True) -> None:
         super().__init__(batch_size=[num_envs])
         shape = (num_envs,)

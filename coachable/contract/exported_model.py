@@ -84,6 +84,8 @@ class OnnxRun:
         choices = torch.from_numpy(outputs["choices"])
         if sample:
             parts = torch.from_numpy(outputs["probabilities"]).split(self._heads.categorical, -1)
+            if not all(part.isfinite().all() for part in parts):
+                raise ContractError("the model's probabilities are not finite: the model cannot act")
             choices = torch.cat([torch.multinomial(part.clamp(min=0.0), 1) for part in parts], -1)
         axes = torch.from_numpy(outputs["axes"]) if self._heads.axes else None
         limits = torch.tensor(self._heads.categorical) - 1

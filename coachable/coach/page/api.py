@@ -151,8 +151,8 @@ class CoachApi:
                 report = session.report()
                 self.publish(report)  # so that a state which is read after the answer has the change
                 answer = {"style": session.style, "controls": session.controls, "outside": report.outside}
-            except ValueError as error:
-                answer = {"error": str(error)}
+            except Exception as error:  # the client must not wait for an answer that never comes
+                answer = {"error": str(error) or type(error).__name__}
             with contextlib.suppress(RuntimeError):  # the server has stopped meanwhile
                 running.call_soon_threadsafe(finish, answer)
 

@@ -11,6 +11,7 @@ from coachable.coach.session.recording import Recording
 from coachable.coach.session.session import CoachSession
 from coachable.evaluation.video import CAPTION, asked_line, caption, measured_line, write_video
 from coachable.keys import TASK_REWARD
+from coachable.outputs import complete_file
 
 _LONGEST_SESSION = 600.0  # [s]; the whole session is replayed to film its last seconds
 
@@ -107,7 +108,8 @@ def film(
     replica = session.replica()
     try:
         fps = max(1, round(1 / session.domain.control_step))
-        write_video(_frames(replica, recording, last, size, on_progress), out, fps)
+        with complete_file(out) as unfinished:
+            write_video(_frames(replica, recording, last, size, on_progress), unfinished, fps)
     finally:
         replica.close()
     return out

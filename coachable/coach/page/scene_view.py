@@ -71,6 +71,7 @@ class SceneView(View):
         self.frame: Frame | None = None
         self._before: Frame | None = None
         self._seen: Hashable = None
+        self._stale = False  # whether steps were not shown because there was no browser
         self._place: Hashable = None
         self._still: list[Any] = []
         # What moves is placed relative to the agent, whose pose is a frame of its own: browsers that draw slowly show
@@ -100,9 +101,12 @@ class SceneView(View):
 
     def update(self, share: float = 1.0) -> None:
         """Show the present state, or one between the last two states; see `View.update`."""
-        if not self._server.get_clients():
-            return
         session = self._session
+        if not self._server.get_clients():
+            self._stale = True
+            return
+        if self._stale and session.domain.make_stage is not None:  # what it remembers is not of the last step
+            self._stage, self._stale = session.domain.make_stage(), False
         present = (session.seed, session.step_count, session.episode, tuple(session.style.items()))
         if present != self._seen or self.frame is None:
             self._seen, self._before = present, self.frame

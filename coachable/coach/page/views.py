@@ -28,7 +28,11 @@ class PictureView(View):
     def __init__(self, server: viser.ViserServer, session: CoachSession) -> None:
         self._server, self._session = server, session
         self._renderer = session.domain.make_renderer(*_PICTURE_SIZE)
-        self._renderer.draw(session.env)  # raises here if it cannot draw
+        try:
+            self._renderer.draw(session.env)
+        except Exception:
+            self._renderer.close()
+            raise
         self._due = 0.0
 
     def update(self, share: float = 1.0) -> None:
@@ -76,6 +80,6 @@ def make_view(server: viser.ViserServer, session: CoachSession) -> View:
         if session.domain.make_stage is not None:
             return SceneView(server, session, session.domain.make_stage())
         return PictureView(server, session)
-    except (ImportError, RuntimeError) as error:  # an extra or an OpenGL library is missing
+    except Exception as error:  # an extra or an OpenGL library is missing, or the domain's own view fails
         server.gui.add_markdown(f"**No view:** {escaped(str(error))}")
         return View()  # coaching works without one

@@ -62,10 +62,11 @@ class ParameterWidget:
 
     def follow(self, value: float | str) -> None:
         """Show the value in force, unless the widget shows it already."""
-        if self._same(value):
+        shown = value if isinstance(value, str) else self._inside(value)
+        if self._same(shown):
             return
-        self._shown = value
-        self.handle.value = readable(value) if isinstance(value, str) else self._inside(value)
+        self._shown = shown  # viser calls back when the value is set, which must not look like a request
+        self.handle.value = readable(shown) if isinstance(shown, str) else shown
 
     def _inside(self, value: float) -> float:
         """Round a float32 value to six digits, and clamp it because rounding may exceed the bounds."""

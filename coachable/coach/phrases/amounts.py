@@ -67,7 +67,7 @@ def amount(p: Weight | Setpoint, segment: Segment, now: float, last: Last | None
         if spent and not segment.sense and not segment.preferred:
             return f"save {readable(p.name)}, or use it?"
         return _level(p, 1.0 - segment.level if sense < 0 else segment.level, segment.degree)
-    if segment.default:
+    if segment.default and not segment.negated:
         return cast(float, p.default)  # declared, or derived when the parameter was made: never None
     if isinstance(p, Weight):
         return _weight(p, segment, spent)

@@ -132,7 +132,10 @@ class StyleGrammar:
         if not split:
             reading.failed.append(f"'{phrase.strip()}'" if phrase.strip() else "an empty phrase")
         for segment in split:
-            if segment.default and not segment.unknown and not segment.mentions:
+            everything = segment.default and not (segment.unknown or segment.mentions or segment.explicit)
+            if everything and segment.negated:
+                reading.failed.append(f"'{segment.text}' (say what instead)")
+            elif everything:
                 self._reset(reading)
             else:
                 self._interpret(segment, reading)
@@ -216,7 +219,7 @@ class StyleGrammar:
             return
         name, parameter = names[0], self.parameters[names[0]]
         if isinstance(parameter, Choice):
-            if segment.keep or segment.default:
+            if segment.keep or (segment.default and not segment.negated):
                 self._change(reading, name, (self._defaults if segment.default else reading.values)[name])
                 return
             expected = f"{readable(name)} can be {_listed(parameter.options)}"

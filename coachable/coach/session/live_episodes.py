@@ -14,7 +14,10 @@ from coachable.training.rollout import Rollout
 
 
 class LiveEpisodes(Rollout):
-    """Rollout in one environment without a time limit that counts how episodes end.
+    """Rollout in one environment that counts how episodes end.
+
+    A time limit is ignored if the environment has an attribute `runs_past_time_limit` that is true. Others, such as
+    those of Gymnasium and dm_control, begin a new episode by themselves when they are stepped after it.
 
     Args:
         domain: Domain that makes the environment.
@@ -60,6 +63,9 @@ class LiveEpisodes(Rollout):
         self.steps += 1
         if transition["next", "terminated"].any():
             self.ended = self._terminated
+        elif transition["next", "truncated"].any() and not getattr(self.base_env, "runs_past_time_limit", False):
+            self.ended = "reached the time limit"
+        if self.ended is not None:
             self.endings[self.ended] += 1
         return transition
 

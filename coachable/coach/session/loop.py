@@ -13,6 +13,7 @@ from coachable.coach.session.session import CoachSession
 _LATE = 0.25  # [s], the loop does not catch up on longer delays
 _IDLE = 0.05  # [s], longest time between checks of the queue
 _FRAME = 1.0 / 30.0  # [s], longest time between two calls of `on_wait`
+_READABLE = 4.0  # [s], for which a problem is shown although other changes succeed
 _WAITING = 256  # changes in the queue, further ones are refused
 
 
@@ -33,7 +34,7 @@ class LiveLoop:
         pause_at_end: How long an ended episode is shown before the next one begins [s].
         speed: Simulated seconds per second, a finite number above 0.
         paused: Whether the loop only makes single steps.
-        problem: Text of the last exception, empty if there was none since the last change.
+        problem: Text of the last exception; empty if changes were made without one for some seconds since.
     """
 
     pause_at_end = 1.0
@@ -49,7 +50,7 @@ class LiveLoop:
         self._stepped = 0.0
         self._speed = 1.0
         self.paused = False
-        self.problem = ""
+        self._problem, self._problem_at = "", -math.inf
         self._changes: queue.Queue[Callable[[CoachSession], Any]] = queue.Queue(_WAITING)
         self._stopping = threading.Event()
         self._stale = threading.Event()
@@ -70,6 +71,15 @@ class LiveLoop:
         if not 0.0 < speed < math.inf:
             raise ValueError(f"speed = {speed}: expected a finite number above 0")
         self._speed = speed
+
+    @property
+    def problem(self) -> str:
+        """Text of the last exception."""
+        return self._problem
+
+    @problem.setter
+    def problem(self, problem: str) -> None:
+        self._problem, self._problem_at = problem, time.perf_counter()
 
     def start(self) -> None:
         """Start the thread."""
@@ -159,7 +169,8 @@ class LiveLoop:
     def _drain(self) -> bool:
         waiting = self._changes.qsize()  # changes submitted from now on wait for the next step
         for _ in range(waiting):
-            self.problem = ""
+            if time.perf_counter() > self._problem_at + _READABLE:
+                self.problem = ""
             self._attempt(self._changes.get_nowait(), pause=False)
         return waiting > 0
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -15,6 +16,7 @@ import numpy as np
 from torch import Tensor
 
 from coachable.domain import Control, Push
+from coachable.outputs import complete_file
 from coachable.styles import Choice, Parameter, StyleSpace
 
 SCHEMA_VERSION = 2
@@ -108,7 +110,8 @@ class Recording:
         """Write the recording to a JSON file, whose folder is created if missing, and return the path."""
         file = Path(file)
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(self.to_json(), encoding="utf-8")
+        with complete_file(file) as unfinished:
+            unfinished.write_text(self.to_json(), encoding="utf-8")
         return file
 
     @classmethod
@@ -135,6 +138,11 @@ def is_trained(parameter: Parameter, value: float | str) -> bool:
         return not isinstance(value, str) and bool(
             np.float32(parameter.low) <= np.float32(value) <= np.float32(parameter.high)
         )
+
+
+def within_json(value: float | str) -> float:
+    """Return a number, or the largest one of its sign if it is infinite, which JSON does not have."""
+    return min(max(float(value), -sys.float_info.max), sys.float_info.max)
 
 
 def _is_count(value: Any) -> bool:

@@ -17,7 +17,7 @@ from coachable.coach.phrases.grammar import StyleGrammar, Understanding, fitting
 from coachable.coach.session.live_controls import LiveControls
 from coachable.coach.session.live_episodes import LiveEpisodes
 from coachable.coach.session.readout import MeasuredWindow, StyleReport
-from coachable.coach.session.recording import Recording, check_seed, is_trained
+from coachable.coach.session.recording import Recording, check_seed, is_trained, within_json
 from coachable.coach.session.timeline import Timeline
 from coachable.domain import Domain
 from coachable.styles import Choice, StyleSpace, Weight
@@ -29,7 +29,7 @@ class CoachSession:
 
     A request applies from the next observation on: the policy reads the style given to `set` in the following `step`.
     While `hold` is true, the request stays in force when an episode begins; otherwise each episode draws a style as in
-    training. After an episode has ended, the next `step` begins a new one; the domain's time limit is ignored.
+    training. After an episode has ended, the next `step` begins a new one; `LiveEpisodes` explains time limits.
 
     Args:
         policy: Policy that reads `observation` and `style` and writes `action`.
@@ -203,7 +203,9 @@ class CoachSession:
             values = self._preset(style) if isinstance(style, str) else dict(style)
             theta = self.space.make(strict=self.strict, **(self.style | values))
             request = {name: value for name, value in self.space.describe(theta).items() if name in values}
-            agenda.setdefault(round(min(seconds / self.domain.control_step, 1e18)), {"style": {}})["style"] |= request
+            event = agenda.setdefault(round(min(seconds / self.domain.control_step, 1e18)), {"style": {}, "asked": {}})
+            event["style"] |= request
+            event["asked"] |= values  # before clamping
         self._timeline.plan(agenda)
 
     @property
@@ -362,7 +364,7 @@ class CoachSession:
     def _apply(self, event: Mapping[str, Any]) -> None:
         """Apply an event now and record it."""
         if "style" in event:
-            self._request(self.space.make(**(self.style | event["style"])), event["style"])
+            self._request(self.space.make(**(self.style | event["style"])), event.get("asked", event["style"]))
         if "controls" in event:
             self._controls.change(event["controls"], settled=self.replaying)  # a recording has all of the way
             self._controls.steer(self.base_env)
@@ -376,7 +378,7 @@ class CoachSession:
 
     def _request(self, theta: Tensor, asked: Mapping[str, Any]) -> None:
         """Put a style in force and record it; `asked` are the requested values before clamping."""
-        numbers = {name: float(v) for name, v in asked.items() if not isinstance(self.space[name], Choice)}
+        numbers = {name: within_json(v) for name, v in asked.items() if not isinstance(self.space[name], Choice)}
         values = {**self._outside, **numbers}.items()
         self._outside = {name: value for name, value in values if not is_trained(self.space[name], value)}
         before, self._theta = self.style, theta

@@ -82,6 +82,9 @@ class CombatEnv(EnvBase):
         torch.Size([2, 3, 190])
     """
 
+    runs_past_time_limit = True
+    """An episode may be continued after it was truncated."""
+
     def __init__(
         self,
         num_envs: int = 128,

@@ -74,6 +74,9 @@ class HumanoidEnv(EnvBase):
         torch.Size([2, 3, 82])
     """
 
+    runs_past_time_limit = True
+    """An episode may be continued after it was truncated."""
+
     def __init__(
         self,
         num_envs: int = 32,

@@ -96,6 +96,9 @@ class RacingEnv(EnvBase):
         torch.Size([2, 3, 10])
     """
 
+    runs_past_time_limit = True
+    """An episode may be continued after it was truncated."""
+
     def __init__(
         self,
         num_envs: int = 64,

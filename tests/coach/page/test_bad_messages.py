@@ -51,6 +51,10 @@ def test_more_requests_than_can_be_carried_out_are_left_out(page):
     wait_for(lambda: not page.loop._changes.qsize())
     do(page)
     assert page.session.style["target"] == pytest.approx(0.1)
+    assert "some were dropped" in page.status.content  # although the changes in the queue succeeded
+    page.loop._problem_at -= 60.0
+    do(page)
+    assert page.loop.problem == ""
 
 
 def test_changes_that_keep_coming_leave_the_agent_time_to_act(page):
@@ -118,4 +122,5 @@ def test_a_recording_with_an_unknown_control_is_refused_and_the_session_goes_on(
     page.widgets["target"].handle.value = 0.5
     page._press("Step")
     do(page)
-    assert page.session.style["target"] == pytest.approx(0.5) and page.loop.problem == ""
+    assert page.session.style["target"] == pytest.approx(0.5) and page.session.step_count > 1
+    assert "no live control named" in page.loop.problem  # still to be read

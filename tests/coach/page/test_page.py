@@ -45,6 +45,15 @@ def test_widgets_follow_the_session(page):
     assert len(page.session.recording().events) == 1, "following is no request"
 
 
+def test_a_value_that_is_shown_rounded_is_no_request(page):
+    """viser calls the slider's callback when the page sets its value."""
+    do(page, lambda session: session.set(fire=1.2345743))
+    do(page)
+    assert page.widgets["fire"].handle.value == 1.23457
+    assert page.session.style["fire"] == pytest.approx(1.2345743, abs=1e-7)
+    assert sum("style" in event for event in page.session.recording().events) == 1
+
+
 def test_the_phrase_box_says_what_it_understood(page):
     say(page, "wild card, target 0.4 m, sing")
     assert page.session.style["target"] == pytest.approx(0.4)

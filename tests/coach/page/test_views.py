@@ -1,6 +1,7 @@
 """The page's views: pictures, the scene and its camera."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -29,6 +30,26 @@ def test_a_view_that_cannot_be_made_is_explained(server, monkeypatch):
     view.update()
     view.close()
     assert type(view) is views.View and view.overlay == ""
+    session.close()
+
+
+def test_a_view_of_which_the_first_picture_fails_is_closed_and_not_made_again(server):
+    made, closed = [], []
+
+    class Broken:
+        def __init__(self, width, height):
+            made.append(self)
+
+        def draw(self, env):
+            raise ValueError("this domain draws nothing")
+
+        def close(self):
+            closed.append(self)
+
+    session = echo_session()
+    session.domain = replace(session.domain, make_renderer=Broken)
+    assert type(views.make_view(server, session)) is views.View
+    assert made == closed and len(made) == 1
     session.close()
 
 

@@ -78,6 +78,9 @@ NOT_UNDERSTOOD = [
     ("not arms in front", "say what instead: arms up or t pose"),
     ("change your arms", "pose can be arms in front or arms up or t pose"),
     ("not 0.4 m", "say what instead"),
+    ("don't reset", "say what instead"),
+    ("not normal", "say what instead"),
+    ("don't reset the arms", "pose can be arms in front or arms up or t pose"),
     ("", "an empty phrase"),
     ("?!", "'?!'"),
     ("step length " + "9" * 400, "how much"),
@@ -179,6 +182,14 @@ def test_the_unit_tells_which_parameter_is_meant():
 def test_back_to_normal_means_everything(grammar):
     understood = grammar.read("back to normal", {"pose": "t_pose", "step_length": 0.6, "course": 90.0})
     assert understood.changes == {"pose": "arms_in_front", "step_length": 0.475, "course": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("phrase", "changes"), [("longer than usual", {"step_length": 0.62}), ("reset to 0.4 m", {"step_length": 0.4})]
+)
+def test_words_for_normal_beside_another_request_reset_nothing_else(grammar, phrase, changes):
+    understood = grammar.read(phrase, {"pose": "t_pose", "step_length": 0.55, "course": 90.0})
+    assert understood.changes == {name: pytest.approx(value) for name, value in changes.items()}
 
 
 def test_weights_are_encouraged_and_discouraged():

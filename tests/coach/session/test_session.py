@@ -1,8 +1,10 @@
 """The coaching session: when requests act, and what is measured."""
 
 import math
+import sys
 from contextlib import nullcontext
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -46,6 +48,13 @@ def test_what_lies_outside_are_numbers(session, value, outside):
     with pytest.warns(StyleRangeWarning) if outside else nullcontext():
         session.set(target=value)
     assert session.report().outside == outside
+
+
+@pytest.mark.parametrize("value", ["inf", "-1e999"])
+def test_what_lies_outside_can_be_written_as_json(session, value):
+    with pytest.warns(StyleRangeWarning):
+        session.set(target=value)
+    assert abs(session.report().outside["target"]) == sys.float_info.max
 
 
 def test_a_drawn_style_is_within_the_trained_range(session):
@@ -201,6 +210,63 @@ def test_time_limits_are_ignored(session):
     truncated = sum(bool(session.step()["next", "truncated"]) for _ in range(25))
     assert truncated and session.ended is None and session.episode == 1
     assert session.report().endings == {}
+
+
+def test_a_time_limit_ends_an_episode_where_the_environment_cannot_go_on():
+    gymnasium = pytest.importorskip("gymnasium")
+    from coachable.gym import GymnasiumEnv
+
+    def features(observation, action, info):
+        return [observation[1]]
+
+    domain = replace(
+        ECHO,
+        make_env=lambda num_envs, **_: GymnasiumEnv(
+            lambda: gymnasium.wrappers.TimeLimit(gymnasium.make("Pendulum-v1").unwrapped, 5), features, num_envs
+        ),
+    )
+    policy = TensorDictModule(lambda style: style[..., :1].clone(), in_keys=[STYLE], out_keys=["action"])
+    session = CoachSession(policy, domain.make_space(), domain, seed=0)
+    for _ in range(5):
+        session.step()
+    assert session.ended == "reached the time limit" and session.episode == 1
+    session.step()
+    assert session.ended is None and session.episode == 2
+    session.close()
+
+
+def test_a_scheduled_value_outside_the_range_is_flagged_when_it_comes(session):
+    with pytest.warns(StyleRangeWarning):
+        session.schedule({0.1: {"target": 2.0}})
+    session.step()
+    assert session.report().outside == {}
+    session.run(0.2)
+    assert session.style["target"] == pytest.approx(0.8) and session.report().outside == {"target": 2.0}
+
+
+def test_minutes_and_seconds_are_no_time_of_a_plan(session):
+    with pytest.raises(ValueError, match="'1:30: fire' is not of the form SECONDS: PHRASE"):
+        read_plan("1:30: fire", session)
+
+
+def test_a_plan_goes_back_to_normal_whatever_is_steered():
+    session = CoachSession.open("humanoid", seed=1)
+    session.steer(course=90.0)
+    session.run(0.5)
+    assert session.controls["course"] != 0.0
+    session.set(pose="t_pose")
+    assert read_plan("3: back to normal", session) == {3.0: {"pose": "arms_in_front"}}
+    session.close()
+
+
+def test_a_recording_that_cannot_be_written_leaves_the_old_one(session, tmp_path, monkeypatch):
+    file = session.recording().save(tmp_path / "session.json")
+    before = file.read_text()
+    session.step()
+    monkeypatch.setattr(Path, "write_text", lambda *_, **__: (_ for _ in ()).throw(OSError("no space left")))
+    with pytest.raises(OSError, match="no space left"):
+        session.recording().save(file)
+    assert file.read_text() == before and list(tmp_path.iterdir()) == [file]
 
 
 def test_schedules(session):
