@@ -152,7 +152,7 @@ def make_loss(run: Run, actor: nn.Module, critics: list[nn.Module], env: EnvBase
     loss = settings.loss.build(actor, critics, action_spec=env.action_spec, num_qvalue_nets=len(critics))
     if is_sac or isinstance(loss, ActorCriticLoss):
         with torch.no_grad(), torch.random.fork_rng(devices=[]):  # critics may have dropout
-            outputs = critics[0](env.fake_tensordict())["state_action_value"].shape[-1]
+            outputs = critics[0](env.fake_tensordict().to(run.device))["state_action_value"].shape[-1]
         expected = 1 if is_sac else loss.critic_outputs()
         if outputs != expected:
             raise ValueError(

@@ -92,7 +92,6 @@ def has_direct_gradients(loss_module: LossModule, *plans: Plan) -> bool:
     return (
         all(_readable(plan) for plan in plans)
         and _has_plain_settings(loss)
-        and (quantiles or critic.trunk.out_features == 1)
         and loss._version == 2
         and loss.min_log_alpha is None
         and loss.max_log_alpha is None
@@ -103,6 +102,7 @@ def has_direct_gradients(loss_module: LossModule, *plans: Plan) -> bool:
         and not head.distribution_kwargs
         and type(critic) is StyleCritic
         and critic.action_features is None
+        and (quantiles or critic.trunk.out_features == 1)
     )
 
 
@@ -124,8 +124,10 @@ class DirectGradients:
         self._value: StyleCritic = loss.qvalue_network.module
 
     def serves(self, batch: TensorDictBase) -> bool:
-        """Return whether the batch has no weights of a prioritised replay buffer, and the loss its plain settings."""
-        return _has_plain_settings(self._loss) and self._loss._maybe_get_priority_weight(batch) is None
+        """Return whether the batch has no weights of a prioritised buffer and no mask, and the loss plain settings."""
+        masks = (batch.get(key, None) for key in self._loss._loss_mask_keys())
+        weights = self._loss._maybe_get_priority_weight(batch)
+        return _has_plain_settings(self._loss) and weights is None and all(mask is None for mask in masks)
 
     @torch.no_grad()
     def both(self, batch: TensorDictBase) -> dict[str, Tensor]:

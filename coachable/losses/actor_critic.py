@@ -269,7 +269,8 @@ class ActorCriticLoss(SACLoss):
         weights = self._maybe_get_priority_weight(tensordict)
         if weights is not None and weights.shape != loss.shape:
             # One weight per record, also if the batch is [B, n + 1].
-            weights = weights.squeeze(-1) if weights.ndim > loss.ndim else weights.unsqueeze(-1)
+            if weights.ndim != loss.ndim:
+                weights = weights.squeeze(-1) if weights.ndim > loss.ndim else weights.unsqueeze(-1)
             weights = weights.expand_as(loss)
         return cast(Tensor, self._reduce_loss(loss, tensordict=tensordict, weights=weights))
 

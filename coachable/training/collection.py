@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
@@ -17,7 +18,7 @@ from torchrl.envs.utils import ExplorationType
 
 from coachable.keys import TASK_REWARD
 from coachable.training.async_collector import AsyncCollector
-from coachable.training.rng import preserved_rng
+from coachable.training.rng import preserved_rng, seed_everything
 from coachable.training.rollout import Rollout
 from coachable.training.simulators import UnsavableError, load_simulator, save_simulator
 from coachable.training.worker_errors import ReportingCollector
@@ -55,7 +56,7 @@ def make_collector(
         init_random_frames: Number of env-steps with uniformly random actions at the start.
         backend: "direct" (this process) or "process" (one host); for several hosts see `coachable.cluster`.
         num_collectors: Number of workers with "process".
-        seed: Seed of the first worker; worker i gets `seed + i`.
+        seed: Seed of the environment; with "process" those of the workers are derived from it.
         policy_device: Device of the policy; None for the device of the environment.
 
     Raises:
@@ -86,7 +87,7 @@ def make_collector(
         follow_policy(collector)
         return collector
     if backend == "process":
-        factories = [_SeededFactory(make_env, seed + i) for i in range(num_collectors)]
+        factories = [_SeededFactory(make_env, _derived(seed, number)) for number in range(num_collectors)]
         receiver, sender = multiprocessing.Pipe(duplex=False)
         common |= plain | {"collector_class": ReportingCollector(sender, follow_policy)}
         # It waits for all workers in each iteration. TorchRL's asynchronous one drops batches that are not taken within
@@ -143,7 +144,13 @@ class _SeededFactory:
         if multiprocessing.parent_process() is not None and threading.current_thread() is threading.main_thread():
             # Ctrl-C reaches the whole process group, but the training process ends its workers itself.
             signal.signal(signal.SIGINT, signal.SIG_IGN)
+            seed_everything(self.seed)  # the worker's actions
         return self.make_env(self.seed)
+
+
+def _derived(seed: int, number: int) -> int:
+    """Return a seed below 2^31 that depends on both numbers."""
+    return int(np.random.SeedSequence([seed, number]).generate_state(1)[0]) % 2**31
 
 
 def simulation_env(env: EnvBase) -> EnvBase:
@@ -194,6 +201,7 @@ def load_collector_state(collector: BaseCollector | AsyncCollector, state: dict[
     counts._frames, counts._iter = int(state.get("frames", 0)), int(state.get("iterations", 0))
     if not isinstance(collector, Collector):
         counts.update_policy_weights_()  # before the first step
+        counts.set_seed(_derived(torch.initial_seed(), counts._frames))  # not the starts of frame 0 again
         raise UnsavableError(_ELSEWHERE)
     env = collector.env
     if isinstance(env, TransformedEnv) and "transforms" in state:  # collectors with workers do not save them
@@ -241,7 +249,7 @@ def evaluate_policy(
         length = torch.zeros_like(fell, dtype=torch.float32)
         sums = {key: torch.zeros_like(length) for key in ("reward", TASK_REWARD)}
         measured, alive = [], []
-        for stepped, running in rollout.episode(lambda td: policy(td.to(device)).to(env.device), max_steps):
+        for stepped, running in rollout.episode(lambda td: policy(td.to(device)).to(env.device or "cpu"), max_steps):
             rollout.begin_ended()
             after: Any = stepped.get("next")
             if measures is not None:

@@ -52,6 +52,9 @@ class Curriculum:
             self.number = 0
         for later in range(self.number + 1, len(self.stages)):
             check_unused(self.folder(later))
+        finished = self.folder(self.number - 1).resolve() if self.number and self._init_from else None
+        if finished is not None and Path(self._init_from).resolve().is_relative_to(finished):  # as at a stage's end
+            CheckpointStore(finished / "checkpoints").remove_replay()
         # The rounding of sums depends on the learner's threads, so all stages and resumptions use the same. When a
         # later stage starts, this process itself would count as a busy core.
         free = asdict(share_threads(**self.stages[0]["threads"]))

@@ -318,7 +318,6 @@ class Trainer:
             "loop": {
                 "frames": self.frames,
                 "pending_updates": self.pending_updates,
-                "evaluations": self._evaluations,
                 "evaluated_frames": self._evaluated_frames,
                 "filled_from": self._filled_from,
             },
@@ -350,7 +349,8 @@ class Trainer:
         self.learner.load_state_dict(state["learner"])
         self.frames = int(state["loop"]["frames"])
         self.pending_updates = float(state["loop"]["pending_updates"])
-        self._evaluations = int(state["loop"]["evaluations"])
+        interval = self.settings.eval_interval  # which may have changed
+        self._evaluations = self.frames // interval if interval else 0
         self._evaluated_frames = int(state["loop"].get("evaluated_frames", -1))
         self._filled_from = int(state["loop"]["filled_from"])
         if replay.is_dir():

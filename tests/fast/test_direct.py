@@ -4,12 +4,14 @@ import math
 
 import pytest
 import torch
+from torchrl.modules import ValueOperator
+from torchrl.objectives import SACLoss
 
 from coachable.fast import accelerate
 from coachable.fast.direct import has_direct_gradients
 from coachable.fast.native import load_sac
 from coachable.losses import QRSACLoss
-from coachable.networks import make_critic, make_gaussian_actor
+from coachable.networks import ResidualMLP, make_critic, make_gaussian_actor
 from coachable.training import Learner
 from coachable.training.learner import NonFiniteLossError
 from tests.sac_problem import ACT, OBS, WIDTHS, ScaledStyle, cat_rac, make_batch, make_learner, make_loss, qr_sac
@@ -182,6 +184,34 @@ def test_weighted_batches_are_left_to_the_loss_module(accelerated):
         torch.manual_seed(1)
         results.append(learner.update(batch))
     torch.testing.assert_close(*results, rtol=0, atol=0)
+
+
+def test_masked_batches_are_left_to_the_loss_module(accelerated):
+    results = []
+    for learner in (accelerated(make_loss), plain(accelerated(make_loss))):
+        batch = make_batch(32)
+        batch["collector", "mask"] = torch.arange(32) < 16
+        torch.manual_seed(1)
+        results.append(learner.update(batch))
+    torch.testing.assert_close(*results, rtol=0, atol=0)
+
+
+def test_residual_critics_that_read_no_style_are_served_by_the_general_passes():
+    def build():
+        torch.manual_seed(0)
+        critics = [ValueOperator(ResidualMLP(OBS + ACT, 1, (16,)), in_keys=["observation", "action"]) for _ in range(2)]
+        actor = make_gaussian_actor(OBS, ACT, ScaledStyle(), WIDTHS)
+        loss = SACLoss(actor, critics, num_qvalue_nets=2, loss_function="l2", action_spec=actor.spec)
+        loss.make_value_estimator(gamma=0.9)
+        return loss
+
+    ours, theirs = Learner(build(), precision="fp32"), Learner(build(), precision="fp32")
+    assert accelerate(ours) and ours.backend._direct is None
+    for learner in (ours, theirs):
+        torch.manual_seed(1)
+        learner.update(make_batch(32))
+    for name, expected in theirs.loss_module.state_dict().items():
+        torch.testing.assert_close(ours.loss_module.state_dict()[name], expected, rtol=1e-3, atol=1e-4, msg=name)
 
 
 def test_a_loss_whose_parameters_moved_is_followed(accelerated):

@@ -204,6 +204,8 @@ def test_one_priority_weight_per_record(case: Case) -> None:
     expected = critic_loss(loss, batch)[0]
     batch["priority_weight"] = weights.expand(5, 2).unsqueeze(-1)
     torch.testing.assert_close(critic_loss(loss, batch)[0], expected)
+    losses, record = torch.rand(5, 2), TensorDict({"priority_weight": weights}, [5])
+    torch.testing.assert_close(loss._reduced(losses, record), (losses * weights).sum() / (2 * weights.sum()))
 
 
 @ALL

@@ -4,8 +4,10 @@ import itertools
 import sys
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import recipe_boxes
 import torch
 from recipe_checks import typed_settings
 from recipe_config import compose_config, config_groups, run_recipe
@@ -320,3 +322,20 @@ def test_help_names_the_recipe(recipe, monkeypatch, capsys):
         run_recipe(recipe, build=None)
     assert stop.value.code == 0
     assert f"python recipes/{recipe}.py preset=smoke" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_the_critics_are_tried_on_their_own_device(recipe, tmp_path, monkeypatch):
+    """The example environment stays on the CPU, whatever the device of the networks."""
+    make_loss, devices = recipe_boxes.make_loss, []
+
+    def watched(run, actor, critics, env):
+        example = env.fake_tensordict()
+        with monkeypatch.context() as patch:
+            moved = SimpleNamespace(to=lambda device: devices.append(device) or example)
+            patch.setattr(env, "fake_tensordict", lambda: moved)
+            return make_loss(run, actor, critics, env)
+
+    monkeypatch.setattr(recipe_boxes, "make_loss", watched)
+    _train(recipe, tmp_path, *BRIEF)
+    assert devices == [torch.device("cpu")]

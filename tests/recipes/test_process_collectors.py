@@ -13,10 +13,13 @@ import torch
 from recipe_config import compose_config, run_recipe
 from tensordict.nn import TensorDictModule
 
+from coachable.networks import make_gaussian_actor
 from coachable.styles import StyleReward, Term
+from coachable.training import collection
 from coachable.training.checkpoint import find_checkpoint, read_state
-from coachable.training.collection import make_collector
+from coachable.training.collection import collector_state, load_collector_state, make_collector
 from coachable.training.episodes import EpisodeSums
+from coachable.training.simulators import UnsavableError
 from coachable.transforms import coachable_env
 from tests.echo import StyleEchoEnv, echo_space
 from tests.recipes.test_every_combination import RECIPES, TINY
@@ -127,7 +130,7 @@ class BreakingEnv(StyleEchoEnv):
         self.killed = killed
 
     def _step(self, tensordict):
-        if self.steps == 8 and self.generator.initial_seed() == 1:
+        if self.steps == 8 and self.generator.initial_seed() == collection._derived(0, 1):
             if self.killed:
                 os.kill(os.getpid(), signal.SIGKILL)
             raise ZeroDivisionError("the pole has no length")
@@ -163,6 +166,32 @@ def test_the_end_of_a_worker_in_a_later_step_is_one_sentence(
     assert re.fullmatch(rf"error: a worker process {end}\. {stopped}", str(ended.value.code))
     assert not multiprocessing.active_children()
     assert read_state(find_checkpoint(tmp_path))["loop"]["frames"] > 0  # of an earlier iteration
+
+
+def collected(seed, resumed=None):
+    """Styles and actions of the first two batches of two workers."""
+    torch.manual_seed(seed)
+    actor = make_gaussian_actor(3, 1, echo_space(), (8,))
+    collector = make_collector(
+        partial(breaking_env, False), actor, frames_per_batch=16, backend="process", num_collectors=2, seed=seed
+    )
+    try:
+        if resumed is not None:
+            with pytest.raises(UnsavableError):
+                load_collector_state(collector, resumed)
+        batch = next(iter(collector)).contiguous()
+        return batch["style"].clone(), batch["action"].clone(), collector_state(collector)
+    finally:
+        collector.shutdown()
+
+
+def test_workers_have_seeds_of_their_own_and_new_ones_after_a_resumption(quick_starts):
+    styles, actions, state = collected(0)
+    again = collected(0)
+    assert torch.equal(styles, again[0]) and torch.equal(actions, again[1])
+    assert len(styles.unique()) == 2 * 4  # no two environments have the same style
+    assert not torch.isin(collected(1)[0], styles).any()  # also not those of another training
+    assert not torch.isin(collected(0, resumed=state)[0], styles).any()
 
 
 class MirroredEnv(StyleEchoEnv):

@@ -95,8 +95,11 @@ def test_a_signal_at_the_end_of_a_stage_ends_the_training(whole, tmp_path, monke
     start(*TINY, STAGES, f"run_dir={run}").run()
     assert [folder.name for folder in (run / "stages").iterdir()] == ["1_first"]
     elsewhere = tmp_path / "elsewhere"
+    buffers = [*run.glob("stages/1_first/checkpoints/*/replay")]
     start(f"resume={run}", f"run_dir={elsewhere}").run()
+    assert buffers and all(folder.is_dir() for folder in buffers)
     start(f"resume={run}").run()
+    assert not any(folder.exists() for folder in buffers)
     for end in (run, elsewhere):
         assert differences(end / "stages" / "2_second", whole / "stages" / "2_second") in ([], ["metrics/episodes"])
 

@@ -235,6 +235,16 @@ def test_the_share_of_annealing_is_a_share():
         TrainSettings(total_frames=10, anneal_entropy=0.0)
 
 
+def test_a_resumed_training_evaluates_at_its_own_interval(make_train, tmp_path):
+    make_train(tmp_path, total_frames=100, eval_interval=20).run()
+    rest = make_train(tmp_path, total_frames=300, eval_interval=60)
+    evaluated = []
+    rest.evaluate = lambda: evaluated.append(rest.frames) or {"score": 0.0}
+    rest.resume(tmp_path)
+    rest.run()
+    assert evaluated == [120, 180, 240, 300]
+
+
 def test_a_ratio_of_none_needs_a_throttle():
     with pytest.raises(ValueError, match=r"needs a throttle: set train\.throttle=RATE"):
         TrainSettings(total_frames=1, utd_ratio=None)
@@ -296,6 +306,18 @@ def test_evaluation_counts_each_episode_once(make_echo_env):
     result = evaluate_policy(env, hold, max_steps=100)
     assert result["return"] == pytest.approx(-0.5 * result["length"], rel=1e-5)
     assert 0 < result["length"] <= 20
+
+
+@pytest.mark.parametrize("device", [None, torch.device("cpu")])
+def test_evaluations_bring_actions_to_the_environment(make_echo_env, monkeypatch, device):
+    env, devices = make_echo_env(3), []
+    monkeypatch.setattr(type(env), "device", device)
+
+    def elsewhere(td):
+        return SimpleNamespace(to=lambda place: devices.append(str(place)) or hold(td))
+
+    evaluate_policy(env, elsewhere, max_steps=3)
+    assert set(devices) == {"cpu"}
 
 
 def test_an_evaluation_measures_the_style_while_episodes_last(make_echo_env):

@@ -74,6 +74,13 @@ def test_copies_are_of_the_past_and_drive_their_share():
     assert [copy.steer.item() for copy in rivals.copies][-1] == -0.75 and len(rivals.copies) == 3
 
 
+def test_copies_of_a_policy_on_another_device_are_where_the_cars_are():
+    _, rivals = races()
+    rivals.follow(nn.Linear(2, 2, device="meta"))
+    with pytest.raises(NotImplementedError, match="Cannot copy out of meta tensor"):  # it would be copied to the cars
+        rivals._frozen()
+
+
 def test_copies_have_styles_of_the_space():
     env, rivals = races({"scripted": 0.0, "interval": 1}, races=100)
     policy = Constant()

@@ -102,7 +102,7 @@ class Rivals:
         self._steps = state["steps"]
         self.copies.clear()
         for weights in state["copies"]:
-            past = _frozen(self.policy)
+            past = self._frozen()
             past.load_state_dict(weights)
             self.copies.append(past)
 
@@ -111,17 +111,16 @@ class Rivals:
             return
         self._steps += 1
         if self._steps % self.interval == 0:
-            self.copies.append(_frozen(self.policy))
+            self.copies.append(self._frozen())
+
+    def _frozen(self) -> nn.Module:
+        """Return a copy of the policy without gradients, on the environment's device."""
+        if self.policy is None:
+            raise ValueError("there is no policy to copy: call follow(policy) before")
+        return copy.deepcopy(self.policy).to(self.styles[0].device).requires_grad_(False)
 
     def _styles(self, field: Field) -> Tensor:
         """Draw a style for each car (N, d), which stays the same throughout a race."""
         low, high = self.styles
         u = uniforms(field.seeds + 2 * _STREAM, field.episode, len(low), field.cars).reshape(len(low), -1)
         return (low[:, None] + (high - low)[:, None] * u).T
-
-
-def _frozen(policy: nn.Module | None) -> nn.Module:
-    """Return a copy of a policy without gradients."""
-    if policy is None:
-        raise ValueError("there is no policy to copy: call follow(policy) before")
-    return copy.deepcopy(policy).requires_grad_(False)
