@@ -76,16 +76,16 @@ def export_recordings(agent: LoadedPolicy, domain: Domain, out: Path, assets: Pa
     requests = [agent.space.describe(theta) | cell for theta, cell in zip(thetas, cells, strict=True)]
     steps = min(domain.episode_steps, max(1, round(domain.recorded.seconds / domain.control_step)))
     vendored = provide(assets, _NEEDED)
-    recordings = record(agent, domain, requests, steps)
-    columns = domain.recorded.columns or domain.columns or published(domain, recordings[0].measured, requests[0])
-    shown = [_measure(domain, agent.space, *column) for column in columns.items()]
-    if unknown := {measure["name"] for measure in shown} - recordings[0].measured.keys():
-        raise ValueError(
-            f"the domain {domain.name} shows {', '.join(sorted(unknown))}: expected some of "
-            f"{', '.join(sorted(recordings[0].measured))}"
-        )
     backdrops: dict[bytes, str] = {}
     with complete_folder(out) as folder:
+        recordings = record(agent, domain, requests, steps)
+        columns = domain.recorded.columns or domain.columns or published(domain, recordings[0].measured, requests[0])
+        shown = [_measure(domain, agent.space, *column) for column in columns.items()]
+        if unknown := {measure["name"] for measure in shown} - recordings[0].measured.keys():
+            raise ValueError(
+                f"the domain {domain.name} shows {', '.join(sorted(unknown))}: expected some of "
+                f"{', '.join(sorted(recordings[0].measured))}"
+            )
         copy_page(folder, vendored)
         (folder / _FOLDER).mkdir()
         manifest = _manifest(agent, domain, requests)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -283,7 +284,8 @@ class CoachPage:
         now = time.perf_counter()
         self._api.on_step()
         for name, value in (self.session.style | self.session.controls).items():
-            self.widgets[name].follow(value)
+            with contextlib.suppress(TypeError, ValueError):  # a browser may have sent it something else than a value
+                self.widgets[name].follow(value)
         if now >= self._report_due or self.loop.paused or self.session.ended is not None:
             self._report_due = now + 1.0 / _REPORTS_PER_SECOND
             report = self.session.report()

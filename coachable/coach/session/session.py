@@ -369,7 +369,7 @@ class CoachSession:
             self._controls.change(event["controls"], settled=self.replaying)  # a recording has all of the way
             self._controls.steer(self.base_env)
             self._timeline.note({"controls": dict(event["controls"])})
-        if self.domain.push is not None and "push" in event:
+        if self.domain.push is not None and "push" in event and self.ended is None:
             self.domain.push.apply(self.base_env, *event["push"])
             self._timeline.note({"push": list(event["push"])})
         if "reset" in event:

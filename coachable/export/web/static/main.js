@@ -1,9 +1,10 @@
 // Start of the page: an agent that acts in the browser, or recordings of one.
 
 import { at, megabytes } from "./dom.js";
+import { fetched } from "./page.js";
 
 async function start() {
-  const manifest = await (await fetch("manifest.json")).json();
+  const manifest = await (await fetched("manifest.json")).json();
   document.title = `${manifest.title} – coachable`;
   at("title").textContent = manifest.title;
   at("summary").textContent = manifest.summary;

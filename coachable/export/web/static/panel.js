@@ -58,7 +58,9 @@ export class Panel {
         pointer.hidden = mean === null;
         if (mean !== null) pointer.style.setProperty("--at", placeOf(pointer.entry, mean));
       }
-      if (steps) drawSteps(steps, readout.last(measure.name), this.asked[measure.parameter], pointer.entry.to);
+      if (!steps) continue;
+      const last = readout.last(measure.name);
+      drawSteps(steps, last, this.asked[measure.parameter], pointer?.entry.to ?? Math.max(1, ...last));
     }
   }
 

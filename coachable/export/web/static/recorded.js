@@ -7,7 +7,8 @@ import { RecordedPanel } from "./recorded_panel.js";
 import { decode, fragmentOf, fromFragment, nearest } from "./recording.js";
 
 const AFTER_END = 1500; // [ms] before the recording begins anew
-const SLOW = 0.2; // [s] between pictures, from which on fewer details are drawn
+const SLOW = 0.2; // [s] between pictures; if several in turn take longer, fewer details are drawn
+const PAUSED = 2; // [s] between pictures, as in a tab that was hidden
 
 class RecordedPage extends Page {
   async load() {
@@ -44,8 +45,7 @@ class RecordedPage extends Page {
   start() {
     addEventListener("hashchange", () => {
       const { number, moment } = fromFragment(this.manifest, location.hash);
-      this.time = moment ?? this.time; // in the recording that is then shown, which may be longer
-      this.select(number);
+      this.select(number, moment);
     });
     addEventListener("resize", () => this.panel.select(this.wanted));
     at("moment-row").hidden = false;
@@ -64,8 +64,8 @@ class RecordedPage extends Page {
     this.select(name === null ? value : nearest(this.manifest, { ...style, [name]: value }, name));
   }
 
-  /** Show a recording from the present moment on. */
-  async select(number) {
+  /** Show a recording from a moment [s], or from the present one on. */
+  async select(number, moment = null) {
     this.#choose(number);
     const recording = await this.#read(number).catch((error) => this.#miss(number, error));
     if (this.wanted !== number) return; // the visitor asked for something else meanwhile, or it is missing
@@ -75,7 +75,7 @@ class RecordedPage extends Page {
     at("moment").max = this.length.toFixed(1);
     this.scene?.play(recording, this.backdrops);
     this.shown = null;
-    this.seek(this.time);
+    this.seek(moment ?? this.time);
     at("announcement").textContent = this.panel.sentences(number);
   }
 
@@ -83,7 +83,8 @@ class RecordedPage extends Page {
   #choose(number) {
     this.wanted = number;
     this.panel.select(number);
-    history.replaceState(null, "", fragmentOf(this.manifest, number));
+    clearTimeout(this.writing); // browsers refuse when the address changes too often
+    this.writing = setTimeout(() => history.replaceState(null, "", fragmentOf(this.manifest, number)), 200);
   }
 
   /** Go on with the recording that is shown, because another one could not be loaded. */
@@ -113,7 +114,7 @@ class RecordedPage extends Page {
     const now = performance.now();
     const elapsed = (now - this.before) / 1000;
     this.before = now;
-    if (elapsed > SLOW) this.slow = (this.slow ?? 0) + 1;
+    if (elapsed < PAUSED) this.slow = elapsed > SLOW ? (this.slow ?? 0) + 1 : 0;
     if (this.slow > 5) this.scene?.spare();
     if (this.ended !== null && !this.paused && now - this.ended > AFTER_END) this.seek(0);
     else if (!this.paused && this.ended === null) {

@@ -274,7 +274,8 @@ function labelOf(text, { label, behind }) {
   [canvas.width, canvas.height] = [width, height];
   const context = canvas.getContext("2d");
   context.fillStyle = behind;
-  context.roundRect(36, 4, width - 72, height - 8, 14);
+  if (context.roundRect) context.roundRect(36, 4, width - 72, height - 8, 14);
+  else context.rect(36, 4, width - 72, height - 8); // older browsers
   context.fill();
   context.font = "600 44px system-ui, sans-serif";
   context.textAlign = "center";

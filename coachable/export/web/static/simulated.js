@@ -70,7 +70,7 @@ export class SimulatedPage extends Page {
     this.pause(matchMedia("(prefers-reduced-motion: reduce)").matches);
     at("loading").hidden = true;
     this.before = performance.now();
-    requestAnimationFrame(() => this.frame());
+    this.next();
   }
 
   /** Take over what is asked for, from the next control step on. */
@@ -126,6 +126,15 @@ export class SimulatedPage extends Page {
     return this.simulator.steps * this.manifest.physics.control_step;
   }
 
+  /** Draw another picture soon; if the agent cannot go on, say so. */
+  next() {
+    const stop = (error) => {
+      console.error(error);
+      this.tell(`The agent stopped: ${error.message}`);
+    };
+    requestAnimationFrame(() => this.frame().catch(stop));
+  }
+
   async frame() {
     const now = performance.now(); // the time that the browser hands over lies in the past where drawing is slow
     const elapsed = (now - this.before) / 1000;
@@ -147,7 +156,7 @@ export class SimulatedPage extends Page {
       if (this.fell !== null && now - this.fell > AFTER_FALL) this.again();
       this.scene?.draw();
     }
-    requestAnimationFrame(() => this.frame());
+    this.next();
   }
 
   /** One control step. */

@@ -7,7 +7,8 @@ import { decode } from "./recording.js";
 import { RUNTIME, SimulatedPage, runtimeOf } from "./simulated.js";
 import { createStepSimulator } from "./step_simulator.js";
 
-const SLOW = 200; // [ms] between pictures, from which on fewer details are drawn
+const SLOW = 200; // [ms] between pictures; if several in turn take longer, fewer details are drawn
+const PAUSED = 2000; // [ms] between pictures, as in a tab that was hidden
 
 class SteppedPage extends SimulatedPage {
   behind = 1; // a control step takes much less time than it simulates, so slow pictures need not slow the agent
@@ -40,7 +41,8 @@ class SteppedPage extends SimulatedPage {
   }
 
   async frame() {
-    if (performance.now() - this.before > SLOW) this.slow = (this.slow ?? 0) + 1;
+    const elapsed = performance.now() - this.before;
+    if (elapsed < PAUSED) this.slow = elapsed > SLOW ? (this.slow ?? 0) + 1 : 0;
     if (this.slow > 5) this.scene?.spare();
     await super.frame();
   }
