@@ -93,6 +93,10 @@ class Workers:
 
     def __init__(self) -> None:
         self._frames, self._iter, self.told = 0, 0, 0
+        self.seeds: list[int] = []
+
+    def set_seed(self, seed: int) -> None:
+        self.seeds.append(seed)
 
     def update_policy_weights_(self) -> None:
         self.told += 1
@@ -104,7 +108,7 @@ def test_workers_in_other_processes_get_the_weights_and_the_count_of_frames():
     before._frames, before._iter = 480, 12
     with pytest.raises(UnsavableError, match=r"environments in other processes cannot be saved \(collector=direct"):
         load_collector_state(after, collector_state(before))
-    assert (after._frames, after._iter, after.told) == (480, 12, 1)
+    assert (after._frames, after._iter, after.told, len(after.seeds)) == (480, 12, 1, 1)
 
 
 def test_a_run_with_workers_is_resumed_in_one_process(make_train):
