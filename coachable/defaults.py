@@ -61,8 +61,8 @@ class RewardMeasures:
     """Measured style from the terms of the style reward.
 
     - `SetpointTolerance`: the feature that it compares with the request, under the set-point's name, and the distance
-      from the request as `<name>_error`. Steps in which its gate is 0 have no value. If several
-      features are compared with it, each has the name of its term instead.
+      from the request as `<name>_error`. Steps in which its gate is 0 have no value. If several features are compared
+      with it, each has the name of its term instead.
     - `WeightedFeature`, `WeightedSum`: the feature that the weight scales, under the weight's name, unless it scales
       several features.
     - Any other term: its reward per step before scaling, as `<term>_reward`.
